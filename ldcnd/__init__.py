@@ -1,0 +1,1 @@
+"""ldcnd owns RS-485 servo lines and exposes their drives over Zenoh."""

@@ -1,0 +1,5 @@
+"""`python -m ldcnd`."""
+
+from ldcnd.cli.main import main
+
+main()

@@ -1,0 +1,217 @@
+"""The configuration of one axis: its drive, its machine, and what it may do."""
+
+from enum import StrEnum
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+
+from ldcnd import smartstep_config
+from ldcnd.config_names import DeviceIdentity, Name
+from ldcnd.drivers.ldcn.profiles import PROFILES, Support
+from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
+from ldcnd.model.axes import AxisLimits
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.requests import HomeMethod, HomeStop
+from ldcnd.smartstep_config import SmartStepUnitConfig
+
+
+def _known_model(model: str) -> str:
+    if model == smartstep_config.MODEL:
+        return model
+    movable = [name for name, profile in PROFILES.items() if profile.support is Support.FULL]
+    if model not in movable:
+        raise ValueError(f"no such drive model; known are {', '.join(movable)}")
+    return model
+
+
+class GainsConfig(Frozen):
+    """Registers of the position loop, as in the drive's manual; 0 < kp and 0 < el or the loop cannot close."""
+
+    kp: int = Field(gt=0, le=0x7FFF)
+    """Position gain."""
+    kd: int = Field(default=0, ge=0, le=0x7FFF)
+    """Derivative gain."""
+    ki: int = Field(default=0, ge=0, le=0x7FFF)
+    """Integral gain."""
+    il: int = Field(default=0, ge=0, le=0x7FFF)
+    """Integration limit; the drive multiplies it by 256."""
+    ol: int = Field(default=250, gt=0, le=0xFF)
+    """Output limit, of 255."""
+    cl: int = Field(default=0, ge=0, le=0xFF)
+    """Current limit: odd values for a sense voltage that rises with the current, 0 for none; PIC-SERVO only."""
+    el: int = Field(gt=0, le=0x3FFF)
+    """Position error, in counts, beyond which the drive opens its loop."""
+    sr: int = Field(default=1, ge=1, le=0xFF)
+    """Servo rate divisor: the servo cycle is so many times 0.512 ms."""
+    deadband: int = Field(default=0, ge=0, le=0xFF)
+    """Added to the amplifier's output around zero."""
+
+
+class HomeConfig(Frozen):
+    """How `home` searches when the request does not say."""
+
+    method: HomeMethod
+    """What marks the reference position."""
+    velocity: float
+    """Units a second, positive forward."""
+    position: float = 0.0
+    """What the position is called there, in axis units."""
+    timeout_s: float = Field(default=60.0, gt=0, le=3600)
+    """Longest search, in seconds."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest search, in axis units."""
+    stop: HomeStop = HomeStop.SMOOTH
+    """How the motor stops there."""
+    move_to: float | None = None
+    """Where to go afterwards, in axis units."""
+    switch_active: Literal["high", "low"] = "high"
+    """Level of a limit switch input while the switch is actuated."""
+
+
+class PwmConfig(Frozen):
+    """Bounds of `set_pwm`; without this table the axis refuses it."""
+
+    duty: float = Field(gt=0, le=1)
+    """Highest duty in either direction."""
+    duration_s: float = Field(default=10.0, gt=0, le=600)
+    """Longest time that a duty stays on."""
+
+
+class TrackingConfig(Frozen):
+    """Bounds of `track`; without this table the axis refuses it."""
+
+    step: float = Field(gt=0)
+    """Longest way from one set-point to the next, in axis units; must stay below the position error limit `el`."""
+    rate: float = Field(gt=0, le=500)
+    """Most set-points a second."""
+
+
+class LossPolicy(StrEnum):
+    """What an axis does when somebody it depends on disappears."""
+
+    RUN_TO_TARGET = "run_to_target"
+    """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive."""
+    HALT = "halt"
+    """Decelerate, then hold."""
+    QUICK_STOP = "quick_stop"
+    """Hold the present position at once."""
+    POWER_OFF = "power_off"
+    """Open the loop: the motor coasts, a hanging load falls."""
+
+
+class LossConfig(Frozen):
+    """What the axis does when somebody disappears in mid-motion."""
+
+    client: LossPolicy = LossPolicy.HALT
+    """The lease under which it moves was not renewed."""
+    bus: LossPolicy = LossPolicy.HALT
+    """The line was lost; acts as soon as it is back and the drive still moves."""
+    daemon: LossPolicy = LossPolicy.HALT
+    """The daemon is told to end."""
+
+
+class RatesConfig(Frozen):
+    """How often an item is published, in Hz; 0 for never."""
+
+    position: float = Field(default=10.0, ge=0, le=2000)
+    """Position, with the following error where the drive reports it."""
+    velocity: float = Field(default=10.0, ge=0, le=2000)
+    """Velocity."""
+    adc: float = Field(default=2.0, ge=0, le=2000)
+    """Analog input."""
+    state: float = Field(default=5.0, gt=0, le=2000)
+    """The drive's status and state; cannot be switched off, faults come with it."""
+
+
+class AxisConfig(Frozen):
+    """One drive on a line."""
+
+    name: Name
+    """Its chunk in every key; unique on the rig."""
+    model: Annotated[str, AfterValidator(_known_model)]
+    """The drive model."""
+    address: int = Field(ge=0, le=127)
+    """Node address from 1 on; the unit number of a SmartStep, 0 to 15."""
+    unit: str = "count"
+    """Unit of everything that concerns this axis."""
+    counts_per_unit: float | None = Field(default=None, gt=0)
+    """Encoder counts per unit. There is no default: without it the axis works in counts and says so."""
+    direction: Literal["forward", "reverse"] = "forward"
+    """reverse: forward in axis units is backward in encoder counts."""
+    velocity: float = Field(gt=0)
+    """Velocity of moves that do not name one, units a second."""
+    acceleration: float = Field(gt=0)
+    """Acceleration of moves that do not name one, units a second squared."""
+    limits: AxisLimits = AxisLimits()
+    """Software limits, in axis units."""
+    gains: GainsConfig | None = None
+    """Without gains the loop of this drive stays open."""
+    reference: Literal["required", "at_reset"] = "required"
+    """Whether absolute moves need home or set_position first, or the position at the drive's reset counts as known."""
+    home: HomeConfig | None = None
+    """How `home` searches when the request does not say."""
+    pwm: PwmConfig | None = None
+    """Bounds of `set_pwm`; without them the axis takes no raw duty."""
+    tracking: TrackingConfig | None = None
+    """Bounds of `track`; without them the axis follows no set-points."""
+    rates: RatesConfig = RatesConfig()
+    """How often each item is published."""
+    loss: LossConfig = LossConfig()
+    """What the axis does when somebody disappears in mid-motion."""
+    jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
+    """A motion at constant velocity that no software limit ends is ended by the drive itself after so many seconds."""
+    adc_volts: float = Field(default=5.0, gt=0)
+    """Voltage at full scale of the A/D converter."""
+    identity: DeviceIdentity | None = None
+    """Id and version of this drive, when they are not among those known for its model: it is treated as that model."""
+
+    smartstep: SmartStepUnitConfig = SmartStepUnitConfig()
+    """What only a SmartStep has."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, document: object) -> object:
+        return smartstep_config.as_axis(document)
+
+    @field_validator("address")
+    @classmethod
+    def _within_family(cls, address: int, known: ValidationInfo) -> int:
+        is_smartstep = known.data.get("model") == smartstep_config.MODEL
+        if is_smartstep and address > HIGHEST_UNIT:
+            raise ValueError("a SmartStep has a unit number from 0 to 15")
+        if not is_smartstep and address == 0:
+            raise ValueError("a node address is 1 to 127")
+        return address
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        limits = self.limits
+        if self.counts_per_unit is None and self.unit != "count":
+            raise ValueError(f"unit {self.unit!r} needs counts_per_unit")
+        if (
+            limits.position_min is not None
+            and limits.position_max is not None
+            and limits.position_min >= limits.position_max
+        ):
+            raise ValueError(
+                f"limits: position_min {limits.position_min} is not below position_max {limits.position_max}"
+            )
+        if limits.velocity is not None and self.velocity > limits.velocity:
+            raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
+        if limits.acceleration is not None and self.acceleration > limits.acceleration:
+            raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
+        self._check_tracking()
+        return self
+
+    def _check_tracking(self) -> None:
+        """Refuse bounds of `track` that would trip the drive or outrun the axis."""
+        tracking, limits = self.tracking, self.limits
+        if tracking is None:
+            return
+        step_counts = tracking.step * (self.counts_per_unit or 1.0)
+        if self.gains and step_counts >= self.gains.el:
+            raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {self.gains.el}")
+        if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:
+            raise ValueError(
+                f"tracking.step x rate is {tracking.step * tracking.rate:g}, above limits.velocity {limits.velocity}"
+            )

@@ -1,0 +1,135 @@
+"""The configuration of one line: its port, its rate, and what is on it."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from ldcnd import smartstep_config
+from ldcnd.axis_config import AxisConfig
+from ldcnd.config_names import DeviceIdentity, Name, refuse_duplicates
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.line import AdoptFallback, StartPolicy
+from ldcnd.model.frozen import Frozen
+from ldcnd.smartstep_config import SmartStepLineConfig
+
+BAUDS = (9600, 19_200, 57_600, 115_200, 230_400)
+
+
+def _known_module(model: str) -> str:
+    if model not in PROFILES:
+        raise ValueError(f"no such module; known are {', '.join(PROFILES)}")
+    return model
+
+
+def _known_baud(baud: int) -> int:
+    if baud not in BAUDS:
+        raise ValueError(f"no drive has this rate; known are {', '.join(map(str, BAUDS))}")
+    return baud
+
+
+def _known_port(port: str) -> str:
+    if port.startswith(("/", "socket://", "sim:")):
+        return port
+    raise ValueError("a port is a device path, socket://host:port, or sim:NAME")
+
+
+class ModuleConfig(Frozen):
+    """A module that is on a line and is no axis: an I/O module, a drive of a model that ldcnd only identifies."""
+
+    address: int = Field(ge=1, le=127)
+    """Its place in the daisy chain, from 1."""
+    model: Annotated[str, AfterValidator(_known_module)]
+    """The module model."""
+    identity: DeviceIdentity | None = None
+    """As for an axis."""
+
+
+class GroupConfig(Frozen):
+    """Axes that can be started in the same servo cycle and stopped by one packet; an axis is in one group at most."""
+
+    name: Name
+    """For people and messages."""
+    axes: tuple[Name, ...] = Field(min_length=2, max_length=31)
+    """The members."""
+    leader: Name | None = None
+    """The axis whose drive answers for the group."""
+
+
+class BusConfig(Frozen):
+    """One line."""
+
+    name: Name
+    """For people and messages, and its chunk in `meta/buses`."""
+    port: Annotated[str, AfterValidator(_known_port)]
+    """A device path, socket://host:port, or sim:NAME."""
+    family: Literal["ldcn", "smartstep"] = "ldcn"
+    """The drive family on it."""
+    smartstep: SmartStepLineConfig = SmartStepLineConfig()
+    """How a line of the smartstep family is wired; its rate is always 9600."""
+    baud: Annotated[int, AfterValidator(_known_baud)] = 19_200
+    """The working rate."""
+    margin_ms: float = Field(default=5.0, gt=0, le=1000)
+    """Added to every reply's deadline: host scheduling and adapter latency."""
+    adapter_latency_ms: float = Field(default=1.0, ge=0, le=100)
+    """What the adapter keeps each reply back, for the plan: 1 for FTDI in low-latency mode, 0 for a UART on board."""
+    overload: Literal["refuse", "skip"] = "refuse"
+    """Rates that the line may not be able to keep: refused before anything is opened, or polls skip turns."""
+    start: StartPolicy = StartPolicy.RESET
+    """Whether the drives are reset at start, or taken over as they are; a line that was lost is always taken over."""
+    adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
+    """What happens to a line that cannot be taken over when `start` asks for it."""
+    divisors: Literal["manual", "alternate"] = "manual"
+    """The family of baud rate divisors: 57600 is 3.3 % fast with the manual's, 1.4 % slow with the alternate ones."""
+    snapshot: bool = False
+    """Positions of all axes may be frozen at one instant; it overwrites the drives' home registers."""
+    axis: tuple[AxisConfig, ...] = Field(min_length=1, max_length=31)
+    """The drives that are axes."""
+    module: tuple[ModuleConfig, ...] = Field(default=(), max_length=30)
+    """What is on the line besides the axes."""
+    group: tuple[GroupConfig, ...] = Field(default=(), max_length=15)
+    """Axes that start and stop together."""
+
+    @model_validator(mode="after")
+    def _unique_addresses(self) -> Self:
+        addresses = [axis.address for axis in self.axis]
+        for address in addresses:
+            if addresses.count(address) > 1:
+                raise ValueError(f"address {address} is given to more than one axis")
+        addresses += [module.address for module in self.module]
+        for module in self.module:
+            if addresses.count(module.address) > 1:
+                raise ValueError(f"address {module.address} of a module is given twice")
+        return self
+
+    @model_validator(mode="after")
+    def _one_family(self) -> Self:
+        is_smartstep = self.family == "smartstep"
+        for axis in self.axis:
+            if (axis.model == smartstep_config.MODEL) is not is_smartstep:
+                raise ValueError(f"axis {axis.name}: a {axis.model} does not belong on a line of family {self.family}")
+        if is_smartstep and len(self.axis) > 1 and any(axis.address == 0 for axis in self.axis):
+            raise ValueError("unit 0 never releases its transmitter: it must be alone on its line")
+        return self
+
+    @model_validator(mode="after")
+    def _reachable_rate(self) -> Self:
+        models = {axis.address: axis.model for axis in self.axis}
+        models.update({module.address: module.model for module in self.module})
+        for address, model in models.items():
+            profile = PROFILES.get(model)
+            if profile and self.baud > profile.top_baud:
+                raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {profile.top_baud} at most")
+        return self
+
+    @model_validator(mode="after")
+    def _possible_groups(self) -> Self:
+        refuse_duplicates("group", [group.name for group in self.group])
+        refuse_duplicates("group member", [name for group in self.group for name in group.axes])
+        known = [axis.name for axis in self.axis]
+        for group in self.group:
+            for name in group.axes:
+                if name not in known:
+                    raise ValueError(f"group {group.name}: no axis {name!r} on this bus; there are {', '.join(known)}")
+            if group.leader is not None and group.leader not in group.axes:
+                raise ValueError(f"group {group.name}: leader {group.leader!r} is not one of {', '.join(group.axes)}")
+        return self

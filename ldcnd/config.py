@@ -1,0 +1,117 @@
+"""The configuration file: TOML, validated whole before anything is opened."""
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from ldcnd.bus_config import BusConfig
+from ldcnd.config_names import Name, refuse_duplicates
+from ldcnd.model.frozen import Frozen
+from ldcnd.simulation_config import SimulatedChainConfig
+from ldcnd.smartstep_config import SimulatedUnitConfig
+from ldcnd.toml_file import read_toml
+
+
+class SimulatedLineConfig(SimulatedChainConfig):
+    """One simulated line, used by `port = "sim:NAME"`."""
+
+    name: Name
+    """What `port = "sim:NAME"` names."""
+    unit: tuple[SimulatedUnitConfig, ...] = Field(default=(), max_length=16)
+    """SmartSteps; a line has modules or units."""
+
+    @model_validator(mode="after")
+    def _one_family(self) -> Self:
+        if bool(self.module) is bool(self.unit):
+            raise ValueError("a simulated line has either modules or units")
+        refuse_duplicates("unit", [str(unit.number) for unit in self.unit])
+        return self
+
+
+class ZenohConfig(Frozen):
+    """Where the daemon meets its clients."""
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints to listen on; the default is this machine only, or what `config_file` says."""
+    connect: tuple[str, ...] = ()
+    """Endpoints (routers, other daemons) to connect to."""
+    config_file: Path | None = None
+    """A Zenoh configuration to start from, for TLS and access control; a relative name counts from the rig's file."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _endpoints_of_file(cls, document: object) -> object:
+        """Leave it to the file where to listen, unless that is said here."""
+        if isinstance(document, dict) and document.get("config_file"):
+            return {"listen": (), **document}
+        return document
+
+
+class DaemonConfig(Frozen):
+    """How the daemon's process runs."""
+
+    uvloop: bool = False
+    """Use uvloop's event loop, if it is installed: less work for each exchange."""
+    hold_cpu_awake: bool = False
+    """Keep the processor out of deep idle states: quicker turn-around for more power; needs /dev/cpu_dma_latency."""
+
+
+class TelemetryConfig(Frozen):
+    """How telemetry leaves."""
+
+    encoding: Literal["msgpack", "json"] = "msgpack"
+    """json can be read by every Zenoh tool; msgpack is smaller."""
+
+
+class RigConfig(Frozen):
+    """A whole rig: what `ldcnd run` needs to know."""
+
+    rig: Name
+    """Second chunk of every key; unique on the site."""
+    zenoh: ZenohConfig = ZenohConfig()
+    """Where the daemon meets its clients."""
+    daemon: DaemonConfig = DaemonConfig()
+    """How the daemon's process runs."""
+    telemetry: TelemetryConfig = TelemetryConfig()
+    """How telemetry leaves."""
+    authority: Literal["open", "leased"] = "open"
+    """Whether a lease is needed to move anything; readers and stops never need one."""
+    state_dir: Path | None = None
+    """Where the daemon keeps what must outlive it, such as the wear of EEPROMs; without it EEPROM is not written."""
+    bus: tuple[BusConfig, ...] = Field(min_length=1)
+    """The lines."""
+    sim: tuple[SimulatedLineConfig, ...] = ()
+    """Simulated lines, used by ports of the form sim:NAME."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        refuse_duplicates("bus", [bus.name for bus in self.bus])
+        refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis])
+        refuse_duplicates("sim", [line.name for line in self.sim])
+        ports = [bus.port for bus in self.bus]
+        refuse_duplicates("port", ports)
+        lines = {line.name for line in self.sim}
+        for port in ports:
+            if port.startswith("sim:") and port.removeprefix("sim:") not in lines:
+                known = ", ".join(sorted(lines)) or "none"
+                raise ValueError(f"port {port!r}: no [[sim]] of that name; there are: {known}")
+        units = {line.name for line in self.sim if line.unit}
+        for bus in self.bus:
+            if bus.port.startswith("sim:") and (bus.family == "smartstep") is not (bus.port[4:] in units):
+                raise ValueError(f"bus {bus.name}: SmartSteps are simulated by units, other drives by modules")
+        return self
+
+
+def load_config(path: Path) -> RigConfig:
+    """Read and validate a rig's configuration.
+
+    Raises:
+        ConfigError: the file cannot be read, is not TOML, or cannot work; names file, keys, what is wrong, what is
+            allowed.
+    """
+    rig = read_toml(path, RigConfig)
+    if rig.zenoh.config_file is None:
+        return rig
+    zenoh = rig.zenoh.model_copy(update={"config_file": path.parent / rig.zenoh.config_file})
+    return rig.model_copy(update={"zenoh": zenoh})

@@ -1,0 +1,96 @@
+"""The configuration file as a page for people, written from the models that read it."""
+
+import types
+from collections.abc import Iterator
+from enum import StrEnum
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from ldcnd.config import RigConfig
+
+PREFACE = """# Configuration
+
+A rig is one TOML file. `ldcnd check-config FILE` validates it whole, without opening anything, and names file, key,
+what is wrong and what is allowed; `ldcnd run` does the same before it opens a port. Defaults are those of the models;
+keys that are not listed here are refused.
+"""
+
+
+def config_reference() -> str:
+    """Return the page, in Markdown."""
+    return PREFACE + "".join(_sections(RigConfig, "", {RigConfig}))
+
+
+def _sections(model: type[BaseModel], path: str, seen: set[type[BaseModel]]) -> Iterator[str]:
+    """Describe a table and the tables within it, each model once."""
+    title = f"`[{path}]`" if path else "Top level"
+    what = (model.__doc__ or "").strip().splitlines()[0]
+    rows = "".join(_row(name, field) for name, field in model.model_fields.items())
+    yield f"\n## {title}\n\n{what}\n\n| key | type | default | meaning |\n|---|---|---|---|\n{rows}"
+    for name, field in model.model_fields.items():
+        inner, many = _table(field.annotation)
+        if inner and inner not in seen:
+            seen.add(inner)
+            below = f"{path.strip('[]')}.{name}".lstrip(".")
+            yield from _sections(inner, f"[{below}]" if many else below, seen)
+
+
+def _row(name: str, field: FieldInfo) -> str:
+    default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
+    meaning = " ".join((field.description or "").split())
+    bounds = ", ".join(text for constraint in field.metadata if (text := _bound(constraint)))
+    return f"| `{name}` | {_type(field.annotation)}{f', {bounds}' if bounds else ''} | {default} | {meaning} |\n"
+
+
+def _bound(constraint: object) -> str:
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    return " ".join(
+        f"{signs[name]} {value:g}" for name in signs if (value := getattr(constraint, name, None)) is not None
+    )
+
+
+def _value(value: Any) -> str:  # noqa: ANN401 - a default can be anything
+    if value is PydanticUndefined or value is None:
+        return "none"
+    if isinstance(value, BaseModel):
+        return "see below"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    if isinstance(value, StrEnum | str):
+        return f'`"{value}"`'
+    if isinstance(value, tuple):
+        return f"`[{', '.join(_value(item).strip('`') for item in value)}]`"
+    return f"`{value}`"
+
+
+def _type(annotation: Any) -> str:  # noqa: ANN401 - an annotation can be anything
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _type(arguments[0])
+    if origin in (Union, types.UnionType):
+        return " or ".join(_type(part) for part in arguments if part is not type(None))
+    if origin is Literal:
+        return " or ".join(f'`"{choice}"`' for choice in arguments)
+    if origin is tuple:
+        return f"array of {_type(arguments[0])}"
+    if isinstance(annotation, type) and issubclass(annotation, StrEnum):
+        return " or ".join(f'`"{choice}"`' for choice in annotation)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "table"
+    return {"str": "string", "int": "integer", "float": "number", "bool": "true or false", "Path": "path"}.get(
+        getattr(annotation, "__name__", ""), str(annotation)
+    )
+
+
+def _table(annotation: Any) -> tuple[type[BaseModel] | None, bool]:  # noqa: ANN401 - an annotation can be anything
+    """Return the model of a table, and whether there may be many of them."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation, False
+    for part in get_args(annotation):
+        inner, _ = _table(part)
+        if inner:
+            return inner, get_origin(annotation) is tuple
+    return None, False

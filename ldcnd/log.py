@@ -1,0 +1,95 @@
+"""Structured logging: fixed phrases with fields, for a terminal, for another program, or for the journal.
+
+In the journal every field can be asked for, such as EXTRA_BUS, EXTRA_AXIS, EXTRA_COMMAND_ID and EXTRA_CODE, where the
+package logging-journald is installed; without it, records keep their priority and carry the fields in their text.
+Source: sd-daemon(3) for the prefixes of lines, systemd.exec(5) "$JOURNAL_STREAM".
+"""
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Mapping, MutableMapping
+from typing import Any, TextIO
+
+import structlog
+
+PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
+"""Levels as syslog and the journal number them."""
+
+
+def get_logger(name: str) -> structlog.stdlib.BoundLogger:
+    """Return the logger of one part of the daemon; `name` is its noun."""
+    logger: structlog.stdlib.BoundLogger = structlog.stdlib.get_logger(f"ldcnd.{name}")
+    return logger
+
+
+def configure_logging(*, json: bool = False, level: str = "info") -> None:
+    """Send log records to standard error, as text for people or as JSON lines; to the journal where that listens there.
+
+    Args:
+        json: one JSON object a line instead of text, also in the journal.
+        level: debug, info, warning or error.
+    """
+    journal = not json and is_journal(sys.stderr, os.environ)
+    processors: list[structlog.typing.Processor] = [
+        structlog.stdlib.filter_by_level,
+        structlog.processors.format_exc_info,
+    ]
+    if journal:
+        handler = _journal_handler(sys.stderr)
+        processors.append(_text_and_fields)
+    else:
+        handler = logging.StreamHandler(sys.stderr)
+        processors += [
+            structlog.stdlib.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+        ]
+    structlog.configure(
+        processors=processors,
+        wrapper_class=structlog.stdlib.BoundLogger,
+        logger_factory=structlog.stdlib.LoggerFactory(),
+    )
+    logging.basicConfig(handlers=[handler], level=level.upper(), format="%(message)s", force=True)
+
+
+def is_journal(stream: TextIO, environment: Mapping[str, str]) -> bool:
+    """Tell whether what is written to the stream goes to the journal."""
+    try:
+        status = os.fstat(stream.fileno())
+    except (OSError, ValueError):
+        return False
+    return environment.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+class PrefixedLines(logging.Formatter):
+    """Puts the priority in front of every line, as the journal takes it from a service's standard error."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record's lines; each becomes an entry of its own."""
+        prefix = f"<{PRIORITIES.get(record.levelno, PRIORITIES[logging.INFO])}>"
+        return "\n".join(prefix + line for line in super().format(record).splitlines())
+
+
+def _journal_handler(stream: TextIO) -> logging.Handler:
+    handler: logging.Handler
+    try:
+        journald = importlib.import_module("logging_journald")  # optional: ldcnd[journal]
+    except ImportError:
+        handler = logging.StreamHandler(stream)
+        handler.setFormatter(PrefixedLines())
+    else:
+        handler = journald.JournaldLogHandler(identifier="ldcnd", use_message_id=False)
+    return handler
+
+
+def _text_and_fields(
+    _logger: object, _method: str, event: MutableMapping[str, Any]
+) -> tuple[tuple[str], Mapping[str, Mapping[str, Any]]]:
+    """Return what the standard logger takes: the phrase with its fields as text, and the fields by themselves."""
+    phrase, trace = str(event.pop("event", "")), event.pop("exception", "")
+    text = " ".join([phrase, *(f"{key}={value!s}" for key, value in event.items() if value is not None)])
+    taken = logging.makeLogRecord({}).__dict__.keys() | {"message", "asctime"}
+    fields = {f"{key}_" if key in taken else key: value for key, value in event.items() if value is not None}
+    return (f"{text}\n{trace}" if trace else text,), {"extra": fields}

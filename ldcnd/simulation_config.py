@@ -1,0 +1,250 @@
+"""What a simulated LDCN/NMC line consists of and what happens to it, as it is written in TOML.
+
+Shared by `[[sim]]` of a rig and by the files of `ldcnd sim`. Defaults are those of `MODELS` and of `MotorPlant`: what
+is left out here is left to them.
+"""
+
+from dataclasses import replace
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from ldcnd.drivers.ldcn.profiles import Support
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.simulated_module import ModuleSettings, PositionErrorClearing
+from ldcnd.drivers.ldcn.simulated_power import Condition
+from ldcnd.drivers.ldcn.simulator import MODELS, ChainSpec, ModuleSpec, TimedEvent
+from ldcnd.model.frozen import Frozen
+from ldcnd.sim.chain import Delivery
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.plant import MotorPlant
+
+ENDLESS_TRAVEL_COUNTS = (-(1 << 30), 1 << 30)
+
+
+def _known_module(model: str) -> str:
+    if model not in MODELS:
+        raise ValueError(f"no such simulated module; known are {', '.join(MODELS)}")
+    return model
+
+
+ModuleName = Annotated[str, AfterValidator(_known_module)]
+"""A module as in `ldcnd sim --chain`."""
+Probability = Annotated[float, Field(ge=0, le=1)]
+CountRange = tuple[int, int]
+
+
+def _rising(span: CountRange | None) -> CountRange | None:
+    if span is not None and span[0] >= span[1]:
+        raise ValueError(f"the first number must be below the second, not {span[0]} and {span[1]}")
+    return span
+
+
+class PlantConfig(Frozen):
+    """The machine on a shaft; what is left out is a small servo motor, 3000 1/min at 24 V."""
+
+    counts_per_rev: int | None = Field(default=None, gt=0)
+    """Encoder counts of a revolution; 2000 when left out."""
+    supply_v: float | None = Field(default=None, gt=0, le=100)
+    """Voltage at full duty; 24."""
+    resistance_ohm: float | None = Field(default=None, gt=0)
+    """Of the winding; 1.2."""
+    torque_nm_per_a: float | None = Field(default=None, gt=0)
+    """Also the back EMF constant in V s/rad; 0.0767."""
+    inertia_kg_m2: float | None = Field(default=None, gt=0)
+    """Of motor and load; 5e-5."""
+    viscous_nm_s: float | None = Field(default=None, gt=0)
+    """Viscous friction per rad/s; 1e-5."""
+    friction_nm: float | None = Field(default=None, ge=0)
+    """Coulomb friction, also at standstill; 0.004."""
+    stop_margin_counts: int | None = Field(default=None, ge=0)
+    """The hard stops lie so far behind the limit switches; 2000."""
+    index_at_counts: int | None = None
+    """Where an index pulse begins; 700."""
+    index_spacing_counts: int | None = Field(default=None, gt=0)
+    """From one index pulse to the next; a revolution when left out."""
+    index_width_counts: int | None = Field(default=None, gt=0)
+    """How long a pulse is; 4. Firmware samples it once per servo cycle and may miss it."""
+    pot_span_counts: Annotated[CountRange | None, AfterValidator(_rising)] = None
+    """The potentiometer turns from 0 to full scale over this range."""
+    pot_noise: float | None = Field(default=None, ge=0, le=1)
+    """Standard deviation of its reading, as a share of full scale."""
+
+
+class ModuleKnobs(Frozen):
+    """How one module behaves where the manuals allow variants."""
+
+    version: int | None = Field(default=None, ge=0, le=255)
+    """Second byte of its identity."""
+    phase_s: float | None = Field(default=None, ge=0, lt=SERVO_CYCLE_S)
+    """Where its servo cycles lie; drawn by lot when left out."""
+    drift_ppm: float | None = Field(default=None, ge=-10_000, le=10_000)
+    """How much longer its servo cycles are than nominal; drawn by lot when left out."""
+    reply_latency_s: float | None = Field(default=None, ge=0, le=10)
+    """Added between the end of the servo cycle and the reply."""
+    reset_dead_s: float | None = Field(default=None, ge=0, le=10)
+    """How long it is deaf after Hard Reset and power-up."""
+    always_obeys_global_reset: bool | None = None
+    """Whether Hard Reset to FF is obeyed in any group, or only in group FF."""
+    stop_clears_velocity: bool | None = None
+    """Whether Stop Motor sets the velocity register to 0."""
+    position_error_clearing: PositionErrorClearing | None = None
+    """What takes the position error bit back: Clear Sticky Bits only, or closing the loop, too."""
+    sense_counts_per_a: float | None = Field(default=None, ge=0)
+    """A/D counts per ampere of motor current, PIC-SERVO."""
+
+
+class SimulatedModuleConfig(Frozen):
+    """One simulated module and the machine on its shaft."""
+
+    model: ModuleName
+    """Module name as in `ldcnd sim --chain`."""
+    travel_counts: Annotated[CountRange | None, AfterValidator(_rising)] = None
+    """Where the limit switches sit, in counts from the power-up position; endless when left out."""
+    plant: PlantConfig = PlantConfig()
+    """Constants of the machine."""
+    behaviour: ModuleKnobs = ModuleKnobs()
+    """Where the manuals allow variants."""
+    conditions: tuple[Condition, ...] = ()
+    """What is wrong around the drive from the beginning."""
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it has a motor."""
+        return MODELS[self.model][0].support is Support.FULL
+
+    @model_validator(mode="after")
+    def _only_drives_suffer(self) -> Self:
+        if self.conditions and not self.is_drive:
+            raise ValueError(f"conditions: a {self.model} has no motor")
+        return self
+
+    def spec(self, seed: int) -> ModuleSpec:
+        """Return what the simulator builds.
+
+        Args:
+            seed: of the potentiometer's noise.
+        """
+        given = self.behaviour.model_dump(exclude_none=True)
+        reverse, forward = self.travel_counts or ENDLESS_TRAVEL_COUNTS
+        travel = MotorPlant(reverse_limit_counts=reverse, forward_limit_counts=forward, seed=seed)
+
+        def adjust(settings: ModuleSettings) -> ModuleSettings:
+            return replace(settings, **given)
+
+        plant = replace(travel, **self.plant.model_dump(exclude_none=True))
+        return ModuleSpec(self.model, plant, adjust=adjust, conditions=frozenset(self.conditions))
+
+
+class SimulatedEventConfig(Frozen):
+    """Something that happens to one module at a given time."""
+
+    at_s: float = Field(ge=0)
+    """Seconds after the line was opened first."""
+    module: int = Field(ge=1, le=31)
+    """Its place in the chain; 1 is next to the host."""
+    begins: Condition | None = None
+    """A condition that begins,"""
+    ends: Condition | None = None
+    """or one that ends,"""
+    power: Literal["on", "off"] | None = None
+    """or the module's own supply; switched on, it starts as after a reset."""
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> Self:
+        if sum(each is not None for each in (self.begins, self.ends, self.power)) != 1:
+            raise ValueError("an event needs exactly one of begins, ends, power")
+        return self
+
+    def spec(self, starts_at_s: float) -> TimedEvent:
+        """Return what the simulator plays."""
+        present = self.begins is not None or self.power == "on"
+        return TimedEvent(starts_at_s + self.at_s, self.module, self.begins or self.ends, present=present)
+
+
+class SimulatedFaultConfig(Frozen):
+    """Something that may go wrong on the wires."""
+
+    kind: FaultKind
+    """What happens."""
+    probability: Probability = 1.0
+    """Of it happening to one request or reply."""
+    from_s: float = Field(default=0.0, ge=0)
+    """Possible from this time on, in seconds after the line was opened first."""
+    until_s: float | None = Field(default=None, gt=0)
+    """Possible before this time."""
+    longest_s: float = Field(default=0.0, ge=0)
+    """For reply_delayed the longest delay, for unplugged the duration."""
+
+    @model_validator(mode="after")
+    def _has_a_length(self) -> Self:
+        if self.kind in {FaultKind.REPLY_DELAYED, FaultKind.UNPLUGGED} and self.longest_s == 0.0:
+            raise ValueError(f"{self.kind} needs longest_s above 0")
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
+        return self
+
+    def spec(self, starts_at_s: float) -> Fault:
+        """Return what the simulator plays."""
+        fault = Fault(self.kind, self.probability, starts_at_s + self.from_s, longest_s=self.longest_s)
+        return fault if self.until_s is None else replace(fault, until_s=starts_at_s + self.until_s)
+
+
+class FaultPlanConfig(Frozen):
+    """A file of its own for what may go wrong on the wires."""
+
+    fault: tuple[SimulatedFaultConfig, ...] = ()
+    """Added to those of the line."""
+
+
+class SimulatedChainConfig(Frozen):
+    """A simulated line, the first module next to the host."""
+
+    seed: int = 1
+    """Of everything that is drawn by lot."""
+    module: tuple[SimulatedModuleConfig, ...] = Field(default=(), max_length=31)
+    """In daisy-chain order."""
+    event: tuple[SimulatedEventConfig, ...] = ()
+    """What happens by itself."""
+    fault: tuple[SimulatedFaultConfig, ...] = ()
+    """What may go wrong on the wires."""
+
+    @model_validator(mode="after")
+    def _possible_events(self) -> Self:
+        for number, event in enumerate(self.event):
+            if event.module > len(self.module):
+                raise ValueError(f"event[{number}]: there is no module {event.module}, only {len(self.module)}")
+            module = self.module[event.module - 1]
+            if event.power is None and not module.is_drive:
+                raise ValueError(f"event[{number}]: module {event.module} is a {module.model} and has no motor")
+        return self
+
+    def spec(
+        self, *, baud_check: bool = True, delivery: Delivery = Delivery.WHOLE, starts_at_s: float = 0.0
+    ) -> ChainSpec:
+        """Return what the simulator builds.
+
+        Args:
+            baud_check: bytes at another rate than a module's are garbage to it.
+            delivery: how reply bytes reach the host.
+            starts_at_s: the instant of the line's clock from which events and faults are counted.
+        """
+        return ChainSpec(
+            tuple(module.spec(self.seed + place) for place, module in enumerate(self.module)),
+            baud_check=baud_check,
+            delivery=delivery,
+            faults=FaultPlan(tuple(fault.spec(starts_at_s) for fault in self.fault), self.seed),
+            seed=self.seed,
+            events=tuple(event.spec(starts_at_s) for event in self.event),
+        )
+
+
+class SimulationConfig(SimulatedChainConfig):
+    """A file of `ldcnd sim --file`."""
+
+    module: tuple[SimulatedModuleConfig, ...] = Field(min_length=1, max_length=31)
+    """In daisy-chain order."""
+    baud_check: bool = False
+    """Bytes at another rate than a module's are garbage to it."""
+    delivery: Delivery = Delivery.WHOLE
+    """Replies reach the host in one piece, or byte by byte."""

@@ -1,0 +1,102 @@
+"""What the configuration file says about SmartStep lines and units, beside what every line and axis has."""
+
+from collections.abc import Mapping
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from ldcnd.drivers.smartstep.profiles import EepromWrite, Framing, Standing, Wiring
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.monitors import MonitorName
+from ldcnd.smartstep_trace_config import SmartStepTraceConfig
+
+MODEL = "smartstep"
+"""The one drive model of the family."""
+
+MOTION_KEYS = ("velocity", "acceleration", "limits", "gains", "reference", "home", "pwm", "tracking", "identity")
+"""Keys of an axis that only a drive with commands for motion has."""
+SLOW_RATES = {"position": 1.0, "velocity": 2.0, "state": 1.0, "adc": 0.0}
+"""What is asked for unless the file says otherwise: one word takes about 40 ms."""
+
+
+class SmartStepLineConfig(Frozen):
+    """How a line of SmartSteps is wired."""
+
+    framing: Framing = Framing.SEVEN_EVEN
+    """7e1, or 8n1-soft-parity for adapters that cannot make seven bits and parity."""
+    wiring: Wiring = Wiring.FOUR_WIRE
+    """4-wire as in the manual; 2-wire needs accept_two_wire."""
+    accept_two_wire: bool = False
+    """Two wires are known to be risky: a drive may take its own replies for commands."""
+    echo: Literal["none", "expect"] = "none"
+    """Whether the adapter returns what the host sends; on two wires it may."""
+
+    @model_validator(mode="after")
+    def _wires(self) -> Self:
+        if self.wiring is Wiring.TWO_WIRE and not self.accept_two_wire:
+            raise ValueError("wiring 2-wire is not described in the manual; set accept_two_wire = true to use it")
+        if self.echo == "expect" and self.wiring is Wiring.FOUR_WIRE:
+            raise ValueError("there is no echo on four wires")
+        return self
+
+
+class SmartStepUnitConfig(Frozen):
+    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
+
+    monitors: Mapping[MonitorName, float] = {}
+    """Monitors to publish, with their rates in Hz."""
+    eeprom_write: EepromWrite = EepromWrite.CONFIRM
+    """deny forbids it; otherwise EEPROM is written when a request names it."""
+    eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
+    """Writes of one parameter until further ones are refused."""
+    first_character_s: float = Field(default=0.3, gt=0, le=5)
+    """The longest wait for a reply; the manual says 0.2 s."""
+    encoder_counts_per_rev: int = Field(default=8000, gt=0)
+    """Pulses of the feedback counter in one turn."""
+    run_active_low: bool = True
+    """RUN is on while its input bit is 0."""
+    reset_active_low: bool = True
+    """RESET is on while its input bit is 0."""
+    alarm_output_high: bool = True
+    """/ALM is 1 in alarm."""
+    trace: SmartStepTraceConfig = SmartStepTraceConfig()
+    """How its recorder is taken to work."""
+    settled: Mapping[str, Standing] = {}
+    """What a bench has said about the doubts of the profile, by their keys."""
+
+    @model_validator(mode="after")
+    def _rates(self) -> Self:
+        for name, rate in self.monitors.items():
+            if not 0 <= rate <= 100:  # noqa: PLR2004 - a word takes 29 ms at least
+                raise ValueError(f"monitors.{name}: {rate} Hz is not 0 to 100")
+        return self
+
+
+class SimulatedUnitConfig(Frozen):
+    """One simulated SmartStep."""
+
+    number: int = Field(ge=0, le=15)
+    """Its unit number."""
+    run: bool = False
+    """RUN is on."""
+    pulse_rate: float = 0.0
+    """Command units a second that come in from the start."""
+
+
+def as_axis(document: object) -> object:
+    """Return an axis as the file has it, completed where the drive is a SmartStep.
+
+    Such a drive takes no motion over its line, so keys for it are refused; what every axis must have is filled with
+    values that nothing reads.
+
+    Raises:
+        ValueError: a key for motion.
+    """
+    if not isinstance(document, dict) or document.get("model") != MODEL:
+        return document
+    for key in MOTION_KEYS:
+        if key in document:
+            raise ValueError(f"{key}: a SmartStep takes no motion over its line; remove it")
+    rates = document.get("rates", {})
+    slow = {**SLOW_RATES, **rates} if isinstance(rates, dict) else rates
+    return {**document, "velocity": 1.0, "acceleration": 1.0, "rates": slow}
