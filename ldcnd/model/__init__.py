@@ -1,0 +1,1 @@
+"""The shared vocabulary: frozen pydantic models, the single source of `schemas/`."""

@@ -1,0 +1,98 @@
+"""What has happened: who moved what, when, with which result."""
+
+from enum import StrEnum
+
+from pydantic import Field
+
+from ldcnd.model.frozen import Frozen
+
+
+class CommandStatus(StrEnum):
+    """How far a command has got; the last five are final."""
+
+    ACCEPTED = "accepted"
+    """Admitted: not refused so far."""
+    EXECUTING = "executing"
+    """The drive acknowledged it."""
+    DONE = "done"
+    """It ended as it was asked."""
+    ABORTED = "aborted"
+    """Another command, a stop or a loss policy ended it early."""
+    REFUSED = "refused"
+    """Nothing was sent to any drive."""
+    FAILED = "failed"
+    """The drive or the line failed."""
+    UNKNOWN = "unknown"
+    """It may or may not have been executed; nobody can tell."""
+
+
+FINAL = frozenset(
+    {
+        CommandStatus.DONE,
+        CommandStatus.ABORTED,
+        CommandStatus.REFUSED,
+        CommandStatus.FAILED,
+        CommandStatus.UNKNOWN,
+    }
+)
+
+
+class CommandEvent(Frozen):
+    """A command got further: published on `tele/<axis>/event`."""
+
+    t: int
+    """When, UTC in ns since 1970."""
+    seq: int = Field(ge=0)
+    """Grows by one with every event of the axis."""
+    axis: str
+    """The axis."""
+    command_id: str
+    """Which command."""
+    verb: str
+    """What was asked."""
+    client: str | None
+    """By whom, as far as that is known; names are not authenticated."""
+    status: CommandStatus
+    """How far it has got."""
+    reason: str | None = None
+    """Why, when it did not end as asked."""
+    code: str | None = None
+    """The error code, when there is one."""
+
+
+class OutcomeRequest(Frozen):
+    """Ask what became of a command."""
+
+    command_id: str
+    """Which command."""
+
+
+class CommandOutcome(Frozen):
+    """What became of a command: the reply to `@cmd/_/outcome`."""
+
+    command_id: str
+    """Which command."""
+    axis: str
+    """The axis."""
+    verb: str
+    """What was asked."""
+    status: CommandStatus
+    """How far it has got."""
+    reason: str | None
+    """Why, when it did not end as asked."""
+
+
+class EventsRequest(Frozen):
+    """Ask for the latest events."""
+
+    axis: str | None = None
+    """Only this axis."""
+    count: int = Field(default=100, ge=1, le=1000)
+    """At most so many, the latest."""
+
+
+class EventList(Frozen):
+    """The latest events, oldest first: the reply to `@cmd/_/events`."""
+
+    events: tuple[CommandEvent, ...]
+    """What has happened."""

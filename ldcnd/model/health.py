@@ -1,0 +1,92 @@
+"""How well a rig is doing, once a second: what a monitoring system watches."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from ldcnd.model.axes import LinkState
+from ldcnd.model.frozen import Frozen
+
+
+class LaneHealth(Frozen):
+    """What waits and how long it takes in one lane of a line."""
+
+    lane: Literal["stop", "command", "poll", "background"]
+    """Stops go before commands, commands before polls, background work comes last."""
+    waiting: int = Field(ge=0)
+    """Exchanges that wait now; polls are scheduled, not queued, and never counted here."""
+    exchanges: int = Field(ge=0)
+    """Replies since the daemon started."""
+    p50_s: float = Field(ge=0)
+    """Half of them came within so many seconds after they were queued (polls: after they were due)."""
+    p99_s: float = Field(ge=0)
+    """The same for 99 %."""
+    longest_s: float = Field(ge=0)
+    """The longest one."""
+
+
+class AxisHealth(Frozen):
+    """How fresh an axis's samples are."""
+
+    axis: str
+    """The axis."""
+    link: LinkState
+    """Whether its drive answers."""
+    sample_age_s: float | None = Field(ge=0)
+    """Age of the latest position, in seconds; null before the first."""
+    rate_wanted_hz: float = Field(ge=0)
+    """How often the configuration asks for the position."""
+    rate_hz: float = Field(ge=0)
+    """How often it was published in the last period."""
+    faults: int = Field(ge=0)
+    """Faults that stand now."""
+
+
+class BusHealth(Frozen):
+    """One line and its axes: published each second on `meta/health/<bus>`."""
+
+    t: int
+    """When, UTC in ns since 1970."""
+    seq: int = Field(ge=0)
+    """Grows by one with every report."""
+    bus: str
+    """The line."""
+    up: bool
+    """Its drives are polled."""
+    utilisation: float = Field(ge=0)
+    """Share of the last period for which bytes were on the wire, 0 to 1; waiting for drives is not counted."""
+    exchanges: int = Field(ge=0)
+    """Requests sent since the daemon started, the other counters likewise."""
+    timeouts: int = Field(ge=0)
+    """Exchanges without a complete reply."""
+    corrupt_replies: int = Field(ge=0)
+    """Replies that could not be trusted."""
+    rejected_packets: int = Field(ge=0)
+    """Packets that a node received damaged and did not execute."""
+    resent: int = Field(ge=0)
+    """Exchanges sent again."""
+    resynchronisations: int = Field(ge=0)
+    """How often the line was fenced."""
+    stray_bytes: int = Field(ge=0)
+    """Bytes that nobody had asked for."""
+    losses: int = Field(ge=0)
+    """How often the port was lost."""
+    lanes: tuple[LaneHealth, ...]
+    """The most urgent first."""
+    axes: tuple[AxisHealth, ...]
+    """The axes on the line."""
+
+
+class DaemonHealth(Frozen):
+    """The daemon's process: published each second on `meta/health`."""
+
+    t: int
+    """When, UTC in ns since 1970."""
+    seq: int = Field(ge=0)
+    """Grows by one with every report."""
+    loop_lag_s: float = Field(ge=0)
+    """The longest that a timer of the daemon came too late in the last period, in seconds."""
+    published: int = Field(ge=0)
+    """Samples and events handed to the network since the daemon started."""
+    missed_reports: int = Field(ge=0)
+    """Reports that were left out since the daemon started because it was held up for longer than a period."""

@@ -1,0 +1,151 @@
+"""What a drive with readable parameters says about them, about its alarms and about itself."""
+
+from enum import StrEnum
+
+from pydantic import Field
+
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.replies import CommandReply
+
+
+class Memory(StrEnum):
+    """Where a parameter value is kept."""
+
+    RAM = "ram"
+    """The value in use; lost at power-off."""
+    EEPROM = "eeprom"
+    """The value for good; the memory endures a limited number of writes."""
+
+
+class CounterName(StrEnum):
+    """The pulse counters of a drive."""
+
+    COMMAND = "command"
+    """Pulses that came in."""
+    FEEDBACK = "feedback"
+    """Pulses of the encoder."""
+
+
+class ParameterInfo(Frozen):
+    """One parameter of a drive: what is known of it, without its value."""
+
+    parameter: str
+    """Its number as the drive displays it, such as Pn100."""
+    name: str
+    """The manual's name."""
+    unit: str | None
+    """Null where it has none, or nobody knows."""
+    lowest: int | None
+    """Lower end of the range; a hint, the drive itself refuses what it does not take."""
+    highest: int | None
+    """Upper end of the range; a hint."""
+    default: int | None
+    """Factory setting; a hint."""
+    digits: bool
+    """Four separate settings, to be read as hexadecimal digits."""
+    power_cycle: bool | None
+    """A change takes effect at the next power-on only; null where nobody knows."""
+    confidence: str | None
+    """Where range and unit come from: S the manual, X a related drive, M recollection; null where nothing is known."""
+
+
+class ParameterList(CommandReply):
+    """The parameters of a drive, in the manual's order."""
+
+    parameters: tuple[ParameterInfo, ...]
+    """What is known of each."""
+
+
+class ParameterValue(Frozen):
+    """The value of a parameter in both memories, as read at this moment."""
+
+    parameter: str
+    """Its number, such as Pn100."""
+    name: str
+    """The manual's name; empty for one that the manual does not list."""
+    active: int = Field(ge=0, le=0xFFFF)
+    """The value in RAM."""
+    stored: int = Field(ge=0, le=0xFFFF)
+    """The value in EEPROM."""
+    eeprom_writes: int | None
+    """So many times this daemon has written it to EEPROM; null when no ledger is kept."""
+
+    @property
+    def differs(self) -> bool:
+        """Whether the two memories differ: something was not saved, or waits for a power cycle."""
+        return self.active != self.stored
+
+
+class ParameterReply(CommandReply):
+    """One parameter, after reading or writing it."""
+
+    value: ParameterValue
+    """What both memories hold now."""
+    written: bool = False
+    """The drive was told to change; false also for a write that found the value there already."""
+    remarks: tuple[str, ...] = ()
+    """What deserves a look."""
+
+
+class ParameterDump(CommandReply):
+    """All listed parameters of a drive, read one after the other."""
+
+    values: tuple[ParameterValue, ...]
+    """In the manual's order; those that the drive does not have are left out."""
+
+
+class CounterReply(CommandReply):
+    """A counter after it was cleared."""
+
+    counter: CounterName
+    """Which."""
+    value: int
+    """What it counts now, signed; near 0 unless pulses come in."""
+
+
+class AlarmEntry(Frozen):
+    """One alarm code."""
+
+    code: int = Field(ge=0, le=0xFFFF)
+    """As the drive reports it."""
+    text: str
+    """The manual's words."""
+    kind: str
+    """alarm, warning, none or unknown."""
+
+
+class AlarmReport(CommandReply):
+    """The present alarm and the history that the drive keeps over power-off."""
+
+    present: AlarmEntry
+    """What stands now."""
+    history: tuple[AlarmEntry, ...]
+    """Ten entries, the newest first as far as is known."""
+
+
+class DoubtInfo(Frozen):
+    """Something about a drive that its manual leaves open."""
+
+    key: str
+    """Its name in the profile."""
+    question: str
+    """What is assumed or asked."""
+    confidence: str
+    """Where the assumption comes from, by the marks of the reference page."""
+    standing: str
+    """What a bench has said: assumed, bench_verified or contradicted."""
+    setting: str | None
+    """What the profile assumes; null where it has no switch for it."""
+
+
+class DriveProfile(CommandReply):
+    """How a drive is taken to behave, and what it said about itself."""
+
+    model: str
+    """The configured model."""
+    identity: str | None
+    """What the drive said it is; null while it has not answered."""
+    self_hearing: bool
+    """The drive takes its own replies for commands: nothing may be written on such wires."""
+    doubts: tuple[DoubtInfo, ...]
+    """All that is not certain."""

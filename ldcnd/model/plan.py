@@ -1,0 +1,84 @@
+"""What the lines of a rig promise before anything is opened: served on `meta/plan`."""
+
+from pydantic import Field
+
+from ldcnd.model.frozen import Frozen
+
+
+class ItemPlan(Frozen):
+    """One telemetry item of one axis."""
+
+    item: str
+    """Last chunk of its key."""
+    rate_hz: float
+    """How often it is read."""
+    response_s: float | None
+    """From being due to being read, at the latest; null when the line is full and there is no bound."""
+
+
+class PollPlan(Frozen):
+    """The periodic exchange of one axis, in which all its items travel."""
+
+    axis: str
+    """Whose."""
+    address: int
+    """Its node address."""
+    request_bytes: int
+    """What is sent."""
+    reply_bytes: int
+    """What comes back at most."""
+    rate_hz: float
+    """How often: as often as its fastest item."""
+    longest_s: float
+    """How long it occupies the line at most."""
+    response_s: float | None
+    """From being due to being over, at the latest; null when the line is full and there is no bound."""
+    holds: bool
+    """It is always over before its next turn."""
+    items: tuple[ItemPlan, ...]
+    """What it carries."""
+
+
+class BusPlan(Frozen):
+    """One line."""
+
+    bus: str
+    """Its name."""
+    baud: int
+    """Nominal rate."""
+    node_baud: float
+    """The rate that the drives' clocks make of it."""
+    turnaround_s: float
+    """Assumed of the host, between a reply and the next request."""
+    adapter_latency_s: float
+    """Assumed of the adapter, for each reply."""
+    load: float
+    """Share of the line that polls take when every drive takes as long as it may."""
+    mean_load: float
+    """The same on average."""
+    commands_per_s: float
+    """So many evenly spaced commands fit in without making a poll miss its turn."""
+    stop_wait_s: float
+    """From a stop's arrival to its first bit, at the latest, while no reply is lost."""
+    stop_s: float
+    """The same to the end of the drive's reply."""
+    stop_after_loss_s: float
+    """To the end of the drive's reply when the exchange before it is lost."""
+    holds: bool
+    """No poll can come too late."""
+    overload: str
+    """What happens if not: refuse or skip."""
+    remedies: tuple[str, ...]
+    """The smallest changes that would make it hold; empty when it does."""
+    polls: tuple[PollPlan, ...]
+    """What is asked of it."""
+
+
+class RigPlan(Frozen):
+    """All lines of a rig: `meta/plan`."""
+
+    rig: str
+    """The rig id."""
+    holds: bool = Field(description="Every line holds.")
+    buses: tuple[BusPlan, ...]
+    """One plan for each line that is planned."""

@@ -1,0 +1,135 @@
+"""Telemetry: what is published on `tele/<axis>/<item>`."""
+
+from enum import StrEnum
+
+from pydantic import Field
+
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.frozen import Frozen
+
+
+class TelemetryItem(StrEnum):
+    """The last chunk of a telemetry key."""
+
+    POSITION = "position"
+    VELOCITY = "velocity"
+    ADC = "adc"
+    FAULT = "fault"
+    STATE = "state"
+
+
+class Sample(Frozen):
+    """What every telemetry payload carries."""
+
+    t: int
+    """When the value was true, UTC in ns since 1970."""
+    t_error_ns: int = Field(ge=0)
+    """The true instant lies within this many ns of `t`, as far as the wire tells."""
+    seq: int = Field(ge=0)
+    """Grows by one with every sample of this item; a gap is a loss."""
+    quality: Quality
+    """How much the value is worth."""
+
+
+class PositionSample(Sample):
+    """Where the axis is."""
+
+    value: float
+    """Position in axis units."""
+    unit: str
+    """The axis unit."""
+    counts: int
+    """Raw encoder counts of the drive."""
+    following_error: float | None
+    """Commanded minus actual position in axis units; null when the drive does not report it."""
+
+
+class VelocitySample(Sample):
+    """How fast the axis moves; positive forward."""
+
+    value: float
+    """Velocity in axis units a second."""
+    unit: str
+    """The axis unit, a second."""
+    counts_per_s: float
+    """Velocity in encoder counts a second; the drive reports whole counts per servo tick."""
+
+
+class AdcSample(Sample):
+    """The analog input of the drive."""
+
+    counts: int = Field(ge=0)
+    """Raw value."""
+    full_scale: int = Field(gt=0)
+    """Raw value at full scale."""
+    volts: float
+    """Voltage at the input, as configured for full scale."""
+
+
+class FaultEntry(Frozen):
+    """One active fault."""
+
+    code: str
+    """Stable code of the fault."""
+    text: str
+    """What it means and what to do."""
+    since: int
+    """When the daemon first saw it, UTC in ns since 1970."""
+    source: str
+    """Who says so: drive or daemon."""
+    stops: bool = True
+    """The motor is off because of it; false for a warning."""
+
+
+class FaultSample(Sample):
+    """What is wrong with the axis."""
+
+    active: tuple[FaultEntry, ...]
+    """Faults that stand now."""
+    first: FaultEntry | None
+    """The fault that came first since the last reset: the likely cause of the others."""
+
+
+class CurrentCommand(Frozen):
+    """The command that the axis carries out."""
+
+    command_id: str
+    """As given in the reply that accepted it."""
+    verb: str
+    """What was asked."""
+    since: int
+    """When it was accepted, UTC in ns since 1970."""
+    target: float | None = None
+    """Where it ends, in axis units; the distance left is from the position to here. Null without an end of its own."""
+    expected_end: int | None = None
+    """When its profile should end, UTC in ns since 1970; settling comes on top. Null without an end of its own."""
+
+
+class StateSample(Sample):
+    """In which state the axis is; `t` grows even when nothing changes: a sign of life of the line itself."""
+
+    state: AxisState
+    """PLCopen state."""
+    enabled: bool
+    """The position loop is closed."""
+    referenced: bool
+    """The position means something: the axis was homed or told where it is since its drive was last reset."""
+    moving: Moving
+    """Whether it moves; unknown when the drive does not answer."""
+    link: LinkState
+    """Whether the drive answers."""
+    stop_latched: bool
+    """A stop is latched; only reset clears it."""
+    command: CurrentCommand | None
+    """What it is doing."""
+    last_error: str | None = None
+    """Why the last command ended other than done, until the next command is accepted."""
+
+
+SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {
+    TelemetryItem.POSITION: PositionSample,
+    TelemetryItem.VELOCITY: VelocitySample,
+    TelemetryItem.ADC: AdcSample,
+    TelemetryItem.FAULT: FaultSample,
+    TelemetryItem.STATE: StateSample,
+}

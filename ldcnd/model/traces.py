@@ -1,0 +1,204 @@
+"""Traces: what can be recorded of an axis against time, what starts it, and what comes out.
+
+A trace is published as a header on `tele/<axis>/trace`, again whenever its phase changes, and as chunks of samples on
+`tele/<axis>/trace/<n>` once it is complete. The last trace stays there for `get`.
+"""
+
+from enum import StrEnum
+
+from pydantic import Field
+
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.parameters import DoubtInfo
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.samples import Sample
+
+MOST_CHANNELS = 8
+MOST_SAMPLES = 10_000
+LONGEST_WAIT_S = 3600.0
+
+
+class TriggerKind(StrEnum):
+    """When a trigger fires."""
+
+    RISING = "rising"
+    """The channel comes from below the level and reaches it; a signal goes from 0 to 1."""
+    FALLING = "falling"
+    """The channel comes from the level or above and drops below it; a signal goes from 1 to 0."""
+    EITHER = "either"
+    """Rising or falling."""
+    ABOVE = "above"
+    """The channel is at the level or above it, from the first sample on."""
+    BELOW = "below"
+    """The channel is below the level, from the first sample on."""
+
+
+class TraceTrigger(Frozen):
+    """What a trace waits for."""
+
+    channel: str
+    """One of the recorded channels."""
+    kind: TriggerKind
+    """When it fires."""
+    level: float = 0.0
+    """In the channel's unit; not used for signals."""
+
+
+class TracePhase(StrEnum):
+    """How far a trace is."""
+
+    WAITING = "waiting"
+    """Armed; the trigger has not come, as far as the daemon can see."""
+    RECORDING = "recording"
+    """Samples are being taken."""
+    UPLOADING = "uploading"
+    """The drive has finished; its memory is being read."""
+    COMPLETE = "complete"
+    """All chunks are there."""
+    ABORTED = "aborted"
+    """Ended by trace_abort; there are no samples."""
+    TIMED_OUT = "timed_out"
+    """The trigger did not come, or the drive did not finish; there are no samples."""
+    FAILED = "failed"
+    """The line or the drive failed; there are no samples."""
+
+
+class TraceSource(StrEnum):
+    """Who takes the samples."""
+
+    HOST = "host"
+    """The daemon polls the drive: every sample has a time of its own."""
+    DRIVE = "drive"
+    """The drive's own recorder: samples are equally spaced by the drive's clock."""
+
+
+class TraceChannel(Frozen):
+    """One recorded quantity."""
+
+    name: str
+    """As in the request."""
+    unit: str
+    """Unit of its values; empty for signals, which are 0 or 1."""
+    scale: float | None = None
+    """Its value for a raw one of 1; null where the raw value is not simply proportional."""
+    raw_column: int | None = None
+    """Which raw column it was made from."""
+
+
+class DriveTraceInfo(Frozen):
+    """What a drive's recorder was set to and how its memory was read, so that raw words can be read again later."""
+
+    objects: tuple[int, int]
+    """Words of 5000H and 5001H."""
+    smptms: int
+    """5002H, sampling interval in units of CYCLEC."""
+    ptrgno: int
+    """5003H, pre-trigger points."""
+    trgc1: int
+    """5004H, trigger condition; 0 is none."""
+    trgc2: int
+    """5005H, trigger level or I/O selection."""
+    trgadr: int | None
+    """5006H as read afterwards; null without a trigger."""
+    cyclec_us: int
+    """8700H."""
+    maxtrqc: int
+    """8701H, torque in % at data 15,000."""
+    osvelcc: int
+    """8702H, speed in r/min at data 15,000."""
+    gear_numerator: int | None
+    """RATB, Pn202; null where command pulses are not traced."""
+    gear_denominator: int | None
+    """RATA, Pn203; null likewise."""
+    encoder_counts_per_rev: int
+    """As configured."""
+    word_layout: str
+    """Where the I/O bit and the value were taken to be in a memory word."""
+    byte_order: str
+    """Which half of a word was taken to come first."""
+    string_checksum: str
+    """What the checksum of a string was found or taken to cover."""
+    string_count_unit: str
+    """What the count of a string was taken to count."""
+    trigger_word_source: str
+    """Where the bits of 5004H come from: none or configured."""
+    command_pulse_gear: str
+    """Which way command pulses were taken to be geared."""
+    assumptions: tuple[DoubtInfo, ...]
+    """The doubts of the drive's profile that bear on a trace."""
+
+
+class TraceHeader(Sample):
+    """A trace without its samples; `t` is the instant of offset 0: the trigger, or the first sample without one."""
+
+    trace_id: str
+    """The id of the command that asked for it."""
+    axis: str
+    """The axis."""
+    source: TraceSource
+    """Who took the samples."""
+    phase: TracePhase
+    """How far it is."""
+    problem: str | None = None
+    """Why it was not completed, or what makes its values doubtful."""
+    channels: tuple[TraceChannel, ...]
+    """The columns of `values` in each chunk."""
+    interval_s: float = Field(ge=0)
+    """Time between two samples as granted; 0 is as fast as the line allowed. Actual times are in the chunks."""
+    samples: int = Field(ge=0)
+    """How many samples were granted; how many there are once it is complete."""
+    pre_trigger: int = Field(ge=0)
+    """So many of them lie before the trigger."""
+    trigger: TraceTrigger | None = None
+    """What it waits or has waited for."""
+    trigger_index: int | None = None
+    """The sample at which the trigger fired."""
+    missed: int = 0
+    """Polls of a trace by the host that brought no sample."""
+    chunks: int = Field(default=0, ge=0)
+    """How many chunks there are; 0 until it is complete."""
+    raw_columns: tuple[str, ...] = ()
+    """What the columns of `raw` in each chunk are."""
+    drive: DriveTraceInfo | None = None
+    """Settings and assumptions of a drive's own recorder; null for a trace by the host."""
+
+
+class TraceChunk(Sample):
+    """Consecutive samples of a trace; `t` is the instant of the first of them."""
+
+    trace_id: str
+    """The trace it belongs to."""
+    index: int = Field(ge=0)
+    """Its number, from 0."""
+    first: int = Field(ge=0)
+    """Index of its first sample in the trace."""
+    offsets_ns: tuple[int, ...]
+    """When each sample was true, relative to the header's `t`."""
+    values: tuple[tuple[float | None, ...], ...]
+    """One column for each channel, in its unit; null where the drive did not say."""
+    raw: tuple[tuple[int | float | None, ...], ...]
+    """One column for each of the header's raw columns: counts, or words of the trace memory."""
+
+
+class TraceReply(CommandReply):
+    """The trace is armed; values are as granted, and may differ from what was asked for."""
+
+    trace_id: str
+    """Names the trace in its header and chunks."""
+    source: TraceSource
+    """Who takes the samples."""
+    channels: tuple[TraceChannel, ...]
+    """What is recorded."""
+    interval_s: float
+    """Time between two samples; 0 is as fast as the line allows."""
+    samples: int
+    """How many samples there will be."""
+    pre_trigger: int
+    """So many of them before the trigger."""
+
+
+class TraceAbortReply(CommandReply):
+    """The trace has ended, and the drive takes settings again."""
+
+    trace_id: str | None
+    """The trace that was ended; null for one that somebody else had left armed in the drive."""
