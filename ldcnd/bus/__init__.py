@@ -1,0 +1,1 @@
+"""One RS-485 line and the one exchange that may be outstanding on it."""

@@ -1,0 +1,280 @@
+"""One bus: owns the port, opens it again when it is lost, and lets its users take turns on the line."""
+
+import asyncio
+from typing import Any, TypeVar
+
+from ldcnd.bus.exchange_queue import ExchangeQueue, Lane
+from ldcnd.bus.line import Line, Phase
+from ldcnd.bus.poller import Poller
+from ldcnd.bus.resync import Resync
+from ldcnd.bus.settings import BusSettings
+from ldcnd.bus.statistics import BusStatistics
+from ldcnd.bus.turn import Job, PollTurn, Turn
+from ldcnd.bus.wire_log import WireEvent, WireLog
+from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
+from ldcnd.exchange import Exchange
+from ldcnd.log import get_logger
+from ldcnd.transport.transport import Opener, Transport
+
+ReplyT = TypeVar("ReplyT")
+
+log = get_logger("bus")
+
+MISSES_BEFORE_BACKOFF = 3
+FIRST_BACKOFF_S = 0.05
+LONGEST_BACKOFF_S = 1.0
+FIRST_REOPEN_S = 0.1
+LONGEST_REOPEN_S = 2.0
+LONGEST_OPENING_S = 10.0
+"""Closing what was lost and opening a port anew are both bounded and together take less."""
+
+
+class Bus:
+    """The owner of one line; every method runs on the event loop that `run` runs on."""
+
+    def __init__(self, settings: BusSettings, opener: Opener) -> None:
+        self.settings = settings
+        self.statistics = BusStatistics()
+        self.wire_log = WireLog()
+        self.resync = Resync()
+        self._opener = opener
+        self._loop = asyncio.get_running_loop()
+        self._queue: ExchangeQueue[Job] = ExchangeQueue()
+        self._pollers: set[Poller[Any]] = set()  # also those whose poll is on the wire
+        self._misses: dict[int, int] = {}
+        self._line: Line | None = None  # None while the port is not open
+        self._opened = asyncio.Event()
+        self._closed = asyncio.Event()
+        self._closed.set()
+        self._loss_reason = ""
+        self._tried_at_s = self._loop.time()  # when the port was last lost or tried
+
+    # -- for users of the line ---------------------------------------------------------------------------------------
+
+    async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND) -> ReplyT:
+        """Run one exchange in its lane's turn and return the decoded reply.
+
+        Cancelling the caller never leaves half a packet on the wire; what was sent is completed and its reply dropped.
+
+        Raises:
+            BusDown: the line is not open, or was lost before the request was sent.
+            BusBusy: the lane is full.
+            ReplyTimeout: no intact reply after the allowed attempts; the exchange was repeatable.
+            OutcomeUnknown: the reply was lost and the exchange must not be repeated.
+            PacketRejected: the node refused our packet as damaged at every attempt; it was not executed.
+            BadReply: the reply was intact but makes no sense.
+        """
+        return await self._submit(exchange, lane, then_baud=None)
+
+    async def change_baud(self, exchange: Exchange[ReplyT], baud: int) -> ReplyT:
+        """Run the exchange that tells the nodes to change their rate, then change ours before anything else is sent.
+
+        Raises:
+            As `execute`; NotSupported when the transport cannot change its rate.
+        """
+        if self.fixed_baud:
+            raise NotSupported(
+                f"bus {self.settings.name}: the port cannot change its rate",
+                remedy="configure the rate the far end uses",
+            )
+        return await self._submit(exchange, Lane.COMMAND, then_baud=baud)
+
+    def add_poller(self, poller: Poller[Any]) -> None:
+        """Let a poller take part from its `due_at_s` on; adding it again only moves its turn.
+
+        All pollers are forgotten when the line is lost: whoever brings the network up again adds them again.
+        """
+        self._pollers.add(poller)
+        self._queue.schedule(poller, poller.due_at_s)
+        self._kick()
+
+    def remove_poller(self, poller: Poller[Any]) -> None:
+        """Stop asking; a poll on the wire is still delivered."""
+        self._pollers.discard(poller)
+        self._queue.unschedule(poller)
+
+    def drop(self, reason: str) -> None:
+        """Give the line up as if it had been lost; it is opened again as after any loss."""
+        if self._line:
+            self._line.close(reason)
+
+    def withdraw(self, node: int, error: LdcndError) -> None:
+        """Fail every command that still waits for this node; what is on the wire runs on. Stops are not touched."""
+        for job in self._queue.waiting(Lane.COMMAND):
+            if job.exchange.node == node:
+                job.fail(error)
+
+    def waiting(self, lane: Lane) -> int:
+        """Return how many exchanges wait in a lane; polls are scheduled, not queued."""
+        return 0 if lane is Lane.POLL else len(self._queue.waiting(lane))
+
+    @property
+    def loss_reason(self) -> str:
+        """Why the port could not be opened, or was lost, the last time that happened; empty if it never did."""
+        return self._loss_reason
+
+    @property
+    def is_open(self) -> bool:
+        """Whether exchanges can be sent."""
+        return self._line is not None
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is on the wire and nothing is waited for."""
+        return self._line is not None and self._line.phase is Phase.IDLE
+
+    def turning(self, now_s: float) -> bool:
+        """Tell whether the bus does its work at `now_s`, in loop time: keeps a line moving, or tries to get one."""
+        if self._line is None:
+            return now_s <= self._tried_at_s + LONGEST_REOPEN_S + LONGEST_OPENING_S
+        return self._line.turning(now_s)
+
+    @property
+    def baud(self) -> int:
+        """The rate in use, or the rate of the next opening."""
+        return self._line.baud if self._line else self.settings.baud
+
+    @property
+    def fixed_baud(self) -> bool:
+        """Whether the port cannot change its rate."""
+        return self._line is not None and self._line.fixed_baud
+
+    async def wait_opened(self) -> None:
+        """Return as soon as the line is open."""
+        await self._opened.wait()
+
+    async def wait_closed(self) -> None:
+        """Return as soon as the line is lost or closed."""
+        await self._closed.wait()
+
+    def misses(self, node: int) -> int:
+        """Return how many exchanges in a row this node has left unanswered."""
+        return self._misses.get(node, 0)
+
+    def longest_s(self, exchange: Exchange[Any]) -> float:
+        """Return how long an exchange occupies the line at most when nothing is lost, in seconds."""
+        byte_s = self.settings.bits_per_byte / self.baud
+        return (len(exchange.request) + exchange.reply_bytes) * byte_s + exchange.response_s
+
+    async def _submit(self, exchange: Exchange[ReplyT], lane: Lane, then_baud: int | None) -> ReplyT:
+        if self._line is None:
+            raise self._down()
+        future: asyncio.Future[ReplyT] = self._loop.create_future()
+        job = Job(exchange, lane, self._loop.time(), future, attempts=self.settings.attempts, then_baud=then_baud)
+        self._queue.push(job, lane)
+        self._kick()
+        return await future
+
+    def _kick(self) -> None:
+        if self._line:
+            self._line.kick()
+
+    def _down(self) -> BusDown:
+        return BusDown(
+            f"bus {self.settings.name} is not open; nothing was sent",
+            remedy="check the adapter and its cable",
+        )
+
+    # -- the life of the port ----------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Own the port until cancelled: open it, and open it again with bounded back-off whenever it is lost."""
+        delay_s = FIRST_REOPEN_S
+        failure = ""
+        while True:
+            self._tried_at_s = self._loop.time()
+            try:
+                transport = await self._opener()
+            except TransportLost as error:
+                if error.message != failure:
+                    log.warning("port not open", bus=self.settings.name, reason=error.message)
+                    self._loss_reason = failure = error.message
+                await asyncio.sleep(delay_s)
+                delay_s = min(2 * delay_s, LONGEST_REOPEN_S)
+                continue
+            delay_s, failure = FIRST_REOPEN_S, ""
+            await self._use(transport)
+            log.warning("line lost", bus=self.settings.name, reason=self._loss_reason)
+            await asyncio.sleep(FIRST_REOPEN_S)
+
+    async def _use(self, transport: Transport) -> None:
+        """Serve the line until it is lost or the caller is cancelled; then every caller has its outcome."""
+        self.statistics.openings += 1
+        self.wire_log.add(self._loop.time(), WireEvent.OPENED)
+        self._misses.clear()
+        self._line = line = Line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
+        self._closed.clear()
+        self._opened.set()
+        log.info("line open", bus=self.settings.name, baud=self.settings.baud)
+        try:
+            line.kick()
+            await self._closed.wait()
+        finally:
+            line.close("the bus was closed")
+            await transport.close()
+
+    # -- for the line (see `Users`) ----------------------------------------------------------------------------------
+
+    def take(self, now_s: float) -> Turn | None:
+        """See `Users`."""
+        turn = self._queue.take(now_s)
+        if isinstance(turn, Poller):
+            wanted_at_s = turn.due_at_s
+            return PollTurn(turn, turn.next_exchange(now_s), wanted_at_s)
+        if turn is not None:
+            turn.attempts_left -= 1
+        return turn
+
+    def next_due_s(self) -> float:
+        """See `Users`."""
+        return self._queue.next_due_s()
+
+    def stop_waits(self) -> bool:
+        """See `Users`."""
+        return self._queue.stop_waits()
+
+    def failing(self) -> set[int]:
+        """See `Users`."""
+        return set(self._misses)
+
+    def answered(self, turn: Turn) -> None:
+        """See `Users`."""
+        if self._misses and turn.exchange.reply_bytes:
+            self._misses.pop(turn.exchange.node, None)
+        if isinstance(turn, PollTurn):
+            self._schedule(turn.poller, turn.poller.due_at_s)
+
+    def missed(self, turn: Turn, now_s: float) -> None:
+        """See `Users`."""
+        node = turn.exchange.node
+        misses = self._misses[node] = self._misses.get(node, 0) + 1
+        if isinstance(turn, PollTurn):
+            self._schedule(turn.poller, max(turn.poller.due_at_s, now_s + _backoff_s(misses)))
+
+    def _schedule(self, poller: Poller[Any], at_s: float) -> None:
+        """Give a poller its next turn, unless it was removed while its poll was on the wire."""
+        if poller in self._pollers:
+            self._queue.schedule(poller, at_s)
+
+    def again(self, turn: Turn) -> None:
+        """See `Users`."""
+        if isinstance(turn, Job):
+            self._queue.push_front(turn, turn.lane)
+
+    def line_lost(self, reason: str) -> None:
+        """See `Users`."""
+        self._line = None
+        self._tried_at_s = self._loop.time()
+        self._loss_reason = reason
+        self._opened.clear()
+        self._closed.set()
+        self._pollers.clear()
+        for waiting in self._queue.drain():
+            waiting.fail(BusDown(f"bus {self.settings.name} was lost ({reason}) before the exchange was complete"))
+
+
+def _backoff_s(misses: int) -> float:
+    """How long a node that missed so many exchanges in a row is left alone."""
+    if misses < MISSES_BEFORE_BACKOFF:
+        return 0.0
+    return min(LONGEST_BACKOFF_S, FIRST_BACKOFF_S * 2.0 ** min(10, misses - MISSES_BEFORE_BACKOFF))

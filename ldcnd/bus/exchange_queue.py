@@ -1,0 +1,153 @@
+"""Which exchange goes on the wire next: four lanes and a fairness bound. Pure: knows no clock and no wire."""
+
+import heapq
+from collections import deque
+from enum import IntEnum
+from itertools import count
+from typing import Any, Generic, Protocol, TypeVar
+
+from ldcnd.bus.poller import Poller
+from ldcnd.errors import BusBusy
+
+
+class Lane(IntEnum):
+    """Priorities, highest first."""
+
+    STOP = 0
+    COMMAND = 1
+    POLL = 2
+    BACKGROUND = 3
+
+
+class Queueable(Protocol):
+    """What the queue must know of a job."""
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody waits for this job any more."""
+
+
+JobT = TypeVar("JobT", bound=Queueable)
+
+COMMANDS_PER_POLL = 4
+"""So many commands may pass a due poll before the poll goes."""
+POLLS_PER_BACKGROUND = 8
+"""So many due polls may pass a background job before the job goes."""
+LANE_LIMITS = {Lane.STOP: 256, Lane.COMMAND: 64, Lane.BACKGROUND: 64}
+
+
+class ExchangeQueue(Generic[JobT]):
+    """Jobs of three lanes, first in first out, and the pollers of the fourth, earliest deadline first.
+
+    A stop goes before everything. Commands go before polls, but a due poll waits for at most `COMMANDS_PER_POLL`
+    commands; background jobs wait for at most `POLLS_PER_BACKGROUND` polls.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: dict[Lane, deque[JobT]] = {lane: deque() for lane in LANE_LIMITS}
+        self._later: list[tuple[float, int, Poller[Any]]] = []
+        self._due: list[tuple[float, float, int, Poller[Any]]] = []
+        self._entries: dict[Poller[Any], int] = {}
+        self._serial = count()
+        self._commands_in_a_row = 0
+        self._polls_in_a_row = 0
+
+    def push(self, job: JobT, lane: Lane) -> None:
+        """Queue a job behind its lane's others.
+
+        Raises:
+            BusBusy: the lane is full.
+        """
+        waiting = self._jobs[lane]
+        if len(waiting) >= LANE_LIMITS[lane]:
+            waiting = self._jobs[lane] = deque(other for other in waiting if not other.abandoned)
+        if len(waiting) >= LANE_LIMITS[lane]:
+            raise BusBusy(
+                f"{len(waiting)} exchanges wait in the {lane.name.lower()} lane already; nothing was sent",
+                limit=LANE_LIMITS[lane],
+                remedy="send commands more slowly",
+            )
+        waiting.append(job)
+
+    def push_front(self, job: JobT, lane: Lane) -> None:
+        """Give a job that has to be sent again the next turn of its lane."""
+        self._jobs[lane].appendleft(job)
+
+    def waiting(self, lane: Lane) -> list[JobT]:
+        """Return the jobs of a lane, first to go first."""
+        return list(self._jobs[lane])
+
+    def schedule(self, poller: Poller[Any], at_s: float) -> None:
+        """Let a poller have its next turn at `at_s`; replaces any turn it had."""
+        serial = next(self._serial)
+        self._entries[poller] = serial
+        heapq.heappush(self._later, (at_s, serial, poller))
+
+    def unschedule(self, poller: Poller[Any]) -> None:
+        """Forget a poller; unknown ones are ignored."""
+        self._entries.pop(poller, None)
+
+    def stop_waits(self) -> bool:
+        """Tell whether a stop is queued that somebody waits for."""
+        return any(not stop.abandoned for stop in self._jobs[Lane.STOP])
+
+    def next_due_s(self) -> float:
+        """Return when the next poller is due; infinity when there is none."""
+        self._drop_stale_polls()
+        if self._due:
+            return self._due[0][1]
+        return self._later[0][0] if self._later else float("inf")
+
+    def take(self, now_s: float) -> JobT | Poller[Any] | None:
+        """Remove and return what goes on the wire now, or None when nothing is due."""
+        if stop := self._take_job(Lane.STOP):
+            return stop
+        poll_due = self._poll_is_due(now_s)
+        if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (
+            command := self._take_job(Lane.COMMAND)
+        ):
+            self._commands_in_a_row += 1
+            return command
+        self._commands_in_a_row = 0
+        if not poll_due or self._polls_in_a_row >= POLLS_PER_BACKGROUND:
+            self._polls_in_a_row = 0
+            if background := self._take_job(Lane.BACKGROUND):
+                return background
+        if not poll_due:
+            return None
+        self._polls_in_a_row += 1
+        *_, poller = heapq.heappop(self._due)
+        del self._entries[poller]
+        return poller
+
+    def drain(self) -> list[JobT]:
+        """Forget all pollers; remove and return all jobs, stops first."""
+        self._entries.clear()
+        self._later.clear()
+        self._due.clear()
+        drained = [job for lane in sorted(self._jobs) for job in self._jobs[lane]]
+        for waiting in self._jobs.values():
+            waiting.clear()
+        return drained
+
+    def _take_job(self, lane: Lane) -> JobT | None:
+        waiting = self._jobs[lane]
+        while waiting:
+            job = waiting.popleft()
+            if not job.abandoned:
+                return job
+        return None
+
+    def _poll_is_due(self, now_s: float) -> bool:
+        """Rank those that have become due by their deadlines, and tell whether there is one."""
+        while self._later and self._later[0][0] <= now_s:
+            at_s, serial, poller = heapq.heappop(self._later)
+            heapq.heappush(self._due, (poller.deadline_at_s, at_s, serial, poller))
+        self._drop_stale_polls()
+        return bool(self._due)
+
+    def _drop_stale_polls(self) -> None:
+        while self._due and self._entries.get(self._due[0][3]) != self._due[0][2]:
+            heapq.heappop(self._due)
+        while self._later and self._entries.get(self._later[0][2]) != self._later[0][1]:
+            heapq.heappop(self._later)

@@ -1,0 +1,397 @@
+"""An open line: keeps exactly one exchange outstanding and gets back in step after a loss.
+
+Reply-driven: when a reply is complete and intact, the next request goes on the wire first; only then is the old reply
+decoded and delivered. No task and no timer per exchange.
+
+No reply is ever credited to a later request. Replies of these lines carry no sequence number, so the line relies on
+three facts: bytes that arrive sooner than the wire can carry them belong to something older; nothing but the reply may
+follow a request; after any loss the line is fenced and probed (`Resync`) before it is used again.
+"""
+
+import asyncio
+from enum import Enum
+
+from ldcnd.bus.resync import Probe, Resync
+from ldcnd.bus.settings import LINGER_S, BusSettings
+from ldcnd.bus.statistics import BusStatistics
+from ldcnd.bus.turn import Turn
+from ldcnd.bus.users import Users
+from ldcnd.bus.watchdog import NEVER_S, Watchdog
+from ldcnd.bus.wire_log import WireEvent, WireLog
+from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
+from ldcnd.exchange import ReplyVerdict, Timing
+from ldcnd.transport.transport import Transport
+
+CLOCK_TOLERANCE = 0.9
+"""A drive's baud clock may be 3 % fast and a time stamp a little early: bytes count as too early below this share."""
+PROBE_ROUNDS = 3
+LONGEST_FENCE = 20
+"""A line that never falls silent is flushed after so many quiet times all the same."""
+LATE_S = 1.0
+"""A line that is so far behind what it had planned next does not turn."""
+
+
+class Phase(Enum):
+    """What the line is doing."""
+
+    IDLE = "idle"
+    REPLY = "reply"
+    LINGER = "linger"
+    """A packet that must not be repeated has its reply; a second one would prove that the first was not its own."""
+    QUIET = "quiet"
+    """After a request that draws no reply."""
+    FENCE = "fence"
+    """Waiting for late bytes to stop."""
+    SETTLE = "settle"
+    """The flush is on its way."""
+    CLOSED = "closed"
+
+
+class Line:
+    """One open transport and what is on it; a `Receiver`, made anew at every opening."""
+
+    def __init__(
+        self,
+        settings: BusSettings,
+        transport: Transport,
+        users: Users,
+        resync: Resync,
+        statistics: BusStatistics,
+        wire_log: WireLog,
+    ) -> None:
+        self.baud = settings.baud
+        self.phase = Phase.IDLE
+        self._settings = settings
+        self._transport = transport
+        self._users = users
+        self._resync = resync
+        self._statistics = statistics
+        self._wire_log = wire_log
+        self._loop = asyncio.get_running_loop()
+        self._watchdog = Watchdog(self._loop, self._expired)
+        self._byte_s = settings.bits_per_byte / settings.baud
+        self._turn: Turn | None = None
+        self._buffer = bytearray()
+        self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
+        self._buffered_early = False
+        self._echo = bytearray()  # sent, and not come back yet
+        self._sent_at_s = 0.0
+        self._request_over_s = 0.0
+        self._fenced_at_s = 0.0
+        self._probes_left = 0  # more than 0: the line is out of step until a probe proves the opposite
+        transport.attach(self)
+
+    @property
+    def fixed_baud(self) -> bool:
+        """Whether the transport cannot change its rate."""
+        return self._transport.fixed_baud
+
+    def turning(self, now_s: float) -> bool:
+        """Tell whether the line keeps to its own plan: it always knows when it will act next, and then does."""
+        if self.phase is Phase.IDLE:
+            return not self._users.stop_waits() and now_s <= self._users.next_due_s() + LATE_S
+        due_s = self._watchdog.deadline_s
+        return due_s < NEVER_S and now_s <= due_s + LATE_S
+
+    def kick(self) -> None:
+        """Look at the queue: something was added to it."""
+        if self.phase is Phase.IDLE:
+            self._next()
+        elif self.phase is Phase.FENCE and self._users.stop_waits():
+            self._watchdog.set(self._loop.time())
+
+    def close(self, reason: str) -> None:
+        """Leave the line; the turn on the wire, if any, is lost. Safe to call twice."""
+        if self.phase is Phase.CLOSED:
+            return
+        self.phase = Phase.CLOSED
+        self._watchdog.cancel()
+        turn, self._turn = self._turn, None
+        if turn and turn.lost(ReplyTimeout(f"node {turn.exchange.node}: {reason} before the reply came")):
+            self._users.again(turn)
+        self._users.line_lost(reason)
+
+    # -- receiver ----------------------------------------------------------------------------------------------------
+
+    def transport_lost(self, reason: str) -> None:
+        """See `Receiver`; a write that failed has told it already when the port tells it again."""
+        if self.phase is Phase.CLOSED:
+            return
+        self._statistics.losses += 1
+        self._note(WireEvent.LOST, note=reason)
+        self.close(reason)
+
+    def data_received(self, data: bytes) -> None:
+        """See `Receiver`."""
+        now_s = self._loop.time()
+        self._statistics.bytes_in += len(data)
+        if self._echo:
+            data = self._strip_echo(data)
+            if not data:
+                return
+        turn = self._turn
+        if turn and self.phase is Phase.LINGER:
+            self._distrust(turn, self._kept[0] + data, "was followed by another one")
+            return
+        if turn is None or self.phase is not Phase.REPLY:
+            self._stray(data, now_s)
+            return
+        if self._buffer:
+            data = bytes(self._buffer) + data
+            self._buffer.clear()
+        exchange = turn.exchange
+        early = self._buffered_early
+        while data:
+            early = early or now_s < self._request_over_s + CLOCK_TOLERANCE * len(data) * self._byte_s
+            total = exchange.total_bytes(data) if exchange.total_bytes else exchange.reply_bytes
+            if total is None or len(data) < total:
+                self._buffer += data
+                self._buffered_early = early
+                return
+            reply, data = data[:total], data[total:]
+            verdict = exchange.check(reply)
+            if verdict is ReplyVerdict.FOREIGN:
+                self._note(WireEvent.STRAY, reply, "foreign reply")
+                self._statistics.stray_bytes += total
+                early = self._buffered_early = False
+                continue
+            if data or early or verdict is ReplyVerdict.CORRUPT:
+                why = "came with surplus bytes" if data else "came too early" if early else "is damaged"
+                self._distrust(turn, reply + data, why)
+            elif not exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
+                self._keep(reply, now_s, until_s)
+            else:
+                self._settle(turn, reply, now_s)
+            return
+
+    def _true_reply_by_s(self, turn: Turn) -> float:
+        """Return until when the node's own reply may still come although one has come already; never when unpaced."""
+        if not self._settings.paced:
+            return -NEVER_S
+        exchange = turn.exchange
+        wire_s = (len(exchange.request) + exchange.reply_bytes) * self._byte_s
+        return self._sent_at_s + wire_s + exchange.response_s + LINGER_S
+
+    def _keep(self, reply: bytes, now_s: float, until_s: float) -> None:
+        """Do not believe the reply to a packet that must not be repeated before no other reply can come."""
+        self.phase = Phase.LINGER
+        self._kept = (reply, now_s)
+        self._watchdog.set(until_s)
+
+    def _settle(self, turn: Turn, reply: bytes, now_s: float) -> None:
+        if turn.exchange.check(reply) is ReplyVerdict.REJECTED:
+            self._rejected(turn, reply)
+        else:
+            self._complete(turn, reply, now_s)
+
+    def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
+        """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
+        self._note(WireEvent.RECEIVED, reply)
+        request_s = len(turn.exchange.request) * self._byte_s
+        reply_s = len(reply) * self._byte_s
+        sent_s = self._sent_at_s + request_s
+        timing = Timing(self._sent_at_s, sent_s, max(now_s - reply_s, sent_s), now_s)
+        self._statistics.replies += 1
+        self._statistics.wire_busy_s += request_s + reply_s
+        if isinstance(turn, Probe):
+            self._probed(turn, reply, timing)
+            return
+        self._users.answered(turn)
+        self._release(turn)
+        self._next()
+        self._statistics.latency[turn.lane].add(max(0.0, now_s - turn.wanted_at_s))
+        turn.completed(reply, timing)
+
+    def _release(self, turn: Turn) -> None:
+        self._turn = None
+        self.phase = Phase.IDLE
+        if turn.then_baud:
+            self._switch_baud(turn.then_baud)
+
+    def _rejected(self, turn: Turn, reply: bytes) -> None:
+        """The node did not execute our packet: the line is in step, and sending again is always safe."""
+        self._note(WireEvent.RECEIVED, reply, "packet rejected")
+        self._statistics.rejected_packets += 1
+        self._users.answered(turn)
+        self._turn = None
+        self.phase = Phase.IDLE
+        if turn.rejected():
+            self._statistics.resent += 1
+            self._users.again(turn)
+        self._next()
+
+    # -- losses ------------------------------------------------------------------------------------------------------
+
+    def _distrust(self, turn: Turn, reply: bytes, why: str) -> None:
+        self._statistics.corrupt_replies += 1
+        self._note(WireEvent.RECEIVED, reply, why)
+        self._lose(turn, BadReply(f"node {turn.exchange.node}: reply {reply.hex(' ')} {why}"))
+
+    def _lose(self, turn: Turn, error: BusError) -> None:
+        """Settle the turn whose reply will never be trusted, and fence the line."""
+        now_s = self._loop.time()
+        self._turn = None
+        self._buffer.clear()
+        self._users.missed(turn, now_s)
+        if not isinstance(turn, Probe):
+            self._probes_left = PROBE_ROUNDS
+        # before the fence, which a stop that is sent again cuts short
+        if turn.lost(error):
+            self._statistics.resent += 1
+            self._users.again(turn)
+        self._fence(now_s)
+
+    def _stray(self, data: bytes, now_s: float) -> None:
+        """Bytes that nobody asked for: late ones while fenced, a sign of being out of step otherwise."""
+        self._statistics.stray_bytes += len(data)
+        self._note(WireEvent.STRAY, data)
+        if self.phase is Phase.FENCE and not self._users.stop_waits():
+            self._watchdog.set(
+                min(now_s + self._resync.quiet_s, self._fenced_at_s + LONGEST_FENCE * self._resync.quiet_s)
+            )
+        elif self.phase is Phase.IDLE:
+            self._probes_left = PROBE_ROUNDS
+            self._fence(now_s)
+
+    def _fence(self, now_s: float) -> None:
+        self._statistics.resynchronisations += 1
+        self._note(WireEvent.RESYNC)
+        self.phase = Phase.FENCE
+        self._echo.clear()
+        self._fenced_at_s = now_s
+        self._watchdog.set(now_s if self._users.stop_waits() else now_s + self._resync.quiet_s)
+
+    def _flush(self, now_s: float) -> None:
+        self.phase = Phase.SETTLE
+        echo_s = self._settings.margin_s if self._settings.echo else 0.0
+        self._watchdog.set(now_s + len(self._resync.flush) * self._byte_s + self._resync.settle_s + echo_s)
+        if self._resync.flush:
+            self._write(self._resync.flush)
+
+    def _flushed(self, now_s: float) -> None:
+        """Behind the fence: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
+        self._transport.discard_input()
+        self._echo.clear()
+        self.phase = Phase.IDLE
+        if self._probes_left and not self._users.stop_waits():
+            exchange = self._resync.probe(self._users.failing())
+            self._probes_left = self._probes_left - 1 if exchange else 0
+            if exchange:
+                self._send(Probe(exchange, now_s), now_s)
+                return
+        self._next()
+
+    def _probed(self, probe: Probe, reply: bytes, timing: Timing) -> None:
+        probe.completed(reply, timing)
+        if not probe.passed:
+            self._distrust(probe, reply, "is not the known one")
+            return
+        self._probes_left = 0
+        self._users.answered(probe)
+        self._release(probe)
+        self._next()
+
+    # -- sending -----------------------------------------------------------------------------------------------------
+
+    def _next(self) -> None:
+        """Put the next exchange on the wire, or sleep until one is due."""
+        if self.phase is not Phase.IDLE:
+            return
+        now_s = self._loop.time()
+        if self._probes_left and not self._users.stop_waits():
+            self._fence(now_s)  # only a stop may use a line that is not proven to be in step
+            return
+        turn = self._users.take(now_s)
+        if turn is None:
+            self._watchdog.set(self._users.next_due_s())
+        else:
+            self._send(turn, now_s)
+
+    def _send(self, turn: Turn, now_s: float) -> None:
+        exchange = turn.exchange
+        settings = self._settings
+        request_s = len(exchange.request) * self._byte_s
+        reply_s = exchange.reply_bytes * self._byte_s
+        self._turn = turn
+        self._sent_at_s = now_s
+        self._request_over_s = now_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
+        self._buffered_early = False
+        self._statistics.exchanges += 1
+        if exchange.reply_bytes:
+            self.phase = Phase.REPLY
+            self._transport.expect(exchange.reply_bytes + (len(exchange.request) if settings.echo else 0))
+            self._watchdog.set(now_s + request_s + exchange.response_s + reply_s + settings.margin_s)
+        else:
+            self.phase = Phase.QUIET
+            self._watchdog.set(now_s + request_s + exchange.response_s)
+        self._write(exchange.request)
+
+    def _write(self, data: bytes) -> None:
+        self._note(WireEvent.SENT, data)
+        self._statistics.bytes_out += len(data)
+        if self._settings.echo:
+            self._echo += data
+        try:
+            self._transport.write(data)
+        except TransportLost as error:
+            self.transport_lost(error.message)
+
+    def _strip_echo(self, data: bytes) -> bytes:
+        """Take our own bytes off the front, by count: a reply may look exactly like its request."""
+        count = min(len(data), len(self._echo))
+        if data[:count] == self._echo[:count]:
+            del self._echo[:count]
+            return data[count:]
+        self._echo.clear()
+        if self._turn and self.phase is Phase.REPLY:
+            self._distrust(self._turn, data, "follows an echo that differs: collision")
+        else:
+            self._stray(data, self._loop.time())
+        return b""
+
+    def _switch_baud(self, baud: int) -> None:
+        try:
+            self._transport.set_baud(baud)
+        except TransportLost as error:
+            self.transport_lost(error.message)
+            return
+        self._note(WireEvent.BAUD, note=str(baud))
+        self.baud = baud
+        self._byte_s = self._settings.bits_per_byte / baud
+
+    # -- time --------------------------------------------------------------------------------------------------------
+
+    def _expired(self, now_s: float) -> None:
+        match self.phase:
+            case Phase.IDLE:
+                self._next()
+            case Phase.REPLY if self._turn:
+                self._timed_out(self._turn)
+            case Phase.LINGER if self._turn:
+                self._settle(self._turn, *self._kept)
+            case Phase.QUIET if self._turn:
+                self._quiet_over(self._turn, now_s)
+            case Phase.FENCE:
+                self._flush(now_s)
+            case Phase.SETTLE:
+                self._flushed(now_s)
+            case _:
+                pass
+
+    def _timed_out(self, turn: Turn) -> None:
+        self._statistics.timeouts += 1
+        got = f"{len(self._buffer)} of {turn.exchange.reply_bytes} bytes" if self._buffer else "nothing"
+        self._note(WireEvent.TIMEOUT, bytes(self._buffer), f"node {turn.exchange.node}")
+        self._lose(turn, ReplyTimeout(f"node {turn.exchange.node} on bus {self._settings.name} sent {got} in time"))
+
+    def _quiet_over(self, turn: Turn, now_s: float) -> None:
+        """An exchange without a reply is complete once the line may be used again."""
+        sent_s = self._sent_at_s + len(turn.exchange.request) * self._byte_s
+        self._statistics.wire_busy_s += sent_s - self._sent_at_s
+        self._users.answered(turn)
+        self._release(turn)
+        self._next()
+        turn.completed(b"", Timing(self._sent_at_s, sent_s, now_s, now_s))
+
+    def _note(self, event: WireEvent, data: bytes = b"", note: str = "") -> None:
+        self._wire_log.add(self._loop.time(), event, data, note)

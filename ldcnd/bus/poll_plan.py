@@ -1,0 +1,140 @@
+"""Whether a line can carry what is asked of it, and what room is left. Pure.
+
+A plan holds when every poll is over before its next turn in the worst case, every drive taking as long as it may. What
+a lost reply costs is told apart: no schedule can promise deadlines on a line that loses packets.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from ldcnd.bus.cost import Cost
+from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s
+
+STEPS = 16
+"""Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Poll:
+    """One periodic exchange.
+
+    Attributes:
+        axis: whose.
+        items: what it asks for in the worst case.
+        rate_hz: how often at most.
+        cost: of the exchange with all these items.
+        mean_s: of the exchange with what it asks for on average.
+    """
+
+    axis: str
+    items: tuple[str, ...]
+    rate_hz: float
+    cost: Cost
+    mean_s: float
+
+    @property
+    def task(self) -> PeriodicTask:
+        """As the analysis sees it."""
+        return PeriodicTask(1.0 / self.rate_hz, self.cost.longest_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Urgent:
+    """What goes before polls, in seconds.
+
+    Attributes:
+        command_s: longest command exchange.
+        stop_s: longest stop exchange.
+        recovery_s: from a reply's deadline to the instant at which the line may be used by a stop: the flush.
+        margin_s: by which a reply's deadline exceeds its longest time.
+    """
+
+    command_s: float
+    stop_s: float
+    recovery_s: float
+    margin_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class LinePlan:
+    """What a line promises.
+
+    Attributes:
+        polls: what is asked of it.
+        responses_s: for each of them, from being due to being over at the latest, without commands.
+        load: share of the line that polls take at worst, `mean_load` on average.
+        commands_per_s: so many evenly spaced commands fit in before a poll misses its turn in the worst case.
+        stop_wait_s: from queueing a stop to its first bit at the latest, on a line that is in step.
+        stop_s: the same to the end of its reply.
+        stop_after_loss_s: to the end of its reply when the exchange on the wire is lost.
+    """
+
+    polls: tuple[Poll, ...]
+    responses_s: tuple[float, ...]
+    load: float
+    mean_load: float
+    commands_per_s: float
+    stop_wait_s: float
+    stop_s: float
+    stop_after_loss_s: float
+
+    @property
+    def late(self) -> tuple[Poll, ...]:
+        """The polls that can come too late; none when the plan holds."""
+        return tuple(
+            poll
+            for poll, response_s in zip(self.polls, self.responses_s, strict=True)
+            if response_s > poll.task.period_s
+        )
+
+    @property
+    def holds(self) -> bool:
+        """Whether no poll can come too late."""
+        return not self.late
+
+
+def plan_line(polls: Sequence[Poll], urgent: Urgent) -> LinePlan:
+    """Work out what a line promises."""
+    tasks = [poll.task for poll in polls]
+    longest_s = max([urgent.command_s, *(task.cost_s for task in tasks)])
+    stop_s = longest_s + urgent.stop_s
+    return LinePlan(
+        polls=tuple(polls),
+        responses_s=tuple(response_times_s(tasks)),
+        load=load_of(tasks),
+        mean_load=math.fsum(poll.rate_hz * poll.mean_s for poll in polls),
+        commands_per_s=_most_commands_per_s(tasks, urgent.command_s),
+        stop_wait_s=longest_s,
+        stop_s=stop_s,
+        stop_after_loss_s=stop_s + urgent.margin_s + urgent.recovery_s,
+    )
+
+
+def largest(fits: Callable[[float], bool], least: float, most: float) -> float | None:
+    """Return the largest value for which something fits, None when not even the least does.
+
+    Args:
+        fits: true up to some value, false above it.
+        least: where to begin.
+        most: where to end.
+    """
+    if fits(most):
+        return most
+    if not fits(least):
+        return None
+    for _ in range(STEPS):
+        middle = (least + most) / 2
+        if fits(middle):
+            least = middle
+        else:
+            most = middle
+    return least
+
+
+def _most_commands_per_s(tasks: Sequence[PeriodicTask], command_s: float) -> float:
+    room = (FULL - load_of(tasks)) / command_s
+    least = room / 2**STEPS
+    if room <= 0.0:
+        return 0.0
+    return largest(lambda rate: meets_deadlines(tasks, PeriodicTask(1.0 / rate, command_s)), least, room) or 0.0

@@ -1,0 +1,39 @@
+"""What wants to be asked again and again: the contract between the bus and whoever polls.
+
+A poller is asked for its next exchange only when the line is free for it, so an overfull line delays polls but never
+piles them up.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Generic, TypeVar
+
+from ldcnd.errors import BusError
+from ldcnd.exchange import Exchange, Timing
+
+ReplyT = TypeVar("ReplyT")
+
+
+class Poller(ABC, Generic[ReplyT]):
+    """One periodic user of the line; every method runs on the event loop, returns at once and never raises.
+
+    Attributes:
+        node: whom it asks; a node that does not answer is asked more and more seldom.
+        due_at_s: when it wants its next slot, in loop time; read by the bus after each slot.
+        deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
+    """
+
+    node: int
+    due_at_s: float
+    deadline_at_s: float = 0.0
+
+    @abstractmethod
+    def next_exchange(self, now_s: float) -> Exchange[ReplyT]:
+        """Return the exchange to run now and move `due_at_s` on."""
+
+    @abstractmethod
+    def deliver(self, reply: ReplyT, timing: Timing) -> None:
+        """Take the decoded reply; the next request is on the wire already."""
+
+    @abstractmethod
+    def missed(self, error: BusError) -> None:
+        """Learn that this slot brought nothing."""

@@ -1,0 +1,31 @@
+"""What a bus must know of its line before it opens it."""
+
+from dataclasses import dataclass
+
+LINGER_S = 0.001
+"""The line stays with a packet that must not be repeated for as long as its true reply can come, and so much longer:
+adapters pass bytes on a little late."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """What the bus must know of its line.
+
+    Attributes:
+        name: as in the configuration.
+        baud: rate at opening.
+        bits_per_byte: 10 for 8N1 and for 7E1.
+        margin_s: added to every reply's deadline: host scheduling and adapter latency.
+        attempts: how often a repeatable command is sent in all.
+        echo: the adapter returns our own bytes before the reply.
+        paced: bytes take real time on this line, so that what comes too early is foreign; false only for
+            far ends that answer faster than the baud rate allows.
+    """
+
+    name: str
+    baud: int
+    bits_per_byte: int = 10
+    margin_s: float = 0.005
+    attempts: int = 3
+    echo: bool = False
+    paced: bool = True

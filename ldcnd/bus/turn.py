@@ -1,0 +1,146 @@
+"""What goes on the wire next and who must hear how it went."""
+
+import asyncio
+from abc import ABC, abstractmethod
+from typing import Any
+
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.poller import Poller
+from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
+from ldcnd.exchange import Exchange, Timing
+
+
+class Turn(ABC):
+    """One exchange on its way over the wire; exactly one of the outcomes is reported for each time it is sent.
+
+    Attributes:
+        exchange: what is sent.
+        lane: where it waited.
+        wanted_at_s: since when, in loop time.
+        then_baud: the rate to use from the end of this exchange on.
+    """
+
+    __slots__ = ("exchange", "lane", "then_baud", "wanted_at_s")
+
+    def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float, then_baud: int | None = None) -> None:
+        self.exchange = exchange
+        self.lane = lane
+        self.wanted_at_s = wanted_at_s
+        self.then_baud = then_baud
+
+    @abstractmethod
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        """Take the intact reply (empty when none was due); the next request is on the wire already."""
+
+    @abstractmethod
+    def lost(self, error: BusError) -> bool:
+        """Learn that no reply will ever be trusted; return whether to send the exchange again."""
+
+    @abstractmethod
+    def rejected(self) -> bool:
+        """Learn that the node did not execute the packet; return whether to send it again."""
+
+
+class PollTurn(Turn):
+    """A poller's turn; it is never sent again, the poller's next turn comes soon enough."""
+
+    __slots__ = ("poller",)
+
+    def __init__(self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float) -> None:
+        super().__init__(exchange, Lane.POLL, wanted_at_s)
+        self.poller = poller
+
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        """See `Turn`."""
+        try:
+            value = self.exchange.decode(reply)
+        except BadReply as error:
+            self.poller.missed(error)
+            return
+        self.poller.deliver(value, timing)
+
+    def lost(self, error: BusError) -> bool:
+        """See `Turn`."""
+        self.poller.missed(error)
+        return False
+
+    def rejected(self) -> bool:
+        """See `Turn`."""
+        self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
+        return False
+
+
+class Job(Turn):
+    """An exchange that a caller waits for; its future gets exactly one outcome."""
+
+    __slots__ = ("attempts", "attempts_left", "future")
+
+    def __init__(
+        self,
+        exchange: Exchange[Any],
+        lane: Lane,
+        wanted_at_s: float,
+        future: "asyncio.Future[Any]",
+        *,
+        attempts: int,
+        then_baud: int | None = None,
+    ) -> None:
+        super().__init__(exchange, lane, wanted_at_s, then_baud)
+        self.future = future
+        self.attempts = attempts
+        self.attempts_left = attempts
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody waits any more."""
+        return self.future.done()
+
+    def fail(self, error: LdcndError) -> None:
+        """Give the caller the error, unless it has gone."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+    def completed(self, reply: bytes, timing: Timing) -> None:  # noqa: ARG002 - part of the contract
+        """See `Turn`."""
+        if self.future.done():
+            return
+        try:
+            value = self.exchange.decode(reply)
+        except BadReply as error:
+            self.fail(error)
+            return
+        self.future.set_result(value)
+
+    def lost(self, error: BusError) -> bool:
+        """See `Turn`."""
+        exchange = self.exchange
+        if not exchange.repeatable:
+            self.fail(
+                OutcomeUnknown(
+                    f"{error.message}; the packet {exchange.request.hex(' ')} must not be repeated and may or may not"
+                    " have been executed",
+                    remedy="read the axis state before anything else",
+                )
+            )
+            return False
+        if self.attempts_left > 0:
+            return True
+        self.fail(
+            ReplyTimeout(
+                f"no intact reply in {self.attempts} attempts: {error.message}",
+                remedy="check the drive's power and address, and the cable",
+            )
+        )
+        return False
+
+    def rejected(self) -> bool:
+        """See `Turn`."""
+        if self.attempts_left > 0:
+            return True
+        self.fail(
+            PacketRejected(
+                f"node {self.exchange.node} received {self.attempts} damaged packets and executed none of them",
+                remedy="check cable, termination and baud rate",
+            )
+        )
+        return False

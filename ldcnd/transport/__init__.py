@@ -1,0 +1,1 @@
+"""Byte pipes to a line: a serial port, a TCP serial server, a simulated line."""

@@ -1,0 +1,274 @@
+"""A serial port as a byte pipe: opened, configured and closed by pyserial and pyserial-asyncio, used by descriptor.
+
+Reading: one `read` each time the descriptor is ready; an empty one or an error of the driver (EIO when the far side of
+a pseudo-terminal or a USB adapter has gone) ends the port. Writing: the bytes go to the descriptor at once; a request
+is far smaller than the driver's buffer, so one that does not fit whole means that the port is stuck. pyserial-asyncio
+0.6 needs three system calls for each read and keeps every write for the next turn of the loop; the measurement is in
+docs/explanation/timing.md. Draining and opening may block and happen in a worker.
+
+The direction of the RS-485 driver is left to the adapter: after a driver has refused pyserial's `rs485_mode`, every
+later change of the rate fails too.
+"""
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import os
+import termios
+from dataclasses import dataclass
+from typing import Literal
+
+import serial
+import serial_asyncio
+import structlog
+
+from ldcnd.errors import TransportLost
+from ldcnd.transport.incoming import Incoming
+from ldcnd.transport.transport import Receiver, Transport
+
+log: structlog.stdlib.BoundLogger = structlog.stdlib.get_logger("ldcnd.serial_port")
+
+OPEN_TIME_S = 5.0
+DRAIN_TIME_S = 1.0
+"""Enough for a full output buffer of 1 KiB at 9600 baud."""
+
+PSEUDO_TERMINALS = range(136, 144)
+"""Major device numbers of Unix98 pseudo-terminals (Linux, admin-guide/devices.txt)."""
+
+READ_BYTES = 4096
+CONTROL_CHARACTERS = 6
+"""Where `termios.tcgetattr` keeps VMIN and VTIME."""
+
+PortFault = (OSError, ValueError, OverflowError, termios.error)
+"""What pyserial lets through when a driver refuses; its own exception is an OSError, that of termios is not."""
+
+Framing = Literal["8n1", "7e1"]
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """How to open a serial port.
+
+    Attributes:
+        path: the device, best a stable name below /dev/serial/by-id.
+        baud: rate of both directions.
+        framing: data bits, parity, stop bits.
+        low_latency: ask the driver to pass bytes on at once; an FTDI adapter otherwise waits for up to 16 ms.
+        exclusive: refuse the port to others, and refuse to share a port that is in use.
+    """
+
+    path: str
+    baud: int
+    framing: Framing = "8n1"
+    low_latency: bool = True
+    exclusive: bool = True
+
+
+async def open_serial_port(settings: SerialSettings) -> Transport:
+    """Open and configure a port.
+
+    Raises:
+        TransportLost: there is no such device, it may not be used, another program has it, or it is no serial port.
+    """
+    loop = asyncio.get_running_loop()
+    opening = loop.run_in_executor(None, _open, settings)
+    try:
+        async with asyncio.timeout(OPEN_TIME_S):
+            port = await asyncio.shield(opening)
+    except TimeoutError:
+        opening.add_done_callback(_close_unwanted)
+        raise TransportLost(
+            f"{settings.path} did not open within {OPEN_TIME_S:g} s", remedy="unplug the adapter and plug it in again"
+        ) from None
+    except asyncio.CancelledError:
+        opening.add_done_callback(_close_unwanted)
+        raise
+    except PortFault as error:
+        raise _explained(settings.path, error) from error
+    incoming = Incoming(settings.path)
+    try:
+        stream, _ = await serial_asyncio.connection_for_serial(loop, lambda: incoming, port)
+    except PortFault as error:
+        port.close()
+        raise _explained(settings.path, error) from error
+    await asyncio.sleep(0)  # the stream begins to read in the loop's next turn, and would do so after a pause, too
+    stream.pause_reading()
+    return SerialPort(port, stream, incoming)
+
+
+class _Serial(serial.Serial):
+    """A port that pyserial-asyncio can close without blocking the loop."""
+
+    def flush(self) -> None:
+        """Do nothing: pyserial-asyncio would drain on the event loop; `SerialPort.close` has drained in a worker."""
+
+    def drain(self) -> None:
+        """Block until the driver has sent everything."""
+        if self.is_open:
+            termios.tcdrain(self.fileno())
+
+
+class SerialPort(Transport):
+    """An open serial port."""
+
+    def __init__(self, port: _Serial, stream: asyncio.Transport, incoming: Incoming) -> None:
+        """Take over an open port, on which pyserial-asyncio does not read."""
+        self._port = port
+        self._stream = stream
+        self._incoming = incoming
+        self._descriptor = port.fileno()
+        self._loop = asyncio.get_running_loop()
+        self._tell_nothing_from_the_end()
+        self._loop.add_reader(self._descriptor, self._readable)
+
+    def attach(self, receiver: Receiver) -> None:
+        """See `Transport`."""
+        self.discard_input()
+        self._incoming.attach(receiver)
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._descriptor, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._give_up(str(error))
+            return
+        if data:
+            self._incoming.data_received(data)
+        else:
+            self._give_up("the far end closed it")
+
+    def write(self, data: bytes) -> None:
+        """See `Transport`."""
+        self._require_usable()
+        try:
+            written = os.write(self._descriptor, data)
+        except OSError as error:
+            raise self._give_up(str(error)) from error
+        if written != len(data):
+            raise self._give_up(f"it took {written} of {len(data)} bytes")
+
+    def expect(self, reply_bytes: int) -> None:
+        """Ignore the hint: a longer VMIN would keep back every reply that comes up short, and does not pay.
+
+        It saves wake-ups, but the processor then sleeps deeply until the reply is over, and the next request leaves
+        later than with a wake-up for each byte (docs/explanation/timing.md).
+        """
+
+    def _tell_nothing_from_the_end(self) -> None:
+        """Ask for at least one byte for each read (VMIN), so that an empty one is the end and not just nothing yet."""
+        with contextlib.suppress(*PortFault):  # a port that is gone says so to its reader
+            attributes = termios.tcgetattr(self._descriptor)
+            attributes[CONTROL_CHARACTERS][termios.VMIN] = 1
+            attributes[CONTROL_CHARACTERS][termios.VTIME] = 0
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
+
+    def discard_input(self) -> None:
+        """See `Transport`."""
+        if not self._incoming.reason:
+            # a port that is gone has no input; its reader reports the loss
+            with contextlib.suppress(*PortFault):
+                self._port.reset_input_buffer()
+
+    def set_baud(self, baud: int) -> None:
+        """See `Transport`."""
+        self._require_usable()
+        try:
+            self._port.baudrate = baud
+        except PortFault as error:
+            raise self._give_up(f"it refuses {baud} baud: {error}") from error
+        self._tell_nothing_from_the_end()  # pyserial has undone it
+
+    async def close(self) -> None:
+        """See `Transport`; what was written still leaves, for at most `DRAIN_TIME_S`."""
+        usable = not self._incoming.reason
+        self._incoming.detach()
+        try:
+            if usable:
+                await self._drain()
+        finally:
+            self._end()
+        await self._incoming.ended.wait()
+
+    async def _drain(self) -> None:
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(TimeoutError, *PortFault):
+            async with asyncio.timeout(DRAIN_TIME_S):
+                await loop.run_in_executor(None, self._port.drain)
+
+    def _require_usable(self) -> None:
+        if self._incoming.reason:
+            raise TransportLost(self._incoming.reason)
+
+    def _give_up(self, why: str) -> TransportLost:
+        error = self._incoming.lost(why)
+        self._end()
+        return error
+
+    def _end(self) -> None:
+        """Let pyserial-asyncio close the port in the loop's next turn, without waiting for unsent bytes."""
+        if self._stream.is_closing():
+            return
+        self._loop.remove_reader(self._descriptor)
+        with contextlib.suppress(*PortFault):
+            self._port.reset_output_buffer()
+        self._stream.abort()
+
+
+def _open(settings: SerialSettings) -> _Serial:
+    """Open the port; blocks, so it runs in a worker."""
+    seven_even = settings.framing == "7e1" and not _is_pseudo_terminal(settings.path)
+    port = _Serial(
+        settings.path,
+        settings.baud,
+        bytesize=serial.SEVENBITS if seven_even else serial.EIGHTBITS,
+        parity=serial.PARITY_EVEN if seven_even else serial.PARITY_NONE,
+        timeout=0,
+        write_timeout=0,
+        exclusive=settings.exclusive or None,
+    )
+    try:
+        if settings.exclusive:
+            # pyserial's lock binds only those who ask for it; this one refuses every other user's open
+            fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+        if settings.low_latency:
+            _ask_for_low_latency(port)
+    except BaseException:
+        port.close()
+        raise
+    return port
+
+
+def _is_pseudo_terminal(path: str) -> bool:
+    """Tell whether the path leads to the near side of a pty: it carries bytes, not frames, and refuses 7E1."""
+    return os.major(os.stat(path).st_rdev) in PSEUDO_TERMINALS  # noqa: PTH116 - a number of the device, not of a file
+
+
+def _ask_for_low_latency(port: _Serial) -> None:
+    try:
+        port.set_low_latency_mode(True)
+    except (ValueError, NotImplementedError) as error:
+        # pseudo-terminals and several drivers have no such mode
+        log.debug("no low-latency mode", port=port.port, reason=str(error))
+
+
+def _close_unwanted(opening: "asyncio.Future[_Serial]") -> None:
+    """Close a port that opened after its caller had gone."""
+    if not opening.cancelled() and not opening.exception():
+        opening.result().close()
+
+
+def _explained(path: str, error: Exception) -> TransportLost:
+    """Say what is wrong with the port and what to do about it."""
+    match error.errno if isinstance(error, OSError) else None:
+        case errno.ENOENT | errno.ENXIO | errno.ENODEV:
+            what, remedy = "no such device", "plug the adapter in, or correct the port in the configuration"
+        case errno.EACCES | errno.EPERM:
+            what, remedy = "permission denied", "add the user to group dialout and log in again"
+        case errno.EBUSY | errno.EAGAIN:
+            what, remedy = "another program has it", "end that program; `fuser` names it"
+        case _:
+            what, remedy = f"it cannot be set up ({error})", "check that it is a serial port and that it has this rate"
+    return TransportLost(f"{path} cannot be opened: {what}; {remedy}", value=path, remedy=remedy)

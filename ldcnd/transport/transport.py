@@ -1,0 +1,64 @@
+"""The contract of a byte pipe: what the bus needs of a port, and nothing else.
+
+Not a stream: bytes are pushed to one receiver as they arrive, so that a reply costs one wake-up and no task.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable
+from typing import Protocol
+
+
+class Receiver(Protocol):
+    """Who gets the bytes; called on the event loop, must not block and must not raise."""
+
+    def data_received(self, data: bytes) -> None:
+        """Take the bytes that have just arrived, at least one."""
+
+    def transport_lost(self, reason: str) -> None:
+        """Learn, once, that the pipe is gone; no byte follows."""
+
+
+class Transport(ABC):
+    """An open byte pipe; made by an opener, closed once.
+
+    Attributes:
+        fixed_baud: the rate cannot be changed from here (a TCP serial server).
+    """
+
+    fixed_baud = False
+
+    @abstractmethod
+    def attach(self, receiver: Receiver) -> None:
+        """Deliver all further bytes to `receiver`; what came before is dropped. Called once, straight after opening."""
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """Hand bytes to the wire without waiting.
+
+        Raises:
+            TransportLost: the pipe is gone.
+        """
+
+    @abstractmethod
+    def expect(self, reply_bytes: int) -> None:
+        """Hint: the next reply has this many bytes, so one wake-up at its end is enough. May be ignored."""
+
+    @abstractmethod
+    def discard_input(self) -> None:
+        """Drop every byte that has arrived but was not delivered yet."""
+
+    @abstractmethod
+    def set_baud(self, baud: int) -> None:
+        """Change the rate of both directions at once; the caller has waited until everything written has left.
+
+        Raises:
+            TransportLost: the pipe is gone.
+        """
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Give the port back; safe to call twice."""
+
+
+Opener = Callable[[], Awaitable[Transport]]
+"""Opens the pipe anew, raising `TransportLost` with the reason when it cannot."""
