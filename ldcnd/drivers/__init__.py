@@ -1,0 +1,1 @@
+"""Drive families: what turns exchanges into axis values."""

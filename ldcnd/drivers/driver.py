@@ -1,0 +1,400 @@
+"""The contract between the daemon and a drive family.
+
+A family brings a `Network` for each line and an `AxisDriver` for each configured drive. Values are encoder counts and
+seconds; units, limits, states and authority are the daemon's.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from ldcnd.bus.poller import Poller
+from ldcnd.bus.resync import Resync
+from ldcnd.drivers.line import FoundModule
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import ParameterAccess
+from ldcnd.drivers.tracer import Tracer
+from ldcnd.errors import BusError, NotSupported
+from ldcnd.exchange import Exchange, Timing
+from ldcnd.model.axes import Capability, Provenance
+from ldcnd.model.monitors import MonitorName
+from ldcnd.model.requests import HomeMethod, PinMode
+from ldcnd.model.samples import TelemetryItem
+
+
+class StopMode(Enum):
+    """How a motor is brought to rest."""
+
+    SMOOTH = "smooth"
+    """Decelerate, then hold."""
+    ABRUPT = "abrupt"
+    """Hold the present position at once."""
+    OFF = "off"
+    """Open the loop and disable the amplifier: the motor coasts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something the drive complains about.
+
+    Attributes:
+        code: stable code.
+        text: what it means and what to do.
+        stops: the drive has switched the motor off; false for a warning.
+    """
+
+    code: str
+    text: str
+    stops: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class AxisReading:
+    """What one poll said; position, velocity and state always, other items None where it did not ask.
+
+    Attributes:
+        position_counts: actual position.
+        following_error_counts: commanded minus actual position.
+        velocity_counts_per_s: actual velocity, positive in counting direction.
+        velocity_resolution_counts_per_s: the smallest velocity the drive can report.
+        adc_counts: analog input.
+        enabled: the position loop is closed.
+        profile_done: no profile is running (in velocity mode: the commanded velocity is reached).
+        homing: armed for a home capture that has not come yet.
+        faults: what the drive complains about.
+        reverse_limit: level of that limit switch input, `forward_limit` of the other; None while it is not shown.
+    """
+
+    position_counts: int
+    following_error_counts: int | None
+    velocity_counts_per_s: float
+    velocity_resolution_counts_per_s: float
+    adc_counts: int | None
+    enabled: bool
+    profile_done: bool
+    homing: bool
+    faults: tuple[Fault, ...]
+    reverse_limit: bool | None = None
+    forward_limit: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A motion in counts: a target for a trapezoid, None for a constant velocity.
+
+    Attributes:
+        target_counts: where to stop, or None to run on.
+        velocity_counts_per_s: positive for a trapezoid; signed for a constant velocity.
+        acceleration_counts_per_s2: positive.
+    """
+
+    target_counts: int | None
+    velocity_counts_per_s: float
+    acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class AnalogMotion:
+    """A motion to a value of the analog position sensor; the drive finds the direction.
+
+    Attributes:
+        target_counts: of the A/D converter.
+        velocity_counts_per_s: encoder counts, positive.
+        acceleration_counts_per_s2: positive.
+    """
+
+    target_counts: int
+    velocity_counts_per_s: float
+    acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class PwmOutput:
+    """A raw duty on the motor, with the position loop open.
+
+    Attributes:
+        duty: -1 to 1, positive in counting direction.
+        acceleration_counts_per_s2: at which a smooth stop ends it.
+    """
+
+    duty: float
+    acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class HomeCapture:
+    """What captures the home position on the way, and how the motor stops then.
+
+    A drive that cannot stop by itself runs on until it is stopped.
+    """
+
+    method: HomeMethod
+    stop: StopMode = StopMode.SMOOTH
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """What is known of a register that cannot be read back; `value` is None when that is nothing."""
+
+    name: str
+    value: int | None
+    provenance: Provenance
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Registers of the position loop, as in the drive's manual."""
+
+    kp: int
+    kd: int
+    ki: int
+    il: int
+    ol: int
+    cl: int
+    el: int
+    sr: int
+    deadband: int
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSpec:
+    """What the configuration says about one drive.
+
+    Attributes:
+        name: of the axis.
+        address: node address, 1 to 127.
+        model: profile name of the family.
+        gains: loaded at power-on; without them the loop stays open.
+        identity: id and version that this drive reports although the family's table does not know them for the model.
+    """
+
+    name: str
+    address: int
+    model: str
+    gains: Gains | None
+    identity: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingListeners:
+    """Whom a family's own poller tells; none of them waits.
+
+    Attributes:
+        observed: of a reading and the items that are new in it.
+        monitored: of a monitor.
+        missed: of a poll that brought nothing.
+    """
+
+    observed: Callable[[AxisReading, frozenset[TelemetryItem], Timing], None]
+    monitored: Callable[[MonitorValue, Timing], None]
+    missed: Callable[[BusError], None]
+
+
+class AxisDriver(ABC):
+    """One drive. Commands raise the `BusError` that befell them; none of them is repeated when that could move twice.
+
+    Attributes:
+        spec: what the configuration says.
+        identity: what the drive said it is; None before bring-up.
+        capabilities: the truth about what the family and the model can do.
+        adc_full_scale: counts of the A/D converter at full scale; None without one.
+        home_methods: what can mark the reference position.
+        monitors: what is published beside the common items.
+        tracer: the drive's own recorder; None where the host has to sample.
+    """
+
+    spec: AxisSpec
+    identity: str | None
+    capabilities: frozenset[Capability]
+    adc_full_scale: int | None
+    home_methods: frozenset[HomeMethod]
+    monitors: tuple[MonitorName, ...] = ()
+    tracer: Tracer | None = None
+
+    @abstractmethod
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        """Build the exchange that reads these items besides position, velocity and the drive's state."""
+
+    @abstractmethod
+    def quantise(self, motion: Motion) -> Motion:
+        """Return the motion as the drive's registers will hold it.
+
+        Raises:
+            ValueOutOfRange: a value does not fit its register; says which one would.
+        """
+
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:  # noqa: ARG002 - for families that have some
+        """Return what `load` and `start` would send for a motion, for looking at only."""
+        return ()
+
+    @abstractmethod
+    async def power(self, *, on: bool) -> None:
+        """Close the loop at the present position, or open it and disable the amplifier; nothing moves."""
+
+    @abstractmethod
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """Prepare a motion, and the capture of a home position on the way; nothing moves.
+
+        Raises:
+            NotSupported: the drive has no such motion.
+            ValueOutOfRange: a value does not fit its register.
+            DriveFault: the sensor that the motion relies on is out of its range.
+        """
+
+    @abstractmethod
+    async def start(self) -> None:
+        """Start what was loaded; never repeated."""
+
+    @abstractmethod
+    async def stop(self, mode: StopMode) -> None:
+        """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing."""
+
+    @abstractmethod
+    async def captured_home(self) -> int:
+        """Return the captured home position, in counts."""
+
+    @abstractmethod
+    async def reset(self) -> None:
+        """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
+
+    @abstractmethod
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the position loop's registers; they act at once."""
+
+    # -- what only some drives have: refused by default, announced by a capability -----------------------------------
+
+    async def clear_warnings(self) -> None:  # noqa: B027 - a drive without warnings has nothing to do
+        """Clear what is remembered without having stopped anything; the loop stays as it is."""
+
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once, without a profile; never repeated.
+
+        Raises:
+            NotSupported: the drive cannot.
+        """
+        raise NotSupported(f"axis {self.spec.name}: {self.spec.model} cannot track ({position_counts})")
+
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
+        """Use limit switch pins as outputs or inputs; None leaves a pin as it is.
+
+        Raises:
+            NotSupported: the drive cannot.
+        """
+        raise NotSupported(f"axis {self.spec.name}: {self.spec.model} has no such outputs ({limit1}, {limit2})")
+
+    @property
+    def parameters(self) -> ParameterAccess | None:
+        """The drive's parameters; None where they cannot be read."""
+        return None
+
+    def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any] | None:  # noqa: ARG002
+        """Return the family's poller, where one exchange cannot read an axis; None for the common one."""
+        return None
+
+    def registers(self) -> tuple[Register, ...]:
+        """Return what is known of the registers that cannot be read back."""
+        return ()
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpReport:
+    """How a line came up.
+
+    Attributes:
+        baud: the rate in use.
+        identities: what was found, by axis name.
+        reset: the drives were reset, so their positions count from 0.
+        remarks: what differs from the configuration or deserves a look.
+    """
+
+    baud: int
+    identities: Mapping[str, str]
+    reset: bool
+    remarks: tuple[str, ...] = ()
+
+
+class Network(ABC):
+    """All drives of one line.
+
+    Attributes:
+        axes: by axis name.
+        resync: how the bus gets this line back in step.
+    """
+
+    axes: Mapping[str, AxisDriver]
+    resync: Resync
+
+    @property
+    def modules(self) -> tuple[FoundModule, ...]:
+        """What was found on the line, by address; empty while that is not known."""
+        return ()
+
+    @property
+    def watches(self) -> tuple[Poller[Any], ...]:
+        """Who asks modules that are no axes how they are; to be added to the bus once the line is up."""
+        return ()
+
+    def incomplete(self) -> bool:
+        """Tell whether something on the line has stopped answering that `rejoin` may bring back."""
+        return False
+
+    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:  # noqa: ARG002 - nobody is lost here
+        """Bring back drives that lost power without disturbing the others; moves and resets nothing.
+
+        Args:
+            restarted: told the axis whose drive had lost power, before that drive can answer again.
+
+        Returns:
+            The axes whose drives answer again, restarted or only cut off for a while.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        return frozenset()
+
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:  # noqa: B027 - optional
+        """Stop axes with as few packets as the family can, before anything else that waits; nobody confirms it.
+
+        Args:
+            mode: see `StopMode`.
+            names: axes whose loops are closed: a smooth or abrupt stop would close an open one.
+
+        Raises:
+            BusError: the line failed; each axis must be stopped by itself in any case.
+        """
+
+    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
+        """Load motions, and start them all in the same servo cycle; if one cannot be loaded nothing starts.
+
+        Args:
+            motions: by axis name; exactly the members of one group.
+            still_wanted: raises when a stop has overtaken the motion; asked before anything starts.
+
+        Raises:
+            NotSupported: these axes are no group.
+            DriveFault: a drive is not ready; nothing started.
+            OutcomeUnknown: a drive did not prove that it started; the group was stopped.
+            BusError: the line failed before the start.
+        """
+        raise NotSupported("this family cannot start several drives together")
+
+    async def snapshot(self) -> Mapping[str, int]:
+        """Return the positions of all axes at one instant, in counts by axis name.
+
+        Raises:
+            NotSupported: the family cannot, or the configuration forbids it.
+            WrongState: a homing needs the registers.
+            BusError: the line failed, or a drive missed the instant.
+        """
+        raise NotSupported("this family cannot freeze positions")
+
+    @abstractmethod
+    async def bring_up(self) -> BringUpReport:
+        """Make the drives ready to be polled, moving nothing.
+
+        Raises:
+            NetworkMismatch: what answers is not what the configuration expects; says precisely what differs.
+            BusError: the line failed meanwhile.
+        """

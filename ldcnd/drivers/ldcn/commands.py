@@ -1,0 +1,248 @@
+"""LDCN/NMC commands as the host sends them: for each a function from values to an `Exchange`.
+
+Nothing here remembers what a module was told: what it sends by default travels with its `Node`. The other direction is
+in received.py. Commands that not every dialect has are refused for the others, and so is everything that could move a
+module which ldcnd only identifies.
+Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-SERVO SC later vendor data sheets.
+"""
+
+from typing import TypeVar
+
+from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, PositionReset, StopControl, check_homing, check_stop
+from ldcnd.drivers.ldcn.destinations import Destination, Group, Node, unanswered
+from ldcnd.drivers.ldcn.fields import ADDRESS, GROUP_ADDRESS, GROUP_MEMBER, POSITION, Field
+from ldcnd.drivers.ldcn.gains import Gains, encode_gains
+from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.profiles import Profile, Support
+from ldcnd.drivers.ldcn.registers import BaudCodes, baud_divisor
+from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.drivers.ldcn.trajectory import Trajectory, encode_trajectory
+from ldcnd.errors import NotSupported, ValueOutOfRange
+from ldcnd.exchange import Exchange
+
+ReplyT = TypeVar("ReplyT")
+
+RESET_SETTLE_S = 0.1
+"""What a module gets to restart after Hard Reset; the manuals name no time."""
+COMMON_TOP_BAUD = 115_200
+"""The rate that every dialect reaches."""
+OUTPUT_MODE = Field("output mode", 1, 0, 0xFF)
+COMMON_COMMANDS = frozenset(
+    {
+        Command.SET_ADDRESS,
+        Command.DEFINE_STATUS,
+        Command.READ_STATUS,
+        Command.SET_BAUD_RATE,
+        Command.NO_OPERATION,
+        Command.HARD_RESET,
+    }
+)
+"""What every module understands, servo or not."""
+
+
+def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Set position counter and command position to 0; not to be sent during a trapezoidal move."""
+    return _exchange(to, Command.RESET_POSITION, repeatable=False)
+
+
+def reset_position_relative_to_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Make the captured home position the new zero.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+    """
+    _require_sc(to, "resetting the position relative to home")
+    return _exchange(to, Command.RESET_POSITION, bytes((PositionReset.RELATIVE_TO_HOME,)), repeatable=False)
+
+
+def set_position(to: Destination[ReplyT], position: int) -> Exchange[ReplyT]:
+    """Set the position counter, in counts.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+        ValueOutOfRange: the position does not fit.
+    """
+    _require_sc(to, "setting the position counter")
+    data = bytes((PositionReset.SET_POSITION,)) + POSITION.encode(position)
+    return _exchange(to, Command.RESET_POSITION, data, repeatable=False)
+
+
+def set_address(to: Destination[ReplyT], address: int, group: int, *, leader: bool = False) -> Exchange[ReplyT]:
+    """Give a module its addresses; the first time, the next module in the chain wakes up at address 0.
+
+    Args:
+        to: the module, `Node(0, ...)` while it has no address. It answers, in the old layout, from its new address.
+        address: individual address, 1 to 127.
+        group: group address, 0x80 to 0xFF.
+        leader: this module answers for its group.
+
+    Raises:
+        ValueOutOfRange: an address is outside its range.
+    """
+    GROUP_ADDRESS.check(group)
+    data = ADDRESS.encode(address) + bytes((group & ~GROUP_MEMBER if leader else group,))
+    return _exchange(to, Command.SET_ADDRESS, data, repeatable=False)
+
+
+def define_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
+    """Choose what the module adds to every reply, this one included; keep `Node.items` in step.
+
+    Raises:
+        NotSupported: the layout of these items is not known for this module.
+    """
+    return _exchange(to, Command.DEFINE_STATUS, bytes((items,)), items=items)
+
+
+def read_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
+    """Ask once for these items instead of the default ones.
+
+    Raises:
+        NotSupported: the layout of these items is not known for this module.
+    """
+    return _exchange(to, Command.READ_STATUS, bytes((items,)), items=items)
+
+
+def load_trajectory(to: Destination[ReplyT], trajectory: Trajectory) -> Exchange[ReplyT]:
+    """Load motion registers, and start at once if the trajectory says so; only then it must not be repeated.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+        NotSupported: see `encode_trajectory`.
+    """
+    data = encode_trajectory(_dialect(to), trajectory)
+    return _exchange(to, Command.LOAD_TRAJECTORY, data, repeatable=not trajectory.start_now)
+
+
+def start_motion(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Execute the trajectory loaded last."""
+    return _exchange(to, Command.START_MOTION, repeatable=False)
+
+
+def set_gain(to: Destination[ReplyT], gains: Gains) -> Exchange[ReplyT]:
+    """Load the position loop, its limits and the servo rate; they act from the next servo tick on.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+        NotSupported: the module lacks a register that is not at its default.
+    """
+    return _exchange(to, Command.SET_GAIN, encode_gains(_dialect(to), gains))
+
+
+def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | None = None) -> Exchange[ReplyT]:
+    """Stop in one manner, or only switch the amplifier; always safe to repeat.
+
+    Args:
+        to: who stops.
+        control: amplifier enable and at most one manner of stopping.
+        position: in counts, where HERE goes without a profile; absolute.
+
+    Raises:
+        ValueOutOfRange: a bad combination of bits, or the position is missing, superfluous or does not fit.
+        NotSupported: the module lacks this manner of stopping.
+    """
+    check_stop(control, to.profile)
+    if (position is not None) != bool(control & StopControl.HERE):
+        raise ValueOutOfRange("Stop Motor takes a position exactly with the bit for stopping here", value=position)
+    data = bytes((control,)) + (POSITION.encode(position) if position is not None else b"")
+    return _exchange(to, Command.STOP_MOTOR, data)
+
+
+def io_control(to: Destination[ReplyT], pins: LimitPins) -> Exchange[ReplyT]:
+    """Set direction and level of the limit switch pins.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO version 4; elsewhere the command is unused or means something else.
+    """
+    if not _dialect(to).limit_outputs:
+        raise NotSupported(f"{_dialect(to).title} has no limit pins that can be outputs")
+    return _exchange(to, Command.IO_CONTROL, bytes((pins,)))
+
+
+def set_output_mode(to: Destination[ReplyT], mode: int) -> Exchange[ReplyT]:
+    """Choose the amplifier interface, the meaning of the same command on PIC-SERVO SC.
+
+    Args:
+        to: a PIC-SERVO SC.
+        mode: the control byte of its data sheet, 0 to 255.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+        ValueOutOfRange: the mode is no byte.
+    """
+    _require_sc(to, "an output mode")
+    return _exchange(to, Command.IO_CONTROL, OUTPUT_MODE.encode(mode))
+
+
+def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[ReplyT]:
+    """Arm the capture of the home position on a change of any of the sources; 0 disarms.
+
+    Raises:
+        ValueOutOfRange: a bad combination of bits.
+        NotSupported: the module lacks a source, or does not stop on home.
+    """
+    check_homing(control, to.profile)
+    return _exchange(to, Command.SET_HOMING_MODE, bytes((control,)))
+
+
+def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> Exchange[None]:
+    """Change the rate of all modules; the host changes its own before it sends anything else.
+
+    Only for a group without a leader, as the manuals insist: a reply would come at the new rate.
+
+    Raises:
+        ValueOutOfRange: no code is known for this rate, or the modules do not reach it.
+    """
+    top = to.profile.top_baud if to.profile else COMMON_TOP_BAUD
+    if baud > top:
+        raise ValueOutOfRange(f"{baud} baud is above {top}", value=baud, limit=top, nearest=top)
+    return _exchange(to, Command.SET_BAUD_RATE, bytes((baud_divisor(baud, codes),)), repeatable=False)
+
+
+def clear_sticky_bits(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Clear position error, position wrap, servo overrun and current limiting as far as their causes are gone."""
+    return _exchange(to, Command.CLEAR_STICKY_BITS)
+
+
+def save_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Save the present position in the home register."""
+    return _exchange(to, Command.SAVE_CURRENT_POSITION_AS_HOME, repeatable=False)
+
+
+def no_operation(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Do nothing but draw a reply."""
+    return _exchange(to, Command.NO_OPERATION)
+
+
+def hard_reset(to: Node | Group) -> Exchange[None]:
+    """Put modules back into the state after power-up: 19200 baud, address 0, motor off; nobody answers."""
+    request = encode_packet(Packet(to.address, Command.HARD_RESET))
+    return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False)
+
+
+def _exchange(
+    to: Destination[ReplyT],
+    command: Command,
+    data: bytes = b"",
+    *,
+    items: StatusItem | None = None,
+    repeatable: bool = True,
+) -> Exchange[ReplyT]:
+    if to.profile and to.profile.support is Support.IDENTIFY and command not in COMMON_COMMANDS:
+        raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
+    return to.exchange(encode_packet(Packet(to.address, command, data)), items, repeatable=repeatable)
+
+
+def _dialect(to: Destination[ReplyT]) -> Profile:
+    """Return the profile that decides the layout.
+
+    Raises:
+        NotSupported: the destination is a group of unknown members.
+    """
+    if to.profile is None:
+        raise NotSupported(f"group {to.address:02X}: this command differs between dialects, so the profile is needed")
+    return to.profile
+
+
+def _require_sc(to: Destination[ReplyT], what: str) -> None:
+    if not _dialect(to).sc_extensions:
+        raise NotSupported(f"{_dialect(to).title} does not know {what}")

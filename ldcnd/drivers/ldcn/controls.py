@@ -1,0 +1,99 @@
+"""The control bytes of Stop Motor, Set Homing Mode, I/O Control and Reset Position.
+
+Sources: LS-182AP manual, "Stop Motor", "Set Homing Mode"; PIC-SERVO manual, 5.2; for the motion lock and for
+Reset Position later vendor data sheets.
+"""
+
+from enum import IntEnum, IntFlag
+
+from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
+from ldcnd.errors import NotSupported, ValueOutOfRange
+
+
+class StopControl(IntFlag):
+    """Stop Motor; with none of bits 1 to 4 only the amplifier enable changes."""
+
+    AMP_ENABLE = 0x01
+    """Called Pic_ae by Logosol: the power driver is on."""
+    MOTOR_OFF = 0x02
+    """Servo off, PWM 0."""
+    ABRUPT = 0x04
+    """Servo on, hold the present position at once."""
+    SMOOTH = 0x08
+    """Decelerate at the loaded acceleration, then hold."""
+    HERE = 0x10
+    """Go to the given position without a profile."""
+    LOCK_DISABLE = 0x80
+    """Allow motion again after homing on a limit; LS-182AP from version `Profile.motion_lock_from` on."""
+
+
+class HomingControl(IntFlag):
+    """Set Homing Mode; 0 cancels the search. The sources have the bits of `HomingSource`."""
+
+    LIMIT1 = 0x01
+    LIMIT2 = 0x02
+    MOTOR_OFF = 0x04
+    INDEX = 0x08
+    STOP_ABRUPT = 0x10
+    STOP_SMOOTH = 0x20
+    POSITION_ERROR = 0x40
+    CURRENT = 0x80
+
+
+class LimitPins(IntFlag):
+    """I/O Control of PIC-SERVO version 4: the limit switch pins as outputs."""
+
+    LIMIT1_HIGH = 0x01
+    LIMIT2_HIGH = 0x02
+    LIMIT1_INPUT = 0x04
+    LIMIT2_INPUT = 0x08
+
+
+class PositionReset(IntEnum):
+    """Reset Position with data, PIC-SERVO SC only."""
+
+    RELATIVE_TO_HOME = 1
+    SET_POSITION = 2
+
+
+WAYS_TO_STOP = StopControl.MOTOR_OFF | StopControl.ABRUPT | StopControl.SMOOTH | StopControl.HERE
+STOPS_ON_HOME = HomingControl.MOTOR_OFF | HomingControl.STOP_ABRUPT | HomingControl.STOP_SMOOTH
+ALL_STOP_BITS = WAYS_TO_STOP | StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE
+
+
+def check_stop(control: StopControl, profile: Profile | None) -> None:
+    """Refuse a control byte of Stop Motor that the device does not define; without a profile, one that none defines.
+
+    Raises:
+        ValueOutOfRange: more than one way to stop, or a bit that must be clear.
+        NotSupported: "stop here" on PIC-SERVO version 1, "lock disable" where there is no lock.
+    """
+    if (control & WAYS_TO_STOP).bit_count() > 1:
+        raise ValueOutOfRange(f"stop control {int(control):02X}: at most one of bits 1 to 4", value=int(control))
+    if control & ~ALL_STOP_BITS:
+        raise ValueOutOfRange(f"stop control {int(control):02X}: bits 5 and 6 must be clear", value=int(control))
+    if profile and control & StopControl.HERE and not profile.stop_here:
+        raise NotSupported(f"{profile.title} cannot stop at a given position")
+    if control & StopControl.LOCK_DISABLE and not (profile and profile.motion_lock_from is not None):
+        raise NotSupported(f"{profile.title if profile else 'the group'} has no motion lock")
+
+
+def check_homing(control: HomingControl, profile: Profile | None) -> None:
+    """Refuse a control byte of Set Homing that the device does not define; without a profile, one that none defines.
+
+    Raises:
+        ValueOutOfRange: more than one way to stop, or a stop without a source that would trigger it.
+        NotSupported: a source or the stop on home does not exist on this device.
+    """
+    stops = control & STOPS_ON_HOME
+    sources = HomingSource(control & ~STOPS_ON_HOME)
+    if stops.bit_count() > 1:
+        raise ValueOutOfRange(f"homing control {int(control):02X}: at most one of bits 2, 4, 5", value=int(control))
+    if stops and not sources:
+        raise ValueOutOfRange(f"homing control {int(control):02X}: nothing triggers the stop", value=int(control))
+    if profile is None:
+        return
+    if sources & ~profile.homing_sources:
+        raise NotSupported(f"{profile.title} cannot capture home on {sources & ~profile.homing_sources!r}")
+    if stops and not profile.stops_on_home:
+        raise NotSupported(f"{profile.title} does not stop on home by itself")

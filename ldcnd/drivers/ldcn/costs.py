@@ -1,0 +1,82 @@
+"""The price list of an LDCN/NMC module: its exchanges, and the rate that its clock makes of a nominal one.
+
+Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; the wait of one servo cycle: PIC-SERVO manual,
+section 3.
+"""
+
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
+from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.profiles import PROFILES, Support
+from ldcnd.drivers.ldcn.rates import NULLS, NULLS_SETTLE_S
+from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_divisor
+from ldcnd.drivers.ldcn.servo import reading_items
+from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drivers.price_list import PriceList
+from ldcnd.exchange import Exchange
+from ldcnd.model.samples import TelemetryItem
+
+ANY_ADDRESS = 1
+"""The price is the same at every address."""
+
+
+def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> PriceList:
+    """Return the exchanges of a module at a rate.
+
+    Args:
+        model: a key of `PROFILES`.
+        baud: nominal rate.
+        codes: the family of baud rate divisors in use.
+
+    Raises:
+        ValueOutOfRange: no divisor makes this rate.
+    """
+    profile = PROFILES[model]
+    node = Node(ANY_ADDRESS, profile)
+    everything = StatusItem.POSITION | StatusItem.ADC | StatusItem.VELOCITY | StatusItem.AUX | StatusItem.HOME
+    common = {
+        "read status, all items": commands.read_status(node, everything | StatusItem(0xE0)),
+        "no operation": commands.no_operation(node),
+    }
+    full = profile.support is Support.FULL
+    return PriceList(
+        node_baud=actual_baud(baud_divisor(baud, codes)),
+        reading=partial(_reading, node),
+        commands=MappingProxyType(common | (_servo_commands(node) if full else {})),
+        stop=commands.stop_motor(node, StopControl.AMP_ENABLE | StopControl.SMOOTH) if full else None,
+        flush=NULLS,
+        settle_s=NULLS_SETTLE_S,
+    )
+
+
+def _reading(node: Node, items: frozenset[TelemetryItem]) -> Exchange[Any]:
+    return commands.read_status(node, reading_items(node.profile, items))
+
+
+def _servo_commands(node: Node) -> dict[str, Exchange[Any]]:
+    trajectory = Trajectory(
+        position=0,
+        velocity=0,
+        acceleration=1,
+        pwm_or_target=0,
+        servo=True,
+        mode=ProfileMode.TRAPEZOIDAL,
+        reverse=False,
+        start_now=False,
+    )
+    gains = Gains(kp=1, kd=0, ki=0, il=0, ol=255, cl=0, el=1, sr=1, deadband=0)
+    return {
+        "load trajectory": commands.load_trajectory(node, trajectory),
+        "start motion": commands.start_motion(node),
+        "set gain": commands.set_gain(node, gains),
+        "stop motor": commands.stop_motor(node, StopControl.AMP_ENABLE | StopControl.SMOOTH),
+        "set homing": commands.set_homing(node, HomingControl(0)),
+        "clear sticky bits": commands.clear_sticky_bits(node),
+        "save home": commands.save_home(node),
+    }

@@ -1,0 +1,68 @@
+"""Which group address each module of a line has: one of 0x80 to 0xFF, 0xFF unless the configuration says otherwise.
+
+A module has exactly one group address, so whatever concerns the whole line goes to all addresses in use.
+Source: LS-182AP manual, "Addressing", "Set Address"; PIC-SERVO manual, 3.3 "Group Commands".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ldcnd.drivers.ldcn.rates import EVERYBODY
+from ldcnd.drivers.line import GroupSpec
+
+FIRST_GROUP = 0x81
+"""Configured groups are numbered from here; 0x80 is avoided, as its leader's byte would be 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Modules that share a group address.
+
+    Attributes:
+        address: 0x80 to 0xFF.
+        members: axis names; for `EVERYBODY` the axes that are in no configured group.
+        leader: the member that answers for the group.
+    """
+
+    address: int
+    members: frozenset[str]
+    leader: str | None = None
+
+
+class GroupPlan:
+    """The groups of one line.
+
+    Attributes:
+        groups: those that have members, `EVERYBODY` first.
+    """
+
+    def __init__(self, specs: tuple[GroupSpec, ...], axes: Mapping[int, str]) -> None:
+        configured = tuple(
+            Group(FIRST_GROUP + number, frozenset(spec.axes), spec.leader) for number, spec in enumerate(specs)
+        )
+        others = frozenset(axes.values()).difference(*(group.members for group in configured))
+        self.groups = (Group(EVERYBODY, others), *configured) if others else configured
+        self._axes = axes
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """Return every group address that a module may have, `EVERYBODY` first."""
+        return (EVERYBODY, *(group.address for group in self.groups if group.address != EVERYBODY))
+
+    def place(self, address: int) -> Group:
+        """Return the group of the module at an individual address."""
+        name = self._axes.get(address)
+        return next((group for group in self.groups if name in group.members), Group(EVERYBODY, frozenset()))
+
+    def leads(self, address: int) -> bool:
+        """Tell whether the module at this address answers for its group."""
+        leader = self.place(address).leader
+        return leader is not None and self._axes.get(address) == leader
+
+    def exactly(self, names: frozenset[str]) -> Group | None:
+        """Return the group with exactly these members: a command to it concerns nobody else."""
+        return next((group for group in self.groups if group.members == names), None)
+
+    def within(self, names: frozenset[str]) -> tuple[Group, ...]:
+        """Return the groups all of whose members are among these."""
+        return tuple(group for group in self.groups if group.members <= names)

@@ -1,0 +1,206 @@
+"""What axes of one LDCN/NMC line do together: start in the same servo cycle, stop by one packet, show one instant.
+
+A group without a leader does not answer: whatever was done is proven afterwards by each drive's own status.
+Source: LS-182AP manual, "Addressing"; PIC-SERVO manual, 3.3 "Group Commands", 5.2 "Start Motion", "Save Current
+Position As Home".
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.drivers.driver import Motion, StopMode
+from ldcnd.drivers.ldcn import commands, destinations
+from ldcnd.drivers.ldcn.addressing import Addressing
+from ldcnd.drivers.ldcn.controls import StopControl
+from ldcnd.drivers.ldcn.destinations import Node, unanswered
+from ldcnd.drivers.ldcn.group_plan import Group, GroupPlan
+from ldcnd.drivers.ldcn.rates import EVERYBODY
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
+from ldcnd.errors import BusError, DriveFault, LdcndError, NotSupported, OutcomeUnknown, ReplyTimeout, WrongState
+from ldcnd.log import get_logger
+
+log = get_logger("ldcn")
+
+READY_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+FROZEN_ITEMS = StatusItem.POSITION | StatusItem.HOME
+
+STOP_CONTROLS = {
+    StopMode.SMOOTH: StopControl.AMP_ENABLE | StopControl.SMOOTH,
+    StopMode.ABRUPT: StopControl.AMP_ENABLE | StopControl.ABRUPT,
+    StopMode.OFF: StopControl.MOTOR_OFF,
+}
+
+
+class Groups:
+    """The groups of one line at work.
+
+    Attributes:
+        proven: the modules are known to be in the groups of the plan: after addressing, not after an adoption.
+        servos_only: nothing but configured axes is in the group of everybody.
+    """
+
+    def __init__(
+        self, bus: Bus, plan: GroupPlan, addressing: Addressing, drives: Mapping[str, LdcnAxis], *, snapshots: bool
+    ) -> None:
+        self.proven = False
+        self.servos_only = False
+        self._bus = bus
+        self._plan = plan
+        self._addressing = addressing
+        self._drives = drives
+        self._snapshots = snapshots
+
+    async def stop(self, mode: StopMode, names: frozenset[str]) -> None:
+        """See `Network.stop_together`: one burst for all groups whose members all stop.
+
+        Raises:
+            BusError: the line failed.
+        """
+        groups = [group for group in self._plan.within(names) if self._usable(group)] if self.proven else []
+        if not groups:
+            return
+        control = STOP_CONTROLS[mode]
+        burst = b"".join(commands.stop_motor(destinations.Group(group.address), control).request for group in groups)
+        stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True)
+        await self._bus.execute(stop, Lane.STOP)
+
+    async def start(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
+        """See `Network.start_group`.
+
+        Raises:
+            NotSupported, DriveFault, OutcomeUnknown, BusError: as there.
+        """
+        names = frozenset(motions)
+        group = self._plan.exactly(names)
+        if group is None or not self._usable(group):
+            raise NotSupported(
+                f"axes {', '.join(sorted(names))} are not exactly the members of one group",
+                remedy="configure a [[bus.group]] of these axes",
+            )
+        await self._prove()
+        before: dict[str, Status] = {}
+        for name, motion in motions.items():
+            before[name] = await self._ready(name)
+            await self._drives[name].load(motion)
+        still_wanted()
+        try:
+            await self._start_motion(group)
+            stuck = [name for name, motion in motions.items() if not await self._started(name, motion, before[name])]
+        except LdcndError as error:  # also a stop of one member that came between
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"group of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
+                " were told to stop",
+                remedy="read the axis states before anything else",
+            ) from error
+        if stuck:
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"group of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were told to stop",
+                remedy="read the axis states before anything else",
+            )
+
+    async def snapshot(self) -> Mapping[str, int]:
+        """See `Network.snapshot`: Save Current Position as Home freezes, the home registers tell.
+
+        Raises:
+            NotSupported, WrongState, BusError: as there; ReplyTimeout when a drive missed the packet.
+        """
+        groups = [group for group in self._plan.groups if self._usable(group)]
+        if not self._snapshots or sum(len(group.members) for group in groups) < len(self._drives):
+            raise NotSupported(
+                "positions cannot be frozen on this line: it is not configured, or other modules share the group",
+                remedy="set snapshot = true on the bus",
+            )
+        homing = [name for name, drive in self._drives.items() if drive.state.homing_armed]
+        if homing:
+            raise WrongState(f"axis {homing[0]} is homing: its home register is in use", axis=homing[0])
+        await self._prove()
+        before = {name: await self._frozen(name) for name in self._drives}
+        burst = b"".join(commands.save_home(destinations.Group(group.address)).request for group in groups)
+        await self._bus.execute(unanswered(EVERYBODY, burst, self._quiet_s(groups), repeatable=False))
+        positions = {}
+        for name in self._drives:
+            status = await self._frozen(name)
+            position, home = status.position or 0, status.home or 0
+            if home == before[name].home and position != home:
+                raise ReplyTimeout(f"axis {name}: the drive missed the instant", axis=name)
+            positions[name] = home
+        return positions
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+
+    def _usable(self, group: Group) -> bool:
+        return group.address != EVERYBODY or self.servos_only
+
+    def _quiet_s(self, groups: list[Group]) -> float:
+        """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which nobody reads."""
+        leaders = sum(group.leader is not None for group in groups)
+        return SERVO_CYCLE_S + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
+
+    async def _prove(self) -> None:
+        """Tell every drive its group again, unless it was this daemon that did."""
+        if self.proven:
+            return
+        for name, drive in self._drives.items():
+            if not await self._addressing.regroup(drive.spec.address):
+                raise ReplyTimeout(f"axis {name}: the drive does not take its group address", axis=name)
+        self.proven = True
+
+    async def _ready(self, name: str) -> Status:
+        """Read a drive that is about to be started.
+
+        Raises:
+            DriveFault: its loop is open.
+        """
+        status = await self._read(name, READY_ITEMS)
+        if status.aux is None or not status.aux & AuxFlag.SERVO_ON:
+            raise DriveFault(f"axis {name}: its loop is open, so the group was not started", axis=name)
+        if not status.flags & StatusFlag.MOVE_DONE:
+            raise WrongState(f"axis {name} moves already, so the group was not started", axis=name)
+        return status
+
+    async def _start_motion(self, group: Group) -> None:
+        """Start Motion, once; a leader's reply proves that the packet was understood, and its loss proves nothing."""
+        if group.leader is None:
+            await self._bus.execute(commands.start_motion(destinations.Group(group.address)))
+            return
+        leader = self._drives[group.leader]
+        await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))
+
+    async def _started(self, name: str, motion: Motion, before: Status) -> bool:
+        """Tell from the drive's status whether it has set out, or has arrived already."""
+        status = await self._read(name, READY_ITEMS)
+        if not status.flags & StatusFlag.MOVE_DONE:
+            return True
+        if motion.target_counts is None:
+            return bool(status.velocity)
+        came_from, is_at = before.position or 0, status.position or 0
+        return abs(is_at - motion.target_counts) <= abs(is_at - came_from)
+
+    async def _stop_all(self, group: Group) -> None:
+        """Stop every member, first together, then each by itself; what fails is logged, the rest goes on."""
+        try:
+            await self.stop(StopMode.SMOOTH, group.members)
+        except BusError as error:
+            log.error("group stop not sent", bus=self._bus.settings.name, reason=error.message)
+        async with asyncio.TaskGroup() as stops:
+            for name in sorted(group.members):
+                stops.create_task(self._stop_one(name), name=f"stop {name}")
+
+    async def _stop_one(self, name: str) -> None:
+        try:
+            await self._drives[name].stop(StopMode.SMOOTH)
+        except BusError as error:
+            log.error("stop not confirmed", axis=name, reason=error.message)
+
+    async def _frozen(self, name: str) -> Status:
+        return await self._read(name, FROZEN_ITEMS)
+
+    async def _read(self, name: str, items: StatusItem) -> Status:
+        drive = self._drives[name]
+        return await self._bus.execute(commands.read_status(Node(drive.spec.address, drive.profile), items))

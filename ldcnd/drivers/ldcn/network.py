@@ -1,0 +1,264 @@
+"""One LDCN/NMC line: from whatever state it is in to drives that can be polled, and back when some of them lose power.
+
+Sources: LS-182AP manual, "Addressing", "Changing communications rates"; PIC-SERVO manual, 4.1 "Network initialization".
+"""
+
+from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
+from typing import Any
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.poller import Poller
+from ldcnd.bus.resync import Resync
+from ldcnd.drivers.driver import AxisDriver, AxisSpec, BringUpReport, Motion, Network, StopMode
+from ldcnd.drivers.ldcn.addressing import Addressing
+from ldcnd.drivers.ldcn.adoption import Adopted, Adoption
+from ldcnd.drivers.ldcn.group_plan import GroupPlan
+from ldcnd.drivers.ldcn.groups import Groups
+from ldcnd.drivers.ldcn.identities import Expected, Identity, differences, read_identity
+from ldcnd.drivers.ldcn.module_watch import ModuleWatch
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.rates import FASTEST_BAUD, NULLS, NULLS_SETTLE_S, RESET_BAUD, LineRate
+from ldcnd.drivers.ldcn.registers import BaudCodes
+from ldcnd.drivers.ldcn.rejoin import Rejoin
+from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
+from ldcnd.errors import NetworkMismatch
+from ldcnd.exchange import Exchange
+from ldcnd.log import get_logger
+
+log = get_logger("ldcn")
+
+__all__ = ["RESET_BAUD", "LdcnNetwork"]
+
+MISSES_UNTIL_MUTE = 3
+
+
+class LdcnNetwork(Network):
+    """The chain of modules on one line."""
+
+    def __init__(self, bus: Bus, specs: tuple[AxisSpec, ...], baud: int, line: LineSpec | None = None) -> None:
+        line = line or LineSpec()
+        self._bus = bus
+        self._baud = baud
+        self._line = line
+        self._drives = {spec.address: LdcnAxis(spec, PROFILES[spec.model], bus) for spec in specs}
+        self._names = {spec.address: spec.name for spec in specs}
+        self._identities: dict[int, Identity] = {}
+        self._watches: dict[int, ModuleWatch] = {}
+        self._was_up = False
+        self._expected = _expected(specs, line)
+        plan = GroupPlan(line.groups, self._names)
+        self._rate = LineRate(
+            bus,
+            baud,
+            BaudCodes.ALTERNATE if line.alternate_divisors else BaudCodes.MANUAL,
+            plan.addresses,
+            fastest=any(each.profile.top_baud >= FASTEST_BAUD for each in self._expected),
+        )
+        self._addressing = Addressing(bus, self._rate, plan)
+        self._adoption = Adoption(bus, self._rate, self._expected)
+        self._rejoin = Rejoin(bus, self._rate, self._addressing)
+        drives = {drive.spec.name: drive for drive in self._drives.values()}
+        self._groups = Groups(bus, plan, self._addressing, drives, snapshots=line.snapshot)
+        self.axes: Mapping[str, AxisDriver] = drives
+        self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)
+
+    # -- bring-up ----------------------------------------------------------------------------------------------------
+
+    async def bring_up(self) -> BringUpReport:
+        """See `Network`: take the line over or reset it, as the policy says; every open loop stays open.
+
+        A line that this daemon had up before is taken over if that is possible, whatever the policy.
+        """
+        self._identities.clear()
+        self._watches.clear()
+        self._rate.working = self._baud
+        remarks: tuple[str, ...] = ()
+        if self._was_up or self._line.start is StartPolicy.ADOPT:
+            try:
+                adopted = await self._adoption.attempt()
+            except NetworkMismatch as error:
+                await self._check_may_reset(error)
+                remarks = (error.message,)
+            else:
+                return self._up(adopted.identities, self._take_over(adopted), reset=False)
+        for drive in self._drives.values():
+            drive.forget()
+        modules, found = await self._start_afresh()
+        return self._up(modules, remarks + found, reset=True)
+
+    def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
+        self._identities = dict(modules)
+        self._watches = {address: ModuleWatch(address) for address in modules if address not in self._drives}
+        self._groups.proven = reset
+        self._groups.servos_only = reset and not self._watches  # an adoption asks only for what it expects
+        for address, drive in self._drives.items():
+            drive.identity = str(modules[address])
+        self._was_up = True
+        log.info("network up", bus=self._bus.settings.name, modules=len(modules), baud=self._bus.baud, reset=reset)
+        return BringUpReport(
+            baud=self._bus.baud,
+            identities={self._names[address]: str(modules[address]) for address in self._drives},
+            reset=reset,
+            remarks=remarks,
+        )
+
+    def _take_over(self, adopted: Adopted) -> tuple[str, ...]:
+        """Learn what the drives are doing; return remarks."""
+        self._rate.working = adopted.baud
+        for address, drive in self._drives.items():
+            drive.adopted(adopted.states[address])
+        remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
+        if adopted.baud != self._baud:
+            remarks.append(f"the configuration asks for {self._baud} baud; the line stays at {adopted.baud}")
+        return tuple(remarks)
+
+    async def _check_may_reset(self, refused: NetworkMismatch) -> None:
+        """Decide what follows a take-over that was not possible.
+
+        Raises:
+            NetworkMismatch: nothing: the line stays down.
+        """
+        if self._line.start is StartPolicy.RESET:
+            return
+        if self._line.adopt_fallback is AdoptFallback.REFUSE:
+            raise refused
+        moving = await self._adoption.moving()
+        if moving:
+            raise NetworkMismatch(
+                f"{refused.message}; not reset either: {'; '.join(moving)}", remedy="wait, or stop the motion"
+            ) from refused
+
+    async def _start_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
+        """Reset, address, identify, go to the working rate; return who is where, and remarks.
+
+        Raises:
+            NetworkMismatch: the drives would be lost by a reset, or are not those of the configuration.
+        """
+        if not self._rate.changeable and self._bus.baud != RESET_BAUD:
+            raise NetworkMismatch(
+                f"bus {self._bus.settings.name}: not reset, as the port stays at {self._bus.baud} baud and the drives"
+                f" would restart at {RESET_BAUD}",
+                remedy=f'set the far end to {RESET_BAUD} baud, or use start = "adopt"',
+            )
+        await self._addressing.reset_all()
+        modules = await self._addressing.address_all()
+        remarks = self._compare(modules)
+        deaf = await self._change_rate(modules)
+        if deaf is None:
+            return modules, remarks
+        await self._addressing.reset_all()
+        modules = await self._addressing.address_all()
+        self._rate.working = RESET_BAUD
+        return modules, (
+            *self._compare(modules),
+            f"address {deaf} does not answer at {self._baud} baud; the line stays at {RESET_BAUD}",
+        )
+
+    async def _change_rate(self, modules: Mapping[int, Identity]) -> int | None:
+        """Move everybody to the working rate; return the first module that did not follow, None if all did."""
+        if not self._rate.changeable:
+            self._rate.working = self._bus.baud
+            return None
+        await self._rate.everybody_to(self._rate.working)
+        for address, identity in modules.items():
+            if await self._rate.who_is(address, patient=True) != identity:
+                return address
+        return None
+
+    def _compare(self, modules: Mapping[int, Identity]) -> tuple[str, ...]:
+        """Hold what was found against the configuration; return remarks on what does no harm.
+
+        Raises:
+            NetworkMismatch: a configured module is missing or is something else.
+        """
+        different = differences(self._expected, modules)
+        if different:
+            raise NetworkMismatch(
+                f"bus {self._bus.settings.name}: {len(modules)} module(s) found, {len(self._expected)} configured; "
+                + "; ".join(different),
+                remedy="correct the wiring or the configuration",
+            )
+        known = {each.address for each in self._expected}
+        return tuple(
+            f"address {address}: {found} is not configured; it is kept on the line and never moved"
+            for address, found in sorted(modules.items())
+            if address not in known
+        )
+
+    # -- while the line is up ----------------------------------------------------------------------------------------
+
+    @property
+    def modules(self) -> tuple[FoundModule, ...]:
+        """See `Network`."""
+        return tuple(self._module(address, identity) for address, identity in sorted(self._identities.items()))
+
+    @property
+    def watches(self) -> tuple[Poller[Any], ...]:
+        """See `Network`."""
+        return tuple(self._watches.values())
+
+    def incomplete(self) -> bool:
+        """See `Network`."""
+        return any(self._bus.misses(each.address) >= MISSES_UNTIL_MUTE for each in self._expected)
+
+    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:
+        """See `Network`: one round of `Rejoin`."""
+
+        def addressing(address: int) -> None:
+            if address in self._drives:
+                self._drives[address].forget()
+                restarted(self._names[address])
+
+        silent = tuple(each for each in self._expected if self._bus.misses(each.address))
+        heard = await self._rejoin.round(silent, addressing)
+        return frozenset(self._names[address] for address in heard if address in self._names)
+
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
+        """See `Network`."""
+        await self._groups.stop(mode, names)
+
+    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
+        """See `Network`."""
+        await self._groups.start(motions, still_wanted)
+
+    async def snapshot(self) -> Mapping[str, int]:
+        """See `Network`."""
+        return await self._groups.snapshot()
+
+    def _module(self, address: int, identity: Identity) -> FoundModule:
+        profile = next((each.profile for each in self._expected if each.address == address), identity.profile)
+        watch = self._watches.get(address)
+        return FoundModule(
+            address=address,
+            title=str(identity),
+            model=profile.name if profile else None,
+            device_id=identity.device_id,
+            version=identity.version,
+            axis=self._names.get(address),
+            status=watch.status if watch else None,
+        )
+
+    def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:
+        """See `Resync`: the identity of a module is known beforehand, and no poll has a reply of this length."""
+        candidates = [address for address in self._identities if address not in avoid] or list(self._identities)
+        if not candidates:
+            return None
+        return read_identity(candidates[0], self._identities[candidates[0]])
+
+
+def _expected(specs: tuple[AxisSpec, ...], line: LineSpec) -> tuple[Expected, ...]:
+    """Return what the configuration says is on the line, in the order of the chain."""
+    axes = [
+        Expected(spec.address, f"axis {spec.name}", PROFILES[spec.model], _override(spec.identity)) for spec in specs
+    ]
+    others = [
+        Expected(module.address, "module", PROFILES[module.model], _override(module.identity))
+        for module in line.modules
+    ]
+    return tuple(sorted(axes + others, key=lambda each: each.address))
+
+
+def _override(identity: tuple[int, int] | None) -> Identity | None:
+    return Identity(*identity) if identity else None

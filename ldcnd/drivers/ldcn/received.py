@@ -1,0 +1,278 @@
+"""LDCN/NMC commands as a module takes them: from a packet to a value.
+
+For the simulator, the wire log and tests. A module believes the count in the command byte: surplus data bytes are
+ignored, missing ones count as 0. `interpret` does the same and says what was odd; `decode_command` refuses the odd.
+Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-SERVO SC later vendor data sheets.
+"""
+
+from dataclasses import dataclass
+
+from ldcnd.drivers.ldcn.controls import HomingControl, PositionReset, StopControl
+from ldcnd.drivers.ldcn.fields import GROUP_MEMBER, POSITION
+from ldcnd.drivers.ldcn.gains import Gains, decode_gains
+from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet
+from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.drivers.ldcn.trajectory import Trajectory, TrajectoryControl, decode_trajectory, trajectory_bytes
+from ldcnd.errors import BadReply
+
+POSITION_BYTES = POSITION.width
+
+
+@dataclass(frozen=True, slots=True)
+class PlainCommand:
+    """A command without data: Start Motion, Clear Sticky Bits, Save Current Position as Home, No Operation."""
+
+    command: Command
+
+
+@dataclass(frozen=True, slots=True)
+class UndefinedCommand:
+    """A command that this device does not define; it answers and does nothing."""
+
+    command: Command
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ResetPosition:
+    """Set the position counter, to 0 on everything but PIC-SERVO SC.
+
+    Attributes:
+        position: the new value of the counter, in counts.
+        relative_to_home: the captured home position becomes 0 instead.
+    """
+
+    position: int = 0
+    relative_to_home: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SetAddress:
+    """Take these addresses; `group` has bit 7 set whether the module leads it or not."""
+
+    address: int
+    group: int
+    leader: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DefineStatus:
+    """Add these items to this reply and to all that follow."""
+
+    items: StatusItem
+
+
+@dataclass(frozen=True, slots=True)
+class ReadStatus:
+    """Send these items in this reply."""
+
+    items: StatusItem
+
+
+@dataclass(frozen=True, slots=True)
+class LoadTrajectory:
+    """Load motion registers, and start if the trajectory says so."""
+
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class SetGain:
+    """Load the position loop's registers; in range or not."""
+
+    gains: Gains
+
+
+@dataclass(frozen=True, slots=True)
+class StopMotor:
+    """Stop, or switch the amplifier; `position` exactly with the bit for stopping here."""
+
+    control: StopControl
+    position: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class IoControl:
+    """Limit pins on PIC-SERVO version 4, output mode on PIC-SERVO SC."""
+
+    control: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetHomingMode:
+    """Arm the home capture, or disarm it with 0."""
+
+    control: HomingControl
+
+
+@dataclass(frozen=True, slots=True)
+class SetBaudRate:
+    """Change the rate; see `registers.actual_baud`."""
+
+    divisor: int
+
+
+@dataclass(frozen=True, slots=True)
+class AddPathPoints:
+    """Append to the path buffer of a PIC-SERVO SC; without points, start the path. Points are raw 16-bit words."""
+
+    points: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class HardReset:
+    """Restart; PIC-SERVO SC takes a control byte that saves or clears its configuration."""
+
+    control: int | None = None
+
+
+ReceivedCommand = (
+    PlainCommand
+    | UndefinedCommand
+    | ResetPosition
+    | SetAddress
+    | DefineStatus
+    | ReadStatus
+    | LoadTrajectory
+    | SetGain
+    | StopMotor
+    | IoControl
+    | SetHomingMode
+    | SetBaudRate
+    | AddPathPoints
+    | HardReset
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Interpretation:
+    """What a module makes of a packet, and what is odd about it.
+
+    Attributes:
+        address: who is meant.
+        command: what the module executes, unless the checksum is wrong.
+        oddities: sentences; empty for a packet as the manual wants it.
+        checksum_ok: a module answers a wrong checksum but does not execute the command.
+    """
+
+    address: int
+    command: ReceivedCommand
+    oddities: tuple[str, ...]
+    checksum_ok: bool = True
+
+
+def interpret(profile: Profile, packet: Packet) -> Interpretation:
+    """Take an intact packet as this device would."""
+    command, expected = _decode(profile, packet)
+    return Interpretation(packet.address, command, _oddities(profile, packet, command, expected))
+
+
+def interpret_bytes(profile: Profile, data: bytes) -> Interpretation:
+    """Take the first packet in the bytes of a line as this device would, wrong checksum included.
+
+    Raises:
+        BadReply: there is no complete packet.
+    """
+    reader = PacketReader()
+    for at, byte in enumerate(data):
+        received = reader.feed(byte)
+        if received:
+            return _with_frame(profile, received, checksum=byte, left=len(data) - at - 1)
+    raise BadReply(f"no complete packet in {len(data)} bytes")
+
+
+def decode_command(profile: Profile, data: bytes) -> Interpretation:
+    """Take exactly one packet that is as the manual wants it for this device.
+
+    Raises:
+        BadReply: a damaged frame, a count that does not fit the command, or a command that the device does not define.
+    """
+    interpretation = interpret(profile, decode_packet(data))
+    if interpretation.oddities:
+        raise BadReply("; ".join(interpretation.oddities))
+    return interpretation
+
+
+def _with_frame(profile: Profile, received: ReceivedPacket, *, checksum: int, left: int) -> Interpretation:
+    packet = received.packet
+    plain = interpret(profile, packet)
+    oddities = plain.oddities
+    if not received.checksum_ok:
+        computed = (packet.address + (len(packet.data) << 4 | packet.command) + sum(packet.data)) & 0xFF
+        oddities += (f"packet checksum {checksum:02X}, computed {computed:02X}: not executed",)
+    if left:
+        oddities += (f"{left} byte(s) follow the {len(packet.data)} data bytes and the checksum",)
+    return Interpretation(packet.address, plain.command, oddities, received.checksum_ok)
+
+
+def _oddities(profile: Profile, packet: Packet, command: ReceivedCommand, expected: int) -> tuple[str, ...]:
+    if isinstance(command, UndefinedCommand):
+        return (f"{profile.title} does not define command {packet.command:X}",)
+    count = len(packet.data)
+    if count == expected:
+        return ()
+    what = f"{count} data bytes, {packet.command.name} takes {expected}"
+    if packet.command is Command.LOAD_TRAJECTORY and packet.data:
+        what = f"{count} data bytes, control byte {packet.data[0]:02X} implies {expected}"
+    return (f"{what}: {f'{expected - count} count as 0' if count < expected else 'the surplus is ignored'}",)
+
+
+def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
+    """Return the command and how many data bytes it should have had."""
+    data = packet.data
+    first = data[0] if data else 0
+    match packet.command:
+        case Command.RESET_POSITION | Command.IO_CONTROL | Command.ADD_PATH_POINTS | Command.HARD_RESET:
+            return _decode_by_dialect(profile, packet, first)
+        case Command.SET_ADDRESS | Command.DEFINE_STATUS | Command.READ_STATUS | Command.SET_BAUD_RATE:
+            return _decode_network(packet, first)
+        case Command.LOAD_TRAJECTORY:
+            return LoadTrajectory(decode_trajectory(profile, data)), trajectory_bytes(profile, TrajectoryControl(first))
+        case Command.SET_GAIN:
+            return SetGain(decode_gains(profile, data)), profile.gain_bytes
+        case Command.STOP_MOTOR:
+            if first & StopControl.HERE:
+                return StopMotor(StopControl(first), POSITION.decode(data[1:])), 1 + POSITION_BYTES
+            return StopMotor(StopControl(first), None), 1
+        case Command.SET_HOMING_MODE:
+            return SetHomingMode(HomingControl(first)), 1
+    return PlainCommand(packet.command), 0
+
+
+def _decode_network(packet: Packet, first: int) -> tuple[ReceivedCommand, int]:
+    match packet.command:
+        case Command.SET_ADDRESS:
+            group = packet.data[1] if len(packet.data) > 1 else 0
+            return SetAddress(first, group | GROUP_MEMBER, leader=not group & GROUP_MEMBER), 2
+        case Command.DEFINE_STATUS:
+            return DefineStatus(StatusItem(first)), 1
+        case Command.READ_STATUS:
+            return ReadStatus(StatusItem(first)), 1
+    return SetBaudRate(first), 1
+
+
+def _decode_by_dialect(profile: Profile, packet: Packet, first: int) -> tuple[ReceivedCommand, int]:
+    data = packet.data
+    match packet.command:
+        case Command.RESET_POSITION if data and profile.sc_extensions:
+            return _decode_sc_reset_position(data)
+        case Command.RESET_POSITION:
+            return ResetPosition(), 0
+        case Command.IO_CONTROL if profile.limit_outputs or profile.sc_extensions:
+            return IoControl(first), 1
+        case Command.ADD_PATH_POINTS if profile.sc_extensions:
+            points = tuple(int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2))
+            return AddPathPoints(points), 2 * len(points)
+        case Command.HARD_RESET if data and profile.sc_extensions:
+            return HardReset(first), 1
+        case Command.HARD_RESET:
+            return HardReset(), 0
+    return UndefinedCommand(packet.command, data), 0
+
+
+def _decode_sc_reset_position(data: bytes) -> tuple[ReceivedCommand, int]:
+    control = data[0]
+    if control == PositionReset.SET_POSITION:
+        return ResetPosition(position=POSITION.decode(data[1:])), 1 + POSITION_BYTES
+    return ResetPosition(relative_to_home=control == PositionReset.RELATIVE_TO_HOME), 1

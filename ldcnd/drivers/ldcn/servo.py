@@ -1,0 +1,369 @@
+"""One LDCN or NMC servo drive as an `AxisDriver`: which packets a command takes.
+
+What its status packets mean is in drive_state.py, which home captures it has in homing.py, what its motions are to it
+in motions.py, what is known of its registers in register_book.py.
+
+Reset Position is never sent: it would make every position on record mean something else, must not be repeated when its
+reply is lost, and is forbidden during a trapezoidal move. The offset between counts and axis units is the host's.
+Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute positioning mode"; PIC-SERVO manual, 4.1,
+4.5, 5.2.
+"""
+
+from dataclasses import asdict, replace
+from typing import Any
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.drivers import driver
+from ldcnd.drivers.driver import (
+    AnalogMotion,
+    AxisDriver,
+    AxisReading,
+    AxisSpec,
+    HomeCapture,
+    Motion,
+    PwmOutput,
+    Register,
+    StopMode,
+)
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
+from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.drive_state import DriveState
+from ldcnd.drivers.ldcn.faults import FaultCode, sensor_lost
+from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.homing import home_methods, homing_control, opens_loop
+from ldcnd.drivers.ldcn.limit_pins import INPUTS, blocks_homing, with_modes
+from ldcnd.drivers.ldcn.motions import quantised, trajectory_of
+from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.register_book import LIMIT_PINS, RegisterBook, gain_values, trajectory_values
+from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, decode_status
+from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
+from ldcnd.exchange import Exchange
+from ldcnd.model.axes import PARAMETER_CAPABILITIES, Capability
+from ldcnd.model.requests import HomeMethod, PinMode
+from ldcnd.model.samples import TelemetryItem
+
+REACHED_COUNTS = 16
+"""So close to its target a finished profile counts as having run."""
+STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+
+STOP_CONTROLS = {
+    StopMode.SMOOTH: StopControl.AMP_ENABLE | StopControl.SMOOTH,
+    StopMode.ABRUPT: StopControl.AMP_ENABLE | StopControl.ABRUPT,
+    StopMode.OFF: StopControl.MOTOR_OFF,
+}
+
+
+def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusItem:
+    """Return the status items that a drive is asked for when these telemetry items are wanted."""
+    mask = STATE_ITEMS
+    if TelemetryItem.ADC in items:
+        mask |= StatusItem.ADC
+    if TelemetryItem.POSITION in items and profile.position_error_bytes:
+        mask |= StatusItem.POSITION_ERROR
+    return mask
+
+
+class LdcnAxis(AxisDriver):
+    """A drive at one address, in the dialect of its profile."""
+
+    def __init__(self, spec: AxisSpec, profile: Profile, bus: Bus) -> None:
+        self.spec = spec
+        self.profile = profile
+        self.identity: str | None = None
+        self.capabilities = _capabilities(profile)
+        self.adc_full_scale = (1 << profile.adc_bits) - 1
+        self.home_methods = home_methods(profile)
+        self.state = DriveState(spec.name, profile)
+        self._bus = bus
+        self._node = Node(spec.address, profile)
+        self._loaded: Trajectory | None = None
+        self._book = RegisterBook(profile)
+        self._gains = spec.gains
+        self._initialised = False
+        self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
+
+    def forget(self) -> None:
+        """The drive was reset: nothing that was sent before holds any more."""
+        self.state.forget()
+        self._book.reset()
+        self._initialised = False
+
+    def adopted(self, status: Status) -> None:
+        """The drive was taken over as it is; its status packet has the auxiliary byte. Gains count as configured."""
+        self.state.forget()
+        self.state.amp_enabled = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
+        self.state.homing_armed = bool(status.flags & StatusFlag.HOME_IN_PROGRESS)
+        self._book.assume(gain_values(self._gains) if self._gains else {})
+        if self._gains:
+            self.state.servo_divisor = self._gains.sr
+        self._initialised = self.state.amp_enabled
+
+    def registers(self) -> tuple[Register, ...]:
+        """See `AxisDriver`."""
+        return self._book.all()
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        """See `AxisDriver`. Whether the analog sensor was lost can only be told with its value."""
+        asked = (items, self.state.absolute)
+        prepared = self._readings.get(asked)
+        if prepared is None:
+            mask = reading_items(self.profile, items)
+            if self.state.absolute:
+                mask |= StatusItem.ADC
+            prepared = self._readings[asked] = self._prepare_reading(mask)
+        return prepared
+
+    def _prepare_reading(self, mask: StatusItem) -> Exchange[AxisReading]:
+        exchange = commands.read_status(self._node, mask)
+
+        def decode(data: bytes) -> AxisReading:
+            return self.state.reading(decode_status(self.profile, mask, data))
+
+        return Exchange(
+            node=exchange.node,
+            request=exchange.request,
+            reply_bytes=exchange.reply_bytes,
+            check=exchange.check,
+            decode=decode,
+            response_s=exchange.response_s,
+            repeatable=exchange.repeatable,
+        )
+
+    # -- power -------------------------------------------------------------------------------------------------------
+
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        """See `AxisDriver`."""
+        trajectory = trajectory_of(motion, self.state.servo_divisor, self.profile)
+        return commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
+
+    async def power(self, *, on: bool) -> None:
+        """See `AxisDriver`. Closing the loop is verified; it takes effect at the present position.
+
+        Raises:
+            DriveFault: the drive did not close its loop.
+        """
+        if not on:
+            await self.stop(StopMode.OFF)
+            return
+        if self._gains and not self._book.written("kp"):
+            await self.set_gains(self._gains)
+        if self.profile.pic_ae_diagnostics and not self._initialised:
+            await self._initialise_registers()
+        self._initialised = True
+        await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.ABRUPT))
+        self.state.amp_enabled = True
+        self.state.loop_may_open = self.state.absolute = False
+        # pos_error is set while the loop is open, and sticky
+        await self._bus.execute(commands.clear_sticky_bits(self._node))
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        if status.aux is None or not status.aux & AuxFlag.SERVO_ON:
+            causes = "; ".join(fault.text for fault in self.state.faults(status)) or "it does not say why"
+            raise DriveFault(
+                f"axis {self.spec.name}: the drive did not close its loop: {causes}",
+                axis=self.spec.name,
+                remedy="remove the cause, then send reset",
+            )
+
+    async def _initialise_registers(self) -> None:
+        """Do what the LS-182AP manual asks for once after a reset: amplifier off, no distance to go."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.POSITION | StatusItem.AUX))
+        if status.aux is None or status.aux & AuxFlag.SERVO_ON:
+            return  # taken over with its loop closed: initialised long ago
+        trajectory = Trajectory(
+            position=status.position,
+            velocity=0,
+            acceleration=1,
+            pwm_or_target=0,
+            servo=True,
+            mode=ProfileMode.TRAPEZOIDAL,
+            reverse=False,
+            start_now=True,
+        )
+        await self._load(trajectory)
+
+    async def stop(self, mode: StopMode) -> None:
+        """See `AxisDriver`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
+        self._book.doubt(("velocity",))
+        await self._bus.execute(commands.stop_motor(self._node, STOP_CONTROLS[mode]), Lane.STOP)
+        self.state.amp_enabled = mode is not StopMode.OFF
+        self.state.loop_may_open = self.state.absolute = False
+        if self.state.homing_armed:
+            await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
+            self.state.homing_armed = False
+
+    async def reset(self) -> None:
+        """See `AxisDriver`: power driver off, sticky bits cleared (LS-182AP manual, "To restore the normal operation").
+
+        Raises:
+            DriveFault: the cause still stands.
+        """
+        await self.stop(StopMode.OFF)
+        await self._bus.execute(commands.clear_sticky_bits(self._node))
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        standing = [fault for fault in self.state.faults(status) if fault.stops]
+        if standing:
+            raise DriveFault(
+                f"axis {self.spec.name}: still {'; '.join(fault.text for fault in standing)}",
+                axis=self.spec.name,
+                value=standing[0].code,
+                remedy="remove the cause, then send reset again",
+            )
+
+    async def clear_warnings(self) -> None:
+        """See `AxisDriver`: Clear Sticky Bits, nothing else."""
+        await self._bus.execute(commands.clear_sticky_bits(self._node))
+
+    # -- motion ------------------------------------------------------------------------------------------------------
+
+    def quantise(self, motion: Motion) -> Motion:
+        """See `AxisDriver`."""
+        return quantised(motion, self.state.servo_divisor, self.profile)
+
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """See `AxisDriver`. A motion lock, set by homing on a limit switch, is lifted: moving on is what is asked for.
+
+        Raises:
+            NotSupported: an analog target on a drive without absolute positioning.
+            WrongState: the limit switch pin that would be homed on is an output.
+            DriveFault: the analog sensor is out of its range.
+        """
+        trajectory = trajectory_of(motion, self.state.servo_divisor, self.profile)
+        if isinstance(motion, AnalogMotion):
+            await self._check_sensor()
+        if isinstance(motion, PwmOutput) and not self.state.loop_may_open:
+            await self._put_acceleration_in_force(trajectory)
+        if self.state.motion_locked:
+            await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE))
+        if home is not None:
+            self._check_pin(home.method)
+            self.state.homing_armed = True  # before it is, so that a stop in between disarms it
+            await self._bus.execute(commands.set_homing(self._node, homing_control(self.profile, home)))
+        await self._load(trajectory)
+        self.state.absolute = isinstance(motion, AnalogMotion)
+        self.state.loop_may_open = isinstance(motion, PwmOutput) or (
+            home is not None and opens_loop(self.profile, home)
+        )
+
+    async def _load(self, trajectory: Trajectory) -> None:
+        self._loaded = trajectory
+        exchange = commands.load_trajectory(self._node, trajectory)
+        values = trajectory_values(trajectory)
+        self._book.doubt(values)
+        await self._bus.execute(exchange)
+        self._book.wrote(values)
+
+    async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
+        """Start a profile from standstill to standstill before a raw duty.
+
+        The manuals let a smooth stop use "the current acceleration rate" and do not say whether loading makes a rate
+        current or only a start does; after a reset the difference is a motor that is never slowed down.
+        """
+        standing = Trajectory(velocity=0, acceleration=trajectory.acceleration, mode=ProfileMode.VELOCITY)
+        await self._load(standing)
+        await self._bus.execute(commands.start_motion(self._node))
+
+    async def _check_sensor(self) -> None:
+        """Refuse an analog motion while the sensor reads like a broken one (manual, "Analog positioning sensor")."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.ADC))
+        if sensor_lost(self.profile, status.adc):
+            raise DriveFault(
+                f"axis {self.spec.name}: the analog sensor reads {status.adc}: {FaultCode.SENSOR_FAULT.remedy}",
+                axis=self.spec.name,
+                value=FaultCode.SENSOR_FAULT.value,
+                remedy="check the sensor's cable",
+            )
+
+    def _check_pin(self, method: HomeMethod) -> None:
+        pins = self._book.value(LIMIT_PINS)
+        if pins is not None and self.profile.limit_outputs and blocks_homing(LimitPins(pins), method):
+            raise WrongState(
+                f"axis {self.spec.name}: the {method} pin is an output",
+                axis=self.spec.name,
+                value=method.value,
+                remedy='send set_outputs with "input"',
+            )
+
+    async def start(self) -> None:
+        """See `AxisDriver`.
+
+        A drive clears move_done as it starts. An acknowledgement that shows it set is looked into, because a reply to
+        something older that came late looks just like that.
+
+        Raises:
+            OutcomeUnknown: acknowledged, but nothing shows that it has started.
+        """
+        status = await self._bus.execute(commands.start_motion(self._node))
+        if status.flags & StatusFlag.MOVE_DONE and not await self._has_started():
+            raise OutcomeUnknown(
+                f"axis {self.spec.name}: the start was acknowledged, but the drive shows no sign of it",
+                axis=self.spec.name,
+                remedy="read the axis state before anything else",
+            )
+
+    async def _has_started(self) -> bool:
+        """Look for a witness: a profile that runs, the target reached, or a velocity."""
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        loaded = self._loaded
+        if loaded is None or not loaded.servo or not status.flags & StatusFlag.MOVE_DONE:
+            return True
+        if loaded.mode is ProfileMode.TRAPEZOIDAL and loaded.position is not None and status.position is not None:
+            return abs(status.position - loaded.position) <= REACHED_COUNTS
+        return bool(status.velocity)
+
+    async def track(self, position_counts: int) -> None:
+        """See `AxisDriver`: "stop here", the manuals' way to follow a string of positions.
+
+        Raises:
+            NotSupported: PIC-SERVO version 1.
+            ValueOutOfRange: beyond the drive's 32-bit counter.
+            OutcomeUnknown: the reply was lost.
+        """
+        control = StopControl.AMP_ENABLE | StopControl.HERE
+        exchange = commands.stop_motor(self._node, control, position_counts)
+        self.state.absolute = False
+        # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
+        await self._bus.execute(replace(exchange, repeatable=False))
+
+    async def captured_home(self) -> int:
+        """See `AxisDriver`."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.HOME))
+        if status.home is None:
+            raise BadReply(f"axis {self.spec.name}: the status packet lacks the home position")
+        return status.home
+
+    # -- registers ---------------------------------------------------------------------------------------------------
+
+    async def set_gains(self, gains: driver.Gains) -> None:
+        """See `AxisDriver`."""
+        exchange = commands.set_gain(self._node, Gains(**asdict(gains)))
+        values = gain_values(gains)
+        self._book.doubt(values)
+        await self._bus.execute(exchange)
+        self._book.wrote(values)
+        self._gains = gains
+        self.state.servo_divisor = gains.sr
+
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
+        """See `AxisDriver`; PIC-SERVO version 4 only."""
+        known = self._book.value(LIMIT_PINS)
+        pins = with_modes(INPUTS if known is None else LimitPins(known), limit1, limit2)
+        exchange = commands.io_control(self._node, pins)
+        self._book.doubt((LIMIT_PINS,))
+        await self._bus.execute(exchange)
+        self._book.wrote({LIMIT_PINS: pins})
+
+
+def _capabilities(profile: Profile) -> frozenset[Capability]:
+    """Return what a device of this profile can do."""
+    lacking = {
+        Capability.MOVE_ANALOG: not profile.analog_target,
+        Capability.TRACK: not profile.stop_here,
+        Capability.SET_OUTPUTS: not profile.limit_outputs,
+    }
+    able = frozenset(capability for capability in Capability if not lacking.get(capability, False))
+    return able - PARAMETER_CAPABILITIES

@@ -1,0 +1,250 @@
+"""What every simulated LDCN/NMC module has in common: addresses, packets, status, rate, reset.
+
+A packet is executed at the end of the servo cycle in which it became complete, and the status packet starts there;
+every module has its own phase and drift of that grid. Decisions where the manuals leave room:
+
+* A byte of the host that arrives before the status packet has been sent takes back the packet, not the command: the
+  command is executed unless a whole new one for the same module overwrites it first (PIC-SERVO manual, 4.1).
+* A framing error in the middle of a packet counts as a wrong checksum; outside of packets it is nothing.
+* Nothing is heard while the address input is high. It is a level, not a latch: a module behind one that was reset is
+  deaf until that one has an address again.
+
+Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface", "Addressing".
+"""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from enum import StrEnum
+
+from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader
+from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud
+from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
+
+EVERYBODY = 0xFF
+RESET_BAUD_DIVISOR = 0x3F
+GROUP_BIT = 0x80
+LOGOSOL_ID = 90
+_ROUNDING = 1e-6
+
+
+class PositionErrorClearing(StrEnum):
+    """What takes the sticky pos_error bit back once the loop is closed."""
+
+    BY_COMMAND = "by_command"
+    """Clear Sticky Bits only, as both manuals say."""
+    BY_CLOSING = "by_closing"
+    """Closing the loop does, too."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleSettings:
+    """How one module behaves where the manuals allow variants.
+
+    Attributes:
+        version: second byte of its identity.
+        phase_s: where its servo cycles lie, 0 to 0.000512.
+        drift_ppm: how much longer its servo cycles are than nominal.
+        reply_latency_s: added between the end of the cycle and the reply.
+        reset_dead_s: how long it is deaf after Hard Reset and power-up.
+        always_obeys_global_reset: obeys Hard Reset to FF in any group; PIC-SERVO version 4 and PIC-I/O do so only in
+            group FF.
+        stop_clears_velocity: Stop Motor sets the velocity register to 0.
+        position_error_clearing: what takes pos_error back.
+        sense_counts_per_a: A/D counts per ampere of motor current (PIC-SERVO).
+    """
+
+    version: int
+    phase_s: float = 0.0
+    drift_ppm: float = 0.0
+    reply_latency_s: float = 0.0
+    reset_dead_s: float = 0.0
+    always_obeys_global_reset: bool = False
+    stop_clears_velocity: bool = False
+    position_error_clearing: PositionErrorClearing = PositionErrorClearing.BY_COMMAND
+    sense_counts_per_a: float = 12.0
+
+
+class SimulatedModule(Module):
+    """One address on the line.
+
+    Attributes:
+        address: individual address; 0 until one was set.
+        group: group address, 128 to 255.
+        leader: answers for its group.
+        items: what Define Status asked for.
+    """
+
+    def __init__(self, profile: Profile, settings: ModuleSettings) -> None:
+        self.profile = profile
+        self.settings = settings
+        self._reader = PacketReader()
+        self._cycle_s = SERVO_CYCLE_S * (1.0 + settings.drift_ppm * 1e-6)
+        self._cycles_done = 0
+        self.address = 0
+        self.group = EVERYBODY
+        self.leader = False
+        self.items = StatusItem(0)
+        self._powered = True
+        self._deaf_until_s = -math.inf
+        self._packet: Packet | None = None
+        self._reply: bytes | None = None
+        self._intact = True  # the packet came without errors
+        self._damaged = False  # the packet being received has a framing error
+        self._answers = False
+        self._due_cycle = 0
+        self._start_afresh()
+
+    def hear(self, value: int | None, at_s: float) -> None:
+        """See `Module`."""
+        if not self._powered or at_s < self._deaf_until_s:
+            return
+        self._fall_silent()
+        if value is None:
+            self._damaged = self._reader.in_packet
+            if not self._damaged:
+                return
+        received = self._reader.feed(value or 0)
+        if received is None:
+            return
+        intact = received.checksum_ok and not self._damaged
+        self._damaged = False
+        packet = received.packet
+        if not self._is_for_me(packet.address, packet.command):
+            return
+        self._answers = packet.address == self.address or (packet.address == self.group and self.leader)
+        self._packet, self._intact = packet, intact
+        self._due_cycle = math.floor((at_s - self.settings.phase_s) / self._cycle_s) + 1
+        self.next_event_s = self.settings.phase_s + self._due_cycle * self._cycle_s
+
+    def takes_whole(self, data: bytes) -> bool:
+        """See `Module`: exactly one packet, or no beginning of any."""
+        if self._reader.in_packet:
+            return False
+        return _is_packet(data) or HEADER not in data
+
+    def hear_all(self, data: bytes, starts_at_s: float, byte_s: float) -> None:
+        """See `Module`: a packet for somebody else only takes back what this module was about to send."""
+        deaf = not self._powered or starts_at_s + byte_s < self._deaf_until_s
+        if deaf or not _is_packet(data) or self._is_for_me(data[1], data[2] & 0x0F):
+            super().hear_all(data, starts_at_s, byte_s)
+        else:
+            self._fall_silent()
+
+    def advance(self, to_s: float) -> Reply | None:
+        """See `Module`."""
+        at_s = self.next_event_s
+        if at_s > to_s:
+            return None
+        self.next_event_s = NEVER_S
+        packet, self._packet = self._packet, None
+        reply, self._reply = self._reply, None
+        if packet is not None:
+            reply = self._obey(packet, at_s)
+            if reply and self.settings.reply_latency_s > 0.0:
+                self._reply = reply
+                self.next_event_s = at_s + self.settings.reply_latency_s
+                return None
+        return Reply(reply, at_s, BITS_PER_BYTE / self.baud) if reply else None
+
+    def power(self, *, on: bool, at_s: float) -> None:
+        """Switch the module off, or on again: it then starts as after a reset."""
+        self.catch_up(at_s)
+        self._reset(at_s)
+        self._powered = on
+
+    def catch_up(self, to_s: float) -> None:
+        """See `Module`: let the servo cycles up to that instant pass; also before something is changed from outside."""
+        self._pass_cycles(math.floor((to_s - self.settings.phase_s) / self._cycle_s + _ROUNDING))
+
+    # -- what kinds of modules differ in -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def restart(self) -> None:
+        """Take the state of power-up."""
+
+    @abstractmethod
+    def run(self, cycles: int) -> None:
+        """Let servo cycles pass."""
+
+    @abstractmethod
+    def execute(self, packet: Packet) -> None:
+        """Execute a command that is not common to all modules; ignore what this one does not know."""
+
+    @abstractmethod
+    def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
+        """Return a status packet."""
+
+    # -- what all have in common -------------------------------------------------------------------------------------
+
+    def _fall_silent(self) -> None:
+        """The host sends: take back what was to be sent."""
+        self._answers = False
+        if self._reply is not None:
+            self._reply = None
+            self.next_event_s = NEVER_S
+
+    def _is_for_me(self, address: int, command: int) -> bool:
+        if address in {self.address, self.group}:
+            return True
+        return address == EVERYBODY and command == Command.HARD_RESET and self.settings.always_obeys_global_reset
+
+    def _pass_cycles(self, until: int) -> None:
+        if until > self._cycles_done:
+            self.run(until - self._cycles_done)
+            self._cycles_done = until
+
+    def _obey(self, packet: Packet, at_s: float) -> bytes | None:
+        """Execute the packet at the end of the present servo cycle; return the status packet, if one is due."""
+        self._pass_cycles(self._due_cycle)
+        if not self._intact:
+            return self.status(self.items, checksum_error=True) if self._answers else None
+        items = self.items
+        match packet.command:
+            case Command.SET_ADDRESS:
+                address, group = packet.data[:2].ljust(2, b"\0")
+                self.address, self.group = address, group | GROUP_BIT
+                self.leader = not group & GROUP_BIT
+                self.address_out = True
+            case Command.DEFINE_STATUS:
+                items = self.items = self._items(packet)
+            case Command.READ_STATUS:
+                items = self._items(packet)
+            case Command.SET_BAUD_RATE:
+                self.baud = actual_baud(packet.data[0] if packet.data else 0)
+            case Command.HARD_RESET:
+                self._reset(at_s)
+                return None
+            case Command.NO_OPERATION:
+                pass
+            case _:
+                self.execute(packet)
+        return self.status(items, checksum_error=False) if self._answers else None
+
+    def _items(self, packet: Packet) -> StatusItem:
+        return StatusItem(packet.data[0] if packet.data else 0)
+
+    def _reset(self, at_s: float) -> None:
+        self._deaf_until_s = at_s + self.settings.reset_dead_s
+        self._start_afresh()
+
+    def _start_afresh(self) -> None:
+        self.address = 0
+        self.group = EVERYBODY
+        self.leader = False
+        self.items = StatusItem(0)
+        self.baud = actual_baud(RESET_BAUD_DIVISOR)
+        self.address_out = False
+        self.next_event_s = NEVER_S
+        self._reader.reset()
+        self._packet = None
+        self._reply = None
+        self._damaged = False
+        self.restart()
+
+
+def _is_packet(data: bytes) -> bool:
+    """Tell whether these bytes are one packet, nothing more or less; the checksum does not matter."""
+    return data[0] == HEADER and len(data) >= FRAME_BYTES and len(data) == FRAME_BYTES + (data[2] >> 4)

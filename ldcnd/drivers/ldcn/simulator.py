@@ -1,0 +1,152 @@
+"""Simulated LDCN/NMC chains built from a specification."""
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from ldcnd.drivers.ldcn.profiles import (
+    LS_173AP,
+    LS_182AP,
+    PIC_IO,
+    PIC_SERVO_SC,
+    PIC_SERVO_V1,
+    PIC_SERVO_V2,
+    PIC_SERVO_V3,
+    PIC_SERVO_V4,
+    PIC_STEP,
+    Support,
+)
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
+from ldcnd.drivers.ldcn.simulated_io import SimulatedIo
+from ldcnd.drivers.ldcn.simulated_module import ModuleSettings, SimulatedModule
+from ldcnd.drivers.ldcn.simulated_power import Condition
+from ldcnd.errors import ValueOutOfRange
+from ldcnd.sim.chain import Chain, Delivery
+from ldcnd.sim.faults import FaultPlan
+from ldcnd.sim.plant import MotorPlant
+
+MOST_DRIFT_PPM = 50.0
+"""Crystals of this quality; it makes the servo cycles of the modules slide past each other."""
+
+MODELS = MappingProxyType(
+    {
+        "ls182ap": (LS_182AP, ModuleSettings(version=20, always_obeys_global_reset=True)),
+        "ls173ap": (LS_173AP, ModuleSettings(version=1, always_obeys_global_reset=True)),
+        "picservo-v1": (PIC_SERVO_V1, ModuleSettings(version=1)),
+        "picservo-v2": (PIC_SERVO_V2, ModuleSettings(version=2)),
+        "picservo-v3": (PIC_SERVO_V3, ModuleSettings(version=3)),
+        "picservo-v4": (PIC_SERVO_V4, ModuleSettings(version=4)),
+        "picservo-sc": (PIC_SERVO_SC, ModuleSettings(version=10, always_obeys_global_reset=True)),
+        "picio": (PIC_IO, ModuleSettings(version=1)),
+        "picstep": (PIC_STEP, ModuleSettings(version=1)),
+    }
+)
+"""Module names, with the dialect each speaks and how it is when nothing else is asked for."""
+
+
+def _unchanged(settings: ModuleSettings) -> ModuleSettings:
+    return settings
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleSpec:
+    """One module of a chain.
+
+    Attributes:
+        name: a key of `MODELS`.
+        plant: the machine on its shaft; modules without a motor ignore it.
+        settings: None for those of `MODELS`, with phase and drift of the servo cycle drawn from the chain's seed.
+        adjust: changes single settings and leaves the others as they are.
+        conditions: what is wrong around the drive from the beginning; empty for modules without a motor.
+    """
+
+    name: str
+    plant: MotorPlant = field(default_factory=MotorPlant)
+    settings: ModuleSettings | None = None
+    adjust: Callable[[ModuleSettings], ModuleSettings] = _unchanged
+    conditions: frozenset[Condition] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class TimedEvent:
+    """Something that happens to one module by itself.
+
+    Attributes:
+        at_s: the instant on the line's clock.
+        place: of the module in the chain; 1 is next to the host.
+        condition: what begins or ends around the drive; None for the module's own supply.
+        present: whether it begins (the supply: is switched on) or ends.
+    """
+
+    at_s: float
+    place: int
+    condition: Condition | None
+    present: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ChainSpec:
+    """A chain, the first module next to the host.
+
+    Attributes:
+        baud_check: bytes at another rate than a module's are garbage to it. Without it every module understands the
+            host at any rate, for ports that do not know the rate.
+        seed: of the modules' phases and drifts.
+        events: in any order.
+    """
+
+    modules: tuple[ModuleSpec, ...]
+    baud_check: bool = True
+    delivery: Delivery = Delivery.WHOLE
+    faults: FaultPlan = field(default_factory=FaultPlan)
+    seed: int = 1
+    events: tuple[TimedEvent, ...] = ()
+
+
+def build_chain(spec: ChainSpec) -> Chain:
+    """Build the modules of a chain, all just powered up at the instant 0 of the line's clock.
+
+    Raises:
+        ValueOutOfRange: a module name is unknown, there is no module, or an event is for none or for one that has no
+            motor.
+    """
+    if not spec.modules:
+        raise ValueOutOfRange("a simulated chain needs at least one module", value=0, limit=1, nearest=1)
+    dice = random.Random(spec.seed)  # noqa: S311 - reproducible on purpose
+    modules = [_build_module(module, dice) for module in spec.modules]
+    chain = Chain(modules, spec.faults, baud_check=spec.baud_check, delivery=spec.delivery)
+    for event in spec.events:
+        if not 1 <= event.place <= len(modules):
+            raise ValueOutOfRange(
+                f"an event is for module {event.place} of {len(modules)}", value=event.place, limit=len(modules)
+            )
+        chain.schedule(event.at_s, _happening(event, modules[event.place - 1]))
+    return chain
+
+
+def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], None]:
+    if event.condition is None:
+        return lambda at_s: module.power(on=event.present, at_s=at_s)
+    condition = event.condition
+    if not isinstance(module, SimulatedDrive):
+        raise ValueOutOfRange(f"module {event.place} has no motor to suffer {condition}", value=event.place)
+    return lambda at_s: module.set_condition(condition, present=event.present, at_s=at_s)
+
+
+def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
+    if spec.name not in MODELS:
+        known = ", ".join(MODELS)
+        raise ValueOutOfRange(f"simulated module {spec.name!r} is not one of {known}", value=spec.name, limit=known)
+    profile, default = MODELS[spec.name]
+    drawn = replace(
+        default, phase_s=dice.uniform(0.0, SERVO_CYCLE_S), drift_ppm=dice.uniform(-MOST_DRIFT_PPM, MOST_DRIFT_PPM)
+    )
+    settings = spec.adjust(spec.settings or drawn)
+    if profile.support is Support.FULL:
+        drive = SimulatedDrive(profile, settings, spec.plant)
+        for condition in spec.conditions:
+            drive.set_condition(condition, present=True, at_s=0.0)
+        return drive
+    return SimulatedIo(profile, settings)

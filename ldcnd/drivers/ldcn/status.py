@@ -1,0 +1,193 @@
+"""LDCN/NMC status packets: which items they carry, how long they are, what they say.
+
+A status packet has no header, no address and no length: its layout follows from the profile and the item mask of the
+request, never from its length (two devices answer 19 bytes to mask FF with different layouts).
+Sources: LS-182AP manual, "Define Status", "Status byte and auxiliary status byte definitions"; PIC-SERVO manual, 5.2
+and 5.3.
+"""
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.errors import BadReply
+from ldcnd.exchange import ReplyVerdict
+
+
+class StatusItem(IntFlag):
+    """Bits of the Define Status and Read Status mask; data follow in this order."""
+
+    POSITION = 0x01
+    ADC = 0x02
+    VELOCITY = 0x04
+    AUX = 0x08
+    HOME = 0x10
+    IDENTITY = 0x20
+    POSITION_ERROR = 0x40
+    BIT7 = 0x80
+
+
+STATUS_BYTE_ONLY = StatusItem(0)
+"""What every module sends after power-up."""
+
+
+class StatusFlag(IntFlag):
+    """The status byte, by PIC-SERVO names; with `pic_ae_diagnostics` bits 3 to 6 mean more, see faults.py."""
+
+    MOVE_DONE = 0x01
+    CHECKSUM_ERROR = 0x02  # the node rejected *our* packet
+    OVERCURRENT = 0x04  # reserved on LS-182AP
+    POWER_ON = 0x08
+    POSITION_ERROR = 0x10
+    LIMIT1 = 0x20  # LS-182AP: reverse limit, or diagnostic bit
+    LIMIT2 = 0x40  # LS-182AP: forward limit, or diagnostic bit
+    HOME_IN_PROGRESS = 0x80
+
+
+class AuxFlag(IntFlag):
+    """The auxiliary status byte."""
+
+    INDEX = 0x01  # complement of the index input, or diagnostic bit
+    POSITION_WRAP = 0x02
+    SERVO_ON = 0x04
+    ACCEL_DONE = 0x08
+    SLEW_DONE = 0x10
+    SERVO_OVERRUN = 0x20
+    MOTION_LOCKED = 0x80  # LS-182AP from version 22 on
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """One decoded status packet; None where the mask did not ask for the item.
+
+    Attributes:
+        position: counts, signed 32 bit.
+        adc: counts, 0 to 255 or 0 to 1023 as the profile says.
+        velocity: counts per servo tick, **positive forward** (the wire says the opposite).
+        home: counts, signed 32 bit.
+        position_error: counts, commanded minus actual, signed 16 bit.
+        bit7: the byte of status item 7 (PIC-SERVO SC: path points left).
+    """
+
+    flags: StatusFlag
+    position: int | None = None
+    adc: int | None = None
+    velocity: int | None = None
+    aux: AuxFlag | None = None
+    home: int | None = None
+    device_id: int | None = None
+    version: int | None = None
+    position_error: int | None = None
+    bit7: int | None = None
+
+
+_POSITION, _ADC, _VELOCITY, _AUX, _HOME, _IDENTITY, _POSITION_ERROR, _BIT7 = map(int, StatusItem)
+"""As numbers: arithmetic with flags costs ten times as much, and every reply needs it."""
+
+
+def item_bytes(profile: Profile, items: StatusItem) -> int:
+    """Return how many data bytes a status packet of this device carries for these items, 0 to 17."""
+    mask = int(items)
+    return (
+        (4 if mask & _POSITION else 0)
+        + (profile.adc_bytes if mask & _ADC else 0)
+        + (2 if mask & _VELOCITY else 0)
+        + (1 if mask & _AUX else 0)
+        + (4 if mask & _HOME else 0)
+        + (2 if mask & _IDENTITY else 0)
+        + (profile.position_error_bytes if mask & _POSITION_ERROR else 0)
+        + (profile.bit7_bytes if mask & _BIT7 else 0)
+    )
+
+
+def status_bytes(profile: Profile, items: StatusItem) -> int:
+    """Return the length of a whole status packet: status byte, items, checksum; 2 to 19."""
+    return 2 + item_bytes(profile, items)
+
+
+def check_status(data: bytes) -> ReplyVerdict:
+    """Judge a complete status packet by its checksum and its checksum-error bit."""
+    if (sum(data) - data[-1]) & 0xFF != data[-1]:
+        return ReplyVerdict.CORRUPT
+    if data[0] & 0x02:  # StatusFlag.CHECKSUM_ERROR, as a number: this runs between two packets
+        return ReplyVerdict.REJECTED
+    return ReplyVerdict.INTACT
+
+
+def encode_status(profile: Profile, items: StatusItem, status: Status) -> bytes:
+    """Build the packet that a device with this profile sends; absent values count as zero.
+
+    Raises:
+        OverflowError: a value does not fit its field.
+    """
+    mask = int(items)
+    body = bytearray([status.flags])
+    if mask & _POSITION:
+        body += (status.position or 0).to_bytes(4, "little", signed=True)
+    if mask & _ADC:
+        body += (status.adc or 0).to_bytes(profile.adc_bytes, "little")
+    if mask & _VELOCITY:
+        body += (-(status.velocity or 0)).to_bytes(2, "little", signed=True)
+    if mask & _AUX:
+        body.append(status.aux or 0)
+    if mask & _HOME:
+        body += (status.home or 0).to_bytes(4, "little", signed=True)
+    if mask & _IDENTITY:
+        body += bytes([status.device_id or 0, status.version or 0])
+    if mask & _POSITION_ERROR and profile.position_error_bytes:
+        body += (status.position_error or 0).to_bytes(2, "little", signed=True)
+    if mask & _BIT7 and profile.bit7_bytes:
+        body.append(status.bit7 or 0)
+    body.append(sum(body) & 0xFF)
+    return bytes(body)
+
+
+def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
+    """Decode a status packet of this device for these items; unknown flag bits are kept.
+
+    Raises:
+        BadReply: the length does not fit the mask, or the checksum is wrong.
+    """
+    mask = int(items)
+    expected = status_bytes(profile, items)
+    if len(data) != expected:
+        raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
+    if sum(data[:-1]) & 0xFF != data[-1]:
+        raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
+    position = adc = velocity = aux = home = device_id = version = position_error = bit7 = None
+    at = 1
+    if mask & _POSITION:
+        position = int.from_bytes(data[at : at + 4], "little", signed=True)
+        at += 4
+    if mask & _ADC:
+        adc = int.from_bytes(data[at : at + profile.adc_bytes], "little")
+        at += profile.adc_bytes
+    if mask & _VELOCITY:
+        velocity = -int.from_bytes(data[at : at + 2], "little", signed=True)
+        at += 2
+    if mask & _AUX:
+        aux = AuxFlag(data[at])
+        at += 1
+    if mask & _HOME:
+        home = int.from_bytes(data[at : at + 4], "little", signed=True)
+        at += 4
+    if mask & _IDENTITY:
+        device_id, version = data[at], data[at + 1]
+        at += 2
+    if mask & _POSITION_ERROR and profile.position_error_bytes:
+        position_error = int.from_bytes(data[at : at + 2], "little", signed=True)
+        at += 2
+    if mask & _BIT7 and profile.bit7_bytes:
+        bit7 = data[at]
+    return Status(
+        StatusFlag(data[0]),
+        position,
+        adc,
+        velocity,
+        aux,
+        home,
+        device_id,
+        version,
+        position_error,
+        bit7,
+    )

@@ -1,0 +1,143 @@
+"""The data of Load Trajectory: goal, velocity, acceleration, PWM or analog target, and how they are executed.
+
+Sources: LS-182AP manual, "Load Trajectory", "Absolute positioning mode"; PIC-SERVO manual, 4.4, 4.5, 5.2. Where the
+LS-182AP text has bit 4 choose between trapezoid and velocity it means bit 5, as its own list of bits says.
+"""
+
+from dataclasses import dataclass
+from enum import IntFlag, StrEnum
+
+from ldcnd.drivers.ldcn.fields import POSITION, Field
+from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.registers import MOST_RATE
+from ldcnd.errors import NotSupported
+
+VELOCITY = Field("velocity", 4, 0, MOST_RATE)
+ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
+MOST_PWM = 0xFF
+
+
+class ProfileMode(StrEnum):
+    """What the profile generator does while the position servo is on."""
+
+    TRAPEZOIDAL = "trapezoidal"
+    VELOCITY = "velocity"
+
+
+class TrajectoryControl(IntFlag):
+    """The control byte; bits 0 to 3 say which fields follow."""
+
+    LOAD_POSITION = 0x01
+    LOAD_VELOCITY = 0x02
+    LOAD_ACCELERATION = 0x04
+    LOAD_PWM_OR_TARGET = 0x08
+    SERVO = 0x10
+    VELOCITY_MODE = 0x20
+    REVERSE = 0x40
+    START_NOW = 0x80
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """What is loaded; None leaves a register as it is.
+
+    Attributes:
+        position: counts, -0x7FFFFFFF to 0x7FFFFFFF; the goal in trapezoidal mode.
+        velocity: programmed velocity, 0 to 0x7FFFFFFF, see registers.py.
+        acceleration: programmed acceleration, 0 to 0x7FFFFFFF.
+        pwm_or_target: without the servo the PWM value, 0 to 255; with it, on devices with absolute positioning, the A/D
+            value at which a motion in velocity mode ends.
+        servo: position servo on; off sends the PWM value straight to the amplifier.
+        mode: the profile, while the servo is on.
+        reverse: backward, in velocity and PWM mode; in trapezoidal mode the direction follows from the position.
+        start_now: execute at once instead of waiting for Start Motion.
+    """
+
+    position: int | None = None
+    velocity: int | None = None
+    acceleration: int | None = None
+    pwm_or_target: int | None = None
+    servo: bool = True
+    mode: ProfileMode = ProfileMode.TRAPEZOIDAL
+    reverse: bool = False
+    start_now: bool = False
+
+    @property
+    def control(self) -> TrajectoryControl:
+        """The control byte that announces these fields."""
+        control = TrajectoryControl(0)
+        for present, bit in (
+            (self.position is not None, TrajectoryControl.LOAD_POSITION),
+            (self.velocity is not None, TrajectoryControl.LOAD_VELOCITY),
+            (self.acceleration is not None, TrajectoryControl.LOAD_ACCELERATION),
+            (self.pwm_or_target is not None, TrajectoryControl.LOAD_PWM_OR_TARGET),
+            (self.servo, TrajectoryControl.SERVO),
+            (self.mode is ProfileMode.VELOCITY, TrajectoryControl.VELOCITY_MODE),
+            (self.reverse, TrajectoryControl.REVERSE),
+            (self.start_now, TrajectoryControl.START_NOW),
+        ):
+            if present:
+                control |= bit
+        return control
+
+
+def trajectory_bytes(profile: Profile, control: TrajectoryControl) -> int:
+    """Return how many data bytes this control byte implies, itself included; 1 to 15."""
+    return 1 + sum(field.width for field in _fields(profile, control) if field)
+
+
+def encode_trajectory(profile: Profile, trajectory: Trajectory) -> bytes:
+    """Return the data bytes for this device.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+        NotSupported: an analog target on a device without absolute positioning, or a backward trapezoid: the bit means
+            nothing there on most devices, and a relative move on PIC-SERVO SC.
+    """
+    if trajectory.servo and trajectory.mode is ProfileMode.TRAPEZOIDAL and trajectory.reverse:
+        raise NotSupported("a trapezoidal move takes its direction from the position, not from the reverse bit")
+    if trajectory.servo and trajectory.pwm_or_target and not profile.analog_target:
+        raise NotSupported(f"{profile.title} has no absolute positioning: with the servo on it takes no analog target")
+    values = (trajectory.position, trajectory.velocity, trajectory.acceleration, trajectory.pwm_or_target)
+    data = bytearray((trajectory.control,))
+    for field, value in zip(_fields(profile, trajectory.control), values, strict=True):
+        if field and value is not None:
+            data += field.encode(value)
+    return bytes(data)
+
+
+def decode_trajectory(profile: Profile, data: bytes) -> Trajectory:
+    """Take data bytes as this device would: missing ones count as 0, surplus ones are ignored."""
+    control = TrajectoryControl(data[0] if data else 0)
+    at = 1
+    values: list[int | None] = []
+    for field in _fields(profile, control):
+        values.append(field.decode(data[at:]) if field else None)
+        at += field.width if field else 0
+    position, velocity, acceleration, pwm_or_target = values
+    return Trajectory(
+        position=position,
+        velocity=velocity,
+        acceleration=acceleration,
+        pwm_or_target=pwm_or_target,
+        servo=bool(control & TrajectoryControl.SERVO),
+        mode=ProfileMode.VELOCITY if control & TrajectoryControl.VELOCITY_MODE else ProfileMode.TRAPEZOIDAL,
+        reverse=bool(control & TrajectoryControl.REVERSE),
+        start_now=bool(control & TrajectoryControl.START_NOW),
+    )
+
+
+def _fields(profile: Profile, control: TrajectoryControl) -> tuple[Field | None, ...]:
+    """Return position, velocity, acceleration and PWM or target, None for those that the control byte leaves out."""
+    return (
+        POSITION if control & TrajectoryControl.LOAD_POSITION else None,
+        VELOCITY if control & TrajectoryControl.LOAD_VELOCITY else None,
+        ACCELERATION if control & TrajectoryControl.LOAD_ACCELERATION else None,
+        _pwm_or_target(profile, control) if control & TrajectoryControl.LOAD_PWM_OR_TARGET else None,
+    )
+
+
+def _pwm_or_target(profile: Profile, control: TrajectoryControl) -> Field:
+    if control & TrajectoryControl.SERVO and profile.analog_target:
+        return Field("analog target", profile.pwm_bytes, 0, (1 << profile.adc_bits) - 1)
+    return Field("PWM", profile.pwm_bytes, 0, MOST_PWM)

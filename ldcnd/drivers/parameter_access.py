@@ -1,0 +1,78 @@
+"""The contract between the daemon and a drive whose parameters, alarms and counters can be read over its line."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from ldcnd.model.parameters import AlarmEntry, CounterName, DoubtInfo, ParameterInfo, ParameterValue
+from ldcnd.model.requests import WriteParameterRequest
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What became of a parameter write.
+
+    Attributes:
+        value: both memories, read after the write.
+        written: the drive was told to change; false when it had the value already.
+        remarks: what deserves a look.
+    """
+
+    value: ParameterValue
+    written: bool
+    remarks: tuple[str, ...] = ()
+
+
+class ParameterAccess(ABC):
+    """The parameters of one drive; one call at a time.
+
+    Every call may raise the `BusError` that befell it, or the `DriveFault` with which the drive declined.
+    """
+
+    @abstractmethod
+    def known(self) -> tuple[ParameterInfo, ...]:
+        """Return what is known of the listed parameters."""
+
+    @abstractmethod
+    async def read(self, parameter: str, *, unlisted: bool = False) -> ParameterValue:
+        """Read one parameter from both memories.
+
+        Raises:
+            ValueOutOfRange: there is no such parameter.
+        """
+
+    @abstractmethod
+    async def read_all(self) -> tuple[ParameterValue, ...]:
+        """Read all listed parameters that the drive has."""
+
+    @abstractmethod
+    async def write(self, request: WriteParameterRequest) -> Written:
+        """Write one parameter unless it has the value already, and read both memories afterwards.
+
+        Raises:
+            ValueOutOfRange: there is no such parameter.
+            NotSupported: EEPROM may not be written here.
+            EepromBudgetSpent: it was written too often.
+            WrongState: the wires do not allow writing, or a change of the unit number is not confirmed.
+            OutcomeUnknown: the line failed before the write could be read back.
+        """
+
+    @abstractmethod
+    async def clear_counter(self, counter: CounterName) -> int:
+        """Set a pulse counter to 0 and return what it counts then.
+
+        Raises:
+            WrongState: the motor turns, or the drive is busy.
+        """
+
+    @abstractmethod
+    async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
+        """Read the present alarm and the history."""
+
+    @abstractmethod
+    def doubts(self) -> tuple[DoubtInfo, ...]:
+        """Return what is not certain about the drive."""
+
+    @property
+    @abstractmethod
+    def self_hearing(self) -> bool:
+        """Whether the drive takes its own replies for commands."""

@@ -1,0 +1,1 @@
+"""OMRON SmartStep: the 14-character ASCII protocol."""

@@ -1,0 +1,136 @@
+"""One SmartStep as an `AxisDriver`: read over its line, moved by pulses and inputs that no command can replace.
+
+Its state follows from what it shows: RUN closes the loop, an alarm opens it, the speed feedback tells whether it moves.
+Source: manual, introduction ("Omission": no command enables, moves, or resets); 3.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.poller import Poller
+from ldcnd.drivers.driver import AxisReading, AxisSpec, Fault, ReadingListeners
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import ParameterAccess
+from ldcnd.drivers.read_only import ReadOnlyAxis
+from ldcnd.drivers.smartstep.addresses import Register
+from ldcnd.drivers.smartstep.alarms import NO_ALARM, AlarmKind, alarm
+from ldcnd.drivers.smartstep.parameter_store import EepromRules
+from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
+from ldcnd.drivers.smartstep.status import (
+    INPUT_SIGNALS,
+    OUTPUT_SIGNALS,
+    SPEED_FEEDBACK,
+    DriverType,
+    alarm_is_out,
+    driver_type,
+    input_levels,
+    output_levels,
+    run_is_on,
+    signed_word,
+)
+from ldcnd.drivers.smartstep.trace import SmartStepTracer
+from ldcnd.drivers.smartstep.unit_parameters import UnitParameters
+from ldcnd.drivers.smartstep.unit_poller import Basic, Item, Listeners, UnitPoller, UnitWords
+from ldcnd.drivers.smartstep.words import Words
+from ldcnd.exchange import Timing
+from ldcnd.model.axes import PARAMETER_CAPABILITIES, TRACE_CAPABILITIES
+from ldcnd.model.monitors import MonitorName
+from ldcnd.model.requests import HomeMethod
+from ldcnd.model.samples import TelemetryItem
+
+
+@dataclass(frozen=True, slots=True)
+class UnitSpec:
+    """What the configuration says about one unit.
+
+    Attributes:
+        axis: name, unit number 0 to 15, model.
+        profile: how the drive is taken to behave.
+        rates_hz: how often each item is read.
+        eeprom: when EEPROM may be written.
+    """
+
+    axis: AxisSpec
+    profile: SmartStepProfile = SMARTSTEP
+    rates_hz: Mapping[Item, float] = field(
+        default_factory=lambda: {Basic.STATE: 1.0, Basic.VELOCITY: 1.0, Basic.POSITION: 1.0}
+    )
+    eeprom: EepromRules = field(default_factory=EepromRules)
+
+
+class SmartStepAxis(ReadOnlyAxis):
+    """A drive at one unit number."""
+
+    def __init__(self, spec: UnitSpec, bus: Bus) -> None:
+        self.spec = spec.axis
+        self.profile = spec.profile
+        self.identity: str | None = None
+        self.capabilities = PARAMETER_CAPABILITIES | TRACE_CAPABILITIES
+        self.adc_full_scale = None
+        self.home_methods: frozenset[HomeMethod] = frozenset()
+        self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
+        self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
+        self._parameters = UnitParameters(self.words, spec.profile, spec.eeprom, self._cleared)
+        self.tracer = SmartStepTracer(bus, self.words, spec.profile)
+        self._rates_hz = spec.rates_hz
+        self._bus = bus
+        self._poller: UnitPoller | None = None
+
+    @property
+    def parameters(self) -> ParameterAccess:
+        """See `AxisDriver`."""
+        return self._parameters
+
+    def identified(self, type_word: int, version: int) -> None:
+        """Take driver type (8800H) and software version (8518H); both types of the manual have one word."""
+        known = driver_type(type_word)
+        title = "R7D-APL or R7D-APH" if known is DriverType.R7D_AP else f"unlisted type {type_word:04X}H"
+        self.identity = f"SmartStep {title} (version {version:04X}H)"
+
+    def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any]:
+        """See `AxisDriver`."""
+
+        def read(words: UnitWords, item: TelemetryItem, timing: Timing) -> None:
+            listeners.observed(self.interpret(words), frozenset({item}), timing)
+
+        def monitored(value: MonitorValue, timing: Timing) -> None:
+            listeners.monitored(value, timing)
+
+        self._poller = UnitPoller(
+            self._bus,
+            self.spec.address,
+            self.profile,
+            self._rates_hz,
+            start_at_s,
+            Listeners(read, monitored, self.identified, listeners.missed),
+        )
+        return self._poller
+
+    def interpret(self, latest: UnitWords) -> AxisReading:
+        """Return what the latest words of the drive say together."""
+        words = latest.words
+        counts_per_s_per_rpm = self.profile.encoder_counts_per_rev / 60.0
+        present = alarm(words[Register.PRESENT_ALARM])
+        out = alarm_is_out(self.profile, output_levels(words[OUTPUT_SIGNALS.address]))
+        stops = present.kind is AlarmKind.ALARM or (present.kind is AlarmKind.UNKNOWN and out)
+        faults = []
+        if present.code != NO_ALARM:
+            faults.append(Fault(f"alarm_{present.code:04x}", f"A.{present.code:02X}: {present.text}", stops=stops))
+        speed_rpm = signed_word(words[SPEED_FEEDBACK.address])
+        return AxisReading(
+            position_counts=latest.position.signed,
+            following_error_counts=None,
+            velocity_counts_per_s=speed_rpm * counts_per_s_per_rpm,
+            velocity_resolution_counts_per_s=counts_per_s_per_rpm / 2,
+            adc_counts=None,
+            enabled=run_is_on(self.profile, input_levels(words[INPUT_SIGNALS.address])) and not stops,
+            profile_done=speed_rpm == 0,
+            homing=False,
+            faults=tuple(faults),
+        )
+
+    def _cleared(self) -> None:
+        if self._poller:
+            self._poller.forget_position()

@@ -1,0 +1,170 @@
+"""Examining one drive by reading only: is it alive, what is it, how are its wires, which doubts can be settled.
+
+Reads at even addresses and even counts only: what a drive does with odd ones is not known. Run it with RUN off.
+Source: manual 2 to 6; the order goes from what no drive can take amiss to what asks most of it.
+"""
+
+from collections.abc import AsyncIterator
+
+from ldcnd.bus.bus import Bus
+from ldcnd.drivers.smartstep import commands
+from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, Register
+from ldcnd.drivers.smartstep.alarms import AlarmKind, alarm
+from ldcnd.drivers.smartstep.axis import SmartStepAxis
+from ldcnd.drivers.smartstep.network import hears_itself
+from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.parameters import PN000, unit_number
+from ldcnd.drivers.smartstep.refusals import Refusal
+from ldcnd.drivers.smartstep.status import (
+    INPUT_COUNTER_LOW,
+    FunctionSwitch,
+    function_switches,
+    gain_switch,
+)
+from ldcnd.drivers.smartstep.strings import LONGEST_STRING_BYTES, StringReply, string_reference
+from ldcnd.errors import BadReply, BusError, DriveFault
+from ldcnd.model.findings import Finding, Verdict
+
+
+async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
+    """Examine one drive on an open line that nobody else uses; yields each finding as it comes.
+
+    Ends early when the drive does not answer or hears itself.
+    """
+    examination = Examination(bus, unit)
+    alive = await examination.alive()
+    yield alive
+    if alive.verdict is Verdict.WRONG:
+        return
+    for part in (
+        examination.wires,
+        examination.identity,
+        examination.state,
+        examination.trace_constants,
+        examination.memories,
+        examination.strings,
+        examination.string_range,
+        examination.longest_string,
+        examination.atomic_counter,
+    ):
+        try:
+            finding = await part()
+        except (BusError, DriveFault) as error:
+            finding = examination.finding(part.__name__.replace("_", " "), Verdict.LOOK, error.message)
+        yield finding
+        if finding.verdict is Verdict.WRONG:
+            return
+
+
+class Examination:
+    """The single looks at one drive; each raises the `BusError` or `DriveFault` that befell it."""
+
+    def __init__(self, bus: Bus, unit: SmartStepAxis) -> None:
+        self._bus = bus
+        self._unit = unit
+        self._words = unit.words
+
+    def finding(self, what: str, verdict: Verdict, text: str, settles: str | None = None) -> Finding:
+        """Return a finding about this drive."""
+        return Finding(axis=self._unit.spec.name, what=what, verdict=verdict, text=text, settles=settles)
+
+    async def alive(self) -> Finding:
+        """Ask for an address that never exists: the known error reply proves drive, line and unit number."""
+        number = self._unit.spec.address
+        try:
+            await self._bus.execute(commands.with_response_time(commands.probe(number), self._unit.profile))
+        except BadReply:
+            text = 'the host hears itself: set echo = "expect"'
+            return self.finding("alive", Verdict.WRONG, text, "echo")
+        except BusError as error:
+            return self.finding("alive", Verdict.WRONG, f"unit {number} does not answer: {error.message}")
+        return self.finding("alive", Verdict.FINE, f"unit {number} answers", "echo")
+
+    async def identity(self) -> Finding:
+        """Read driver type and software version."""
+        type_word = await self._words.read(Register.DRIVER_TYPE)
+        self._unit.identified(type_word, await self._words.read(Register.SOFTWARE_VERSION))
+        return self.finding("identity", Verdict.FINE, self._unit.identity or "")
+
+    async def state(self) -> Finding:
+        """Read alarm, operating mode, switches and the unit number that is stored."""
+        present = alarm(await self._words.read(Register.PRESENT_ALARM))
+        mode = await self._words.mode()
+        switches = function_switches(await self._words.read(Register.FUNCTION_SWITCHES))
+        gain = gain_switch(await self._words.read(Register.GAIN_SWITCH))
+        stored = unit_number(await self._words.read(PN000.eeprom_address))
+        rule = "parameters rule" if FunctionSwitch.PARAMETERS_RULE in switches else "switches rule"
+        fine = present.kind is AlarmKind.NONE and mode == OperatingMode.NORMAL and stored == self._unit.spec.address
+        text = (
+            f"alarm {present.code:02X} ({present.text}); mode {mode:04X}H; gain switch {gain:X}; switch 6: {rule};"
+            f" unit {stored} in Pn000.2"
+        )
+        return self.finding("state", Verdict.FINE if fine else Verdict.LOOK, text, "unit_digit")
+
+    async def wires(self) -> Finding:
+        """Read a word that is not zero and listen whether the drive answers itself."""
+        if await hears_itself(self._bus, self._unit):
+            self._words.self_hearing = True
+            text = "the drive takes its own replies for commands: use four wires"
+            return self.finding("wires", Verdict.WRONG, text, "wiring")
+        return self.finding("wires", Verdict.FINE, "the drive does not hear itself", "wiring")
+
+    async def trace_constants(self) -> Finding:
+        """Read what scales a data trace."""
+        cyclec = await self._words.read(Register.CYCLEC)
+        maxtrqc = await self._words.read(Register.MAXTRQC)
+        osvelcc = await self._words.read(Register.OSVELCC)
+        verdict = Verdict.FINE if cyclec and maxtrqc and osvelcc else Verdict.LOOK
+        text = f"CYCLEC {cyclec} us, MAXTRQC {maxtrqc} %, OSVELCC {osvelcc} r/min"
+        return self.finding("trace constants", verdict, text)
+
+    async def memories(self) -> Finding:
+        """Compare RAM with EEPROM for every listed parameter."""
+        values = await self._unit.parameters.read_all()
+        differing = [f"{value.parameter} {value.active}/{value.stored}" for value in values if value.differs]
+        if not differing:
+            return self.finding("memories", Verdict.FINE, f"{len(values)} parameters, in use as stored")
+        return self.finding("memories", Verdict.LOOK, f"in use/stored differ: {', '.join(differing)}")
+
+    async def strings(self) -> Finding:
+        """Read short strings: the checksum variant, and whether an address holds a byte."""
+        start = TRACE_1_AREA.start
+        one = await self._string(start, 2)
+        both = await self._string(start, 4)
+        second = await self._string(start + 2, 2)
+        if isinstance(one, Refusal) or isinstance(both, Refusal) or isinstance(second, Refusal):
+            return self.finding("strings", Verdict.LOOK, "string references are refused", "string_checksum")
+        if not any(both.data):
+            text = "the trace memory is empty, so a byte in the wrong place would not show: record a trace first"
+            return self.finding("strings", Verdict.LOOK, text, "string_checksum")
+        by_bytes = both.data == one.data + second.data
+        fits = one.fits & both.fits & second.fits
+        names = ", ".join(sorted(fit.value for fit in fits)) or "none in common"
+        text = f"an address holds {'a byte' if by_bytes else 'something else'}; checksum covers: {names}"
+        return self.finding("strings", Verdict.FINE if by_bytes and fits else Verdict.LOOK, text, "string_checksum")
+
+    async def string_range(self) -> Finding:
+        """Read the last word of a trace memory, and one beyond: the second must be refused."""
+        last = await self._string(TRACE_1_AREA.stop - 2, 2)
+        beyond = await self._string(TRACE_1_AREA.stop, 2)
+        fine = not isinstance(last, Refusal) and isinstance(beyond, Refusal)
+        text = f"last word: {last if isinstance(last, Refusal) else 'read'}; beyond: {beyond}"
+        return self.finding("string range", Verdict.FINE if fine else Verdict.LOOK, text, "string_count_unit")
+
+    async def longest_string(self) -> Finding:
+        """Read a whole trace memory at once; this holds the line for two seconds."""
+        whole = await self._string(TRACE_1_AREA.start, LONGEST_STRING_BYTES)
+        if isinstance(whole, Refusal):
+            return self.finding("longest string", Verdict.FINE, f"{whole}: use chunks", "trace_chunk_bytes")
+        return self.finding("longest string", Verdict.FINE, "1000 bytes in one reply", "trace_chunk_bytes")
+
+    async def atomic_counter(self) -> Finding:
+        """Try whether one string reference returns both halves of a counter."""
+        halves = await self._string(INPUT_COUNTER_LOW.address, 4)
+        can = "can" if isinstance(halves, StringReply) else "cannot"
+        return self.finding("atomic counter", Verdict.FINE, f"a counter {can} be read at once", "atomic_counter")
+
+    async def _string(self, address: int, byte_count: int) -> StringReply | Refusal:
+        return await self._bus.execute(
+            string_reference(self._unit.spec.address, address, byte_count, self._unit.profile)
+        )

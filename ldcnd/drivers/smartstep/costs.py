@@ -1,0 +1,47 @@
+"""The price list of a SmartStep: 14 characters each way at 9600 baud, and a wait that only its maximum is known of.
+
+Source: manual 2.1 "Basic specifications", 2.2.
+"""
+
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+from ldcnd.drivers.price_list import PriceList
+from ldcnd.drivers.smartstep import commands
+from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TraceRegister
+from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
+from ldcnd.drivers.smartstep.strings import string_reference
+from ldcnd.exchange import Exchange
+from ldcnd.model.samples import TelemetryItem
+
+BAUD = 9600
+ANY_UNIT = 1
+"""The price is the same for every unit."""
+
+
+def price_list(profile: SmartStepProfile = SMARTSTEP) -> PriceList:
+    """Return the exchanges of a drive; a reading is one word, whatever is asked for."""
+    chunk = string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.trace_chunk_bytes, profile)
+    exchanges: dict[str, Exchange[Any]] = {
+        "read word": commands.reference(ANY_UNIT, 0),
+        "write trace register": commands.write_trace_register(ANY_UNIT, next(iter(TraceRegister)), 0),
+        "set operating mode": commands.set_operating_mode(ANY_UNIT, OperatingMode.NORMAL),
+        "probe": commands.probe(ANY_UNIT),
+        f"read string of {profile.trace_chunk_bytes} bytes": chunk,
+    }
+    return PriceList(
+        node_baud=float(BAUD),
+        reading=partial(_reading, profile),
+        commands=MappingProxyType(
+            {name: commands.with_response_time(exchange, profile) for name, exchange in exchanges.items()}
+        ),
+        stop=None,
+        flush=commands.FLUSH,
+        settle_s=profile.quiet_s,
+    )
+
+
+def _reading(profile: SmartStepProfile, _items: frozenset[TelemetryItem]) -> Exchange[Any]:
+    return commands.with_response_time(commands.reference(ANY_UNIT, 0), profile)

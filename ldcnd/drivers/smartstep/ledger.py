@@ -1,0 +1,109 @@
+"""How often each parameter was written to EEPROM, kept on disk: the memory endures 10,000 writes.
+
+A write is entered before it is sent and taken back only when the drive has proven that it did not carry it out, so a
+crash in between makes the count too high, never too low.
+Source: manual 2.2, note on EEPROM.
+"""
+
+import asyncio
+import json
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from ldcnd.errors import ConfigError, EepromBudgetSpent
+
+EEPROM_LIFE = 10_000
+WARNING_WRITES = 1000
+"""From so many writes on, every further one is remarked upon."""
+
+
+class EepromLedger:
+    """The counts of one rig, by axis and parameter; an axis stands for its drive."""
+
+    def __init__(self, path: Path) -> None:
+        """Take up the ledger that is there, or begin an empty one.
+
+        Raises:
+            ConfigError: there is one and it cannot be read; it is not replaced, because counts would be lost.
+        """
+        self._path = path
+        self._worker = ThreadPoolExecutor(1, "eeprom ledger")  # one: the file is replaced in the order of the counts
+        self._counts = _load(path)
+
+    def writes(self, axis: str, parameter: str) -> int:
+        """Return how often a parameter was written."""
+        return self._counts.get(axis, {}).get(parameter, 0)
+
+    def total(self, axis: str) -> int:
+        """Return how many writes a drive has taken in all."""
+        return sum(self._counts.get(axis, {}).values())
+
+    async def enter(self, axis: str, parameter: str, budget: int) -> None:
+        """Count a write that is about to be sent; it is on disk when this returns.
+
+        Raises:
+            EepromBudgetSpent: the parameter has had its share.
+        """
+        writes = self.writes(axis, parameter)
+        if writes >= budget:
+            raise EepromBudgetSpent(
+                f"axis {axis}: {parameter} was written to EEPROM {writes} times; the budget is {budget}",
+                axis=axis,
+                value=writes,
+                limit=budget,
+                remedy=f"write RAM, or raise eeprom_budget (the memory endures {EEPROM_LIFE} writes)",
+            )
+        await self._set(axis, parameter, writes + 1)
+
+    async def take_back(self, axis: str, parameter: str) -> None:
+        """Forget a write that the drive has not carried out."""
+        await self._set(axis, parameter, max(0, self.writes(axis, parameter) - 1))
+
+    async def _set(self, axis: str, parameter: str, writes: int) -> None:
+        before = self.writes(axis, parameter)
+        self._counts.setdefault(axis, {})[parameter] = writes
+        text = json.dumps(self._counts, indent=1, sort_keys=True)
+        loop = asyncio.get_running_loop()
+        try:
+            await loop.run_in_executor(self._worker, _replace, self._path, text)
+        except OSError as error:
+            self._counts[axis][parameter] = before
+            raise ConfigError(
+                f"{self._path}: the EEPROM ledger cannot be written: {error.strerror}",
+                axis=axis,
+                remedy="make state_dir writable",
+            ) from error
+
+
+def _load(path: Path) -> dict[str, dict[str, int]]:
+    if not path.exists():
+        return {}
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return {str(axis): _counts(counts) for axis, counts in document.items()}
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise ConfigError(
+            f"{path}: not an EEPROM ledger: {error}", remedy="restore it from a backup, or move it away"
+        ) from error
+
+
+def _counts(document: Mapping[str, object]) -> dict[str, int]:
+    counts = {}
+    for parameter, writes in document.items():
+        if type(writes) is not int or writes < 0:
+            raise ValueError(f"{parameter}: {writes!r} is not a number of writes")
+        counts[parameter] = writes
+    return counts
+
+
+def _replace(path: Path, text: str) -> None:
+    """Replace the file whole, and only once the new one is on the disk."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_suffix(".new")
+    with draft.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)

@@ -1,0 +1,135 @@
+"""One SmartStep line: who answers on it, what each unit is, whether one hears itself.
+
+Units have no addressing procedure: their numbers are set in Pn000.2. A silent unit does not keep the others from
+being served; it is asked again and again, more and more seldom.
+Source: manual 2.1, 2.2.
+"""
+
+import asyncio
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from typing import Any
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.resync import Resync
+from ldcnd.bus.wire_log import WireEvent
+from ldcnd.drivers.driver import AxisDriver, BringUpReport, Network
+from ldcnd.drivers.smartstep import commands
+from ldcnd.drivers.smartstep.addresses import Register
+from ldcnd.drivers.smartstep.axis import SmartStepAxis, UnitSpec
+from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS
+from ldcnd.drivers.smartstep.parameters import PN000, PN100, unit_number
+from ldcnd.drivers.smartstep.profiles import SMARTSTEP
+from ldcnd.drivers.smartstep.reply_reader import ReplyReader
+from ldcnd.drivers.smartstep.status import DriverType, FunctionSwitch, function_switches
+from ldcnd.errors import DriveFault, NetworkMismatch, ReplyTimeout
+from ldcnd.exchange import Exchange
+from ldcnd.log import get_logger
+
+log = get_logger("smartstep")
+
+STRAY_WAIT_S = 0.3
+"""A drive that heard itself has answered by then: its longest response time and some margin."""
+
+
+class SmartStepNetwork(Network):
+    """The units of one line."""
+
+    def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...]) -> None:
+        self._bus = bus
+        self._units = {spec.axis.address: SmartStepAxis(spec, bus) for spec in specs}
+        self._answering: list[int] = []
+        self.axes: Mapping[str, AxisDriver] = {unit.spec.name: unit for unit in self._units.values()}
+        self.resync = Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=self._probe)
+
+    async def bring_up(self) -> BringUpReport:
+        """See `Network`: ask every unit what it is; only reads.
+
+        Raises:
+            NetworkMismatch: no unit answers at all, or one takes its own replies for commands.
+            BusError: the line failed meanwhile.
+        """
+        self._answering.clear()
+        remarks: list[str] = []
+        for number, unit in self._units.items():
+            try:
+                await self._bus.execute(commands.with_response_time(commands.probe(number), unit.profile))
+            except ReplyTimeout:
+                remarks.append(f"unit {number} (axis {unit.spec.name}) does not answer")
+                continue
+            self._answering.append(number)
+            try:
+                await self._check_wires(unit)
+                remarks += await self._meet(unit)
+            except (ReplyTimeout, DriveFault) as error:
+                remarks.append(f"unit {number} (axis {unit.spec.name}): {error.message}")
+        name = self._bus.settings.name
+        if not self._answering:
+            raise NetworkMismatch(
+                f"bus {name}: none of the {len(self._units)} configured SmartStep units answers",
+                remedy="check wiring, 9600 baud 7E1, and the unit numbers in Pn000.2",
+            )
+        log.info("network up", bus=name, units=list(self._answering))
+        return BringUpReport(
+            baud=self._bus.baud,
+            identities={unit.spec.name: unit.identity for unit in self._units.values() if unit.identity},
+            reset=False,
+            remarks=tuple(remarks),
+        )
+
+    async def _check_wires(self, unit: SmartStepAxis) -> None:
+        """Refuse a line on which a drive hears itself, before a word is read that may be zero.
+
+        Raises:
+            NetworkMismatch: it does.
+        """
+        if await hears_itself(self._bus, unit):
+            unit.words.self_hearing = True
+            raise NetworkMismatch(
+                f"bus {self._bus.settings.name}: unit {unit.spec.address} (axis {unit.spec.name}) takes its own replies"
+                " for commands; reading a zero or writing would make it answer itself without end",
+                remedy="use four wires",
+            )
+
+    async def _meet(self, unit: SmartStepAxis) -> list[str]:
+        """Learn what a unit is; return what deserves a look."""
+        words, who = unit.words, f"unit {unit.spec.address} (axis {unit.spec.name})"
+        remarks = []
+        type_word = await words.read(Register.DRIVER_TYPE)
+        unit.identified(type_word, await words.read(Register.SOFTWARE_VERSION))
+        if type_word != DriverType.R7D_AP:
+            remarks.append(f"{who}: driver type {type_word:04X}H is not one that the manual lists")
+        mode = await words.mode()
+        if mode != OperatingMode.NORMAL:
+            remarks.append(f"{who}: was left in operating mode {mode:04X}H")
+        stored = unit_number(await words.read(PN000.eeprom_address))
+        if stored != unit.spec.address:
+            remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on")
+        if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
+            remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")
+        return remarks
+
+    def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:
+        """See `Resync`: no other command's reply carries the address of the probe."""
+        candidates = [number for number in self._answering if number not in avoid] or self._answering
+        return commands.probe(candidates[0]) if candidates else None
+
+
+async def hears_itself(bus: Bus, unit: SmartStepAxis) -> bool:
+    """Tell whether a drive takes its own replies for commands.
+
+    A non-zero word makes it answer itself with a data error, which stops by itself: Pn100 is never zero.
+    """
+    unit.words.self_hearing = False
+    await unit.words.read(PN100.ram_address)
+    loop = asyncio.get_running_loop()
+    heard_at_s = loop.time()
+    await asyncio.sleep(STRAY_WAIT_S)
+    stray = b"".join(
+        record.data
+        for record in bus.wire_log.records()
+        if record.event is WireEvent.STRAY and record.at_s >= heard_at_s
+    )
+    packets = ReplyReader(PACKET_CHARACTERS).feed(stray)  # a port may deliver them in pieces
+    return any(commands.is_self_hearing(unit.spec.address, packet) for packet in packets)

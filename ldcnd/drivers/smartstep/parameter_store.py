@@ -1,0 +1,250 @@
+"""Reading and writing the parameters of one drive: RAM by default, EEPROM rarely and never twice for one request.
+
+EEPROM: the value is read first and nothing is sent if it is there already; each write is entered in the ledger before
+it is sent; when its reply is lost, the memory is read back, and only a value that is still the old one lets the write
+be sent again.
+Source: manual 2.2, note on EEPROM; 3.
+"""
+
+from dataclasses import dataclass
+
+from ldcnd.drivers.parameter_access import Written
+from ldcnd.drivers.smartstep.commands import write_eeprom, write_ram
+from ldcnd.drivers.smartstep.ledger import EEPROM_LIFE, WARNING_WRITES, EepromLedger
+from ldcnd.drivers.smartstep.parameters import (
+    PARAMETERS,
+    PN000,
+    Parameter,
+    find_parameter,
+    unit_number,
+    unlisted_parameter,
+)
+from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile
+from ldcnd.drivers.smartstep.words import Words
+from ldcnd.errors import (
+    AddressRefused,
+    BadReply,
+    BusBusy,
+    BusDown,
+    DriveFault,
+    NotSupported,
+    OutcomeUnknown,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.log import get_logger
+from ldcnd.model.parameters import Memory, ParameterInfo, ParameterValue
+from ldcnd.model.requests import WriteParameterRequest
+
+log = get_logger("smartstep")
+
+EEPROM_ATTEMPTS = 3
+"""So many writes at most for one request, each after a read-back that shows the old value."""
+DEFAULT_BUDGET = 9000
+
+
+@dataclass(frozen=True, slots=True)
+class EepromRules:
+    """When EEPROM may be written.
+
+    Attributes:
+        ledger: where writes are counted; without one there are none.
+        budget: writes of one parameter, up to 10,000.
+    """
+
+    ledger: EepromLedger | None = None
+    budget: int = DEFAULT_BUDGET
+
+
+class ParameterStore:
+    """The parameters of one drive; one call at a time."""
+
+    def __init__(self, words: Words, profile: SmartStepProfile, rules: EepromRules) -> None:
+        self._words = words
+        self._profile = profile
+        self._rules = rules
+
+    @property
+    def _axis(self) -> str:
+        return self._words.axis
+
+    def find(self, text: str, *, unlisted: bool) -> Parameter:
+        """Return the parameter with this number or name.
+
+        Raises:
+            ValueOutOfRange: there is none, or the manual does not list it and that was not asked for.
+        """
+        listed = find_parameter(text) or next((each for each in PARAMETERS if each.name.lower() == text.lower()), None)
+        if listed:
+            return listed
+        digits = text.lower().removeprefix("pn")
+        if unlisted and digits and not digits.strip("0123456789abcdef"):
+            return unlisted_parameter(int(digits, 16))
+        raise ValueOutOfRange(
+            f"axis {self._axis}: the manual lists no parameter {text!r}",
+            axis=self._axis,
+            value=text,
+            remedy="send list_parameters, or allow unlisted ones",
+        )
+
+    async def read(self, parameter: Parameter) -> ParameterValue:
+        """Read both memories."""
+        active = await self._words.read(parameter.ram_address)
+        return self._value(parameter, active, await self._words.read(parameter.eeprom_address))
+
+    async def read_all(self) -> tuple[ParameterValue, ...]:
+        """Read all listed parameters; a drive may lack some."""
+        values = []
+        for parameter in PARAMETERS:
+            try:
+                values.append(await self.read(parameter))
+            except AddressRefused:
+                log.info("parameter not there", axis=self._axis, parameter=parameter.label)
+        return tuple(values)
+
+    async def write(self, request: WriteParameterRequest) -> Written:
+        """Write one parameter; see `ParameterAccess`."""
+        parameter = self.find(request.parameter, unlisted=request.unlisted)
+        before = await self.read(parameter)
+        self._check_unit(parameter, before, request)
+        if request.memory is Memory.RAM:
+            if before.active == request.value:
+                return Written(before, written=False)
+            await self._words.ask(write_ram(self._words.unit, parameter, request.value))
+        else:
+            self._check_eeprom()
+            if before.stored == request.value:
+                return Written(before, written=False, remarks=_pending(parameter, before))
+            await self._write_eeprom(parameter, before.stored, request.value)
+        after = await self.read(parameter)
+        held = after.active if request.memory is Memory.RAM else after.stored
+        if held != request.value:
+            raise DriveFault(
+                f"axis {self._axis}: {parameter.label} reads {held} after {request.value} was written to"
+                f" {request.memory.upper()}",
+                axis=self._axis,
+                value=request.value,
+                remedy="the memory may be worn out, or the drive in a state that forbids the change",
+            )
+        log.info("parameter written", axis=self._axis, parameter=parameter.label, memory=request.memory.value)
+        return Written(after, written=True, remarks=self._remarks(parameter, after, request.memory))
+
+    # -- EEPROM ------------------------------------------------------------------------------------------------------
+
+    async def _write_eeprom(self, parameter: Parameter, old: int, value: int) -> None:
+        """Bring a value into EEPROM; the ledger counts exactly what the drive has carried out.
+
+        Raises:
+            OutcomeUnknown: every write got lost, or the last one cannot be read back; then it stays counted.
+        """
+        for _ in range(EEPROM_ATTEMPTS):
+            if await self._written_once(parameter, old, value):
+                return
+        raise OutcomeUnknown(
+            f"axis {self._axis}: {parameter.label} still holds {old} after {EEPROM_ATTEMPTS} writes",
+            axis=self._axis,
+            value=value,
+            remedy="look at the line's losses before trying again",
+        )
+
+    async def _written_once(self, parameter: Parameter, old: int, value: int) -> bool:
+        ledger = self._ledger()
+        await ledger.enter(self._axis, parameter.label, self._rules.budget)
+        try:
+            await self._words.ask(write_eeprom(self._words.unit, parameter, value))
+        except (DriveFault, BusDown, BusBusy):
+            await ledger.take_back(self._axis, parameter.label)  # declined, or never sent
+            raise
+        except (OutcomeUnknown, BadReply):
+            held = await self._words.read_back(parameter.eeprom_address)
+            if held == old:
+                await ledger.take_back(self._axis, parameter.label)
+            return held != old
+        return True
+
+    def _ledger(self) -> EepromLedger:
+        if self._rules.ledger is None:
+            raise NotSupported(
+                f"axis {self._axis}: EEPROM is not written without a ledger of its wear",
+                axis=self._axis,
+                remedy="configure state_dir",
+            )
+        return self._rules.ledger
+
+    # -- checks ------------------------------------------------------------------------------------------------------
+
+    def _check_eeprom(self) -> None:
+        if self._profile.eeprom_write is EepromWrite.DENY:
+            raise NotSupported(
+                f"axis {self._axis}: the configuration forbids writing EEPROM",
+                axis=self._axis,
+                value="eeprom_write",
+                remedy="write RAM",
+            )
+        self._ledger()
+
+    def _check_unit(self, parameter: Parameter, before: ParameterValue, request: WriteParameterRequest) -> None:
+        """Refuse to change the unit number by the way: after its next power-on the drive has another one."""
+        if parameter != PN000:
+            return
+        unit = unit_number(request.value)
+        if unit == unit_number(before.stored if request.memory is Memory.EEPROM else before.active):
+            return
+        if request.memory is Memory.RAM:
+            raise WrongState(
+                f"axis {self._axis}: a unit number in RAM may cut the drive off and is lost at power-off",
+                axis=self._axis,
+                value=request.value,
+                remedy="write it to EEPROM",
+            )
+        if request.confirm_unit != unit:
+            raise WrongState(
+                f"axis {self._axis}: from its next power-on on the drive would be unit {unit}, not {self._words.unit}",
+                axis=self._axis,
+                value=request.value,
+                remedy=f"send confirm_unit {unit}, and change the configuration before the power cycle",
+            )
+
+    # -- results -----------------------------------------------------------------------------------------------------
+
+    def _value(self, parameter: Parameter, active: int, stored: int) -> ParameterValue:
+        ledger = self._rules.ledger
+        return ParameterValue(
+            parameter=parameter.label,
+            name=parameter.name,
+            active=active,
+            stored=stored,
+            eeprom_writes=ledger.writes(self._axis, parameter.label) if ledger else None,
+        )
+
+    def _remarks(self, parameter: Parameter, value: ParameterValue, memory: Memory) -> tuple[str, ...]:
+        remarks = list(_pending(parameter, value))
+        if memory is Memory.RAM and parameter.power_cycle and parameter.power_cycle.value:
+            remarks = [f"{parameter.label} is said to be taken over at power-on, when RAM is lost: write EEPROM"]
+        if memory is Memory.EEPROM and (value.eeprom_writes or 0) >= WARNING_WRITES:
+            remarks.append(f"{value.eeprom_writes} of {EEPROM_LIFE} EEPROM writes are spent")
+            log.warning("EEPROM wears", axis=self._axis, parameter=parameter.label, writes=value.eeprom_writes)
+        return tuple(remarks)
+
+
+def parameter_info(parameter: Parameter) -> ParameterInfo:
+    """Return what is known of a parameter."""
+    facts = [fact for fact in (parameter.limits, parameter.unit) if fact]
+    limits = parameter.limits.value if parameter.limits else None
+    return ParameterInfo(
+        parameter=parameter.label,
+        name=parameter.name,
+        unit=parameter.unit.value if parameter.unit else None,
+        lowest=limits.lowest if limits else None,
+        highest=limits.highest if limits else None,
+        default=parameter.default.value if parameter.default else None,
+        digits=parameter.nibbles,
+        power_cycle=parameter.power_cycle.value if parameter.power_cycle else None,
+        confidence=facts[0].confidence.value if facts else None,
+    )
+
+
+def _pending(parameter: Parameter, value: ParameterValue) -> tuple[str, ...]:
+    if not value.differs:
+        return ()
+    return (f"{parameter.label}: {value.active} is in use, {value.stored} is stored: they meet at the next power-on",)

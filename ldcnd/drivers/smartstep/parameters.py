@@ -1,0 +1,205 @@
+"""The parameters Pn: numbers, names, and what is known of their units, ranges and defaults.
+
+Addresses and names are stated by the manual; units and ranges mostly are not. A value marked RECOLLECTED is a hint for
+a person: the drive enforces its ranges itself (data error), so nothing here refuses a value that fits 16 bits.
+Source: manual 3, "Correspondence of addresses and user parameters for drivers"; 2.2, examples 2 and 6.
+"""
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_OFFSET
+from ldcnd.drivers.smartstep.profiles import Confidence
+from ldcnd.errors import ValueOutOfRange
+
+ValueT = TypeVar("ValueT")
+UNIT_DIGIT = 2
+"""The unit number is Pn000.2: digits count from the right (INFERRED_HIGH)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact(Generic[ValueT]):
+    """A value and where it comes from."""
+
+    value: ValueT
+    confidence: Confidence
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Both ends belong to the range."""
+
+    lowest: int
+    highest: int
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One Pn; a word without sign on the wire.
+
+    Attributes:
+        number: as the digits of its name: Pn10A is 010AH.
+        name: as the manual gives it; empty for an unlisted parameter.
+        unit: None where it has none or nobody knows.
+        power_cycle: whether a change takes effect only at the next power-on; a RAM write of such a parameter is
+            useless.
+        nibbles: four separate settings, shown as hexadecimal digits.
+    """
+
+    number: int
+    name: str
+    unit: Fact[str] | None = None
+    limits: Fact[Limits] | None = None
+    default: Fact[int] | None = None
+    power_cycle: Fact[bool] | None = None
+    nibbles: bool = False
+
+    @property
+    def label(self) -> str:
+        """The name on the drive's display, such as Pn10A."""
+        return f"Pn{self.number:03X}"
+
+    @property
+    def eeprom_address(self) -> int:
+        """Where the value is kept over power-off; endures 10,000 writes."""
+        return self.number
+
+    @property
+    def ram_address(self) -> int:
+        """Where the value in use is."""
+        return self.number + RAM_OFFSET
+
+
+def unlisted_parameter(number: int) -> Parameter:
+    """Return a parameter that the manual does not list: an explicit step for who really means it.
+
+    Args:
+        number: 0 to FFFH.
+
+    Raises:
+        ValueOutOfRange: the number is outside the parameter area.
+    """
+    if number not in EEPROM_AREA:
+        raise ValueOutOfRange(f"parameter number {number:X}H is not 0 to FFFH", value=number, limit=EEPROM_AREA[-1])
+    return Parameter(number, "")
+
+
+def find_parameter(label: str) -> Parameter | None:
+    """Return the listed parameter with this label, such as Pn100, in any case; None when there is none."""
+    return next((parameter for parameter in PARAMETERS if parameter.label.lower() == label.lower()), None)
+
+
+def digit_of(word: int, digit: int) -> int:
+    """Return one setting of a nibble parameter: `PnXXX.digit`, 0 is the rightmost."""
+    return word >> 4 * digit & 0xF
+
+
+def with_digit(word: int, digit: int, value: int) -> int:
+    """Return the word of a nibble parameter with one setting replaced by 0 to 15."""
+    return word & ~(0xF << 4 * digit) | (value & 0xF) << 4 * digit
+
+
+def unit_number(basic_switch_1: int) -> int:
+    """Return the unit number that Pn000 gives the drive at its next power-on."""
+    return digit_of(basic_switch_1, UNIT_DIGIT)
+
+
+_X, _M = Confidence.RELATED, Confidence.RECOLLECTED
+_NEEDS_CYCLE = Fact(value=True, confidence=_M)
+_AT_ONCE = Fact(value=False, confidence=_M)
+_AT_ONCE_RELATED = Fact(value=False, confidence=_X)
+
+
+def _nibbles(number: int, name: str, power_cycle: Fact[bool]) -> Parameter:
+    return Parameter(number, name, power_cycle=power_cycle, nibbles=True)
+
+
+def _range(lowest: int, highest: int, confidence: Confidence = _M) -> Fact[Limits]:
+    return Fact(Limits(lowest, highest), confidence)
+
+
+def _default(value: int, confidence: Confidence = _M) -> Fact[int]:
+    return Fact(value, confidence)
+
+
+_TIME = Fact("0.01 ms", _M)
+
+PN000 = _nibbles(0x000, "Basic switch 1", _NEEDS_CYCLE)
+PN001 = _nibbles(0x001, "Basic switch 2", _NEEDS_CYCLE)
+# The manual's example 6 states the upper end, related drives the lower one.
+PN100 = Parameter(0x100, "Speed loop gain", Fact("Hz", _X), _range(1, 2000, _X), _default(80), _AT_ONCE)
+PN101 = Parameter(
+    0x101,
+    "Speed loop integral time constant",
+    Fact("0.01 ms", _X),
+    _range(15, 51200, _X),
+    _default(2000, _X),
+    _AT_ONCE,
+)
+PN102 = Parameter(0x102, "Position loop gain", Fact("1/s", _X), _range(1, 2000), _default(40), _AT_ONCE)
+PN103 = Parameter(0x103, "Inertia rate", Fact("%", _X), _range(0, 10000, _X), _default(300), _AT_ONCE)
+PN109 = Parameter(0x109, "Feed forward amount", Fact("%", _M), _range(0, 100), _default(0), _AT_ONCE)
+PN10A = Parameter(0x10A, "Feed forward reference filter", _TIME, _range(0, 6400), _default(0), _AT_ONCE)
+PN110 = _nibbles(0x110, "Online auto-tuning setting", _NEEDS_CYCLE)
+PN200 = _nibbles(0x200, "Position control setting 1", _NEEDS_CYCLE)
+PN202 = Parameter(0x202, "Electronic gear ratio G1 (numerator)", None, _range(1, 65535), _default(4), _NEEDS_CYCLE)
+PN203 = Parameter(0x203, "Electronic gear ratio G2 (denominator)", None, _range(1, 65535), _default(1), _NEEDS_CYCLE)
+PN204 = Parameter(
+    0x204,
+    "Position reference filter time constant 1 (primary filter)",
+    _TIME,
+    _range(0, 6400),
+    _default(0),
+    _AT_ONCE,
+)
+PN207 = _nibbles(0x207, "Position control setting 2", _NEEDS_CYCLE)
+PN208 = Parameter(
+    0x208,
+    "Position reference filter time constant 2 (linear acceleration/deceleration)",
+    _TIME,
+    _range(0, 6400),
+    _default(0),
+    _NEEDS_CYCLE,
+)
+# Example 2 states that 1000 is accepted.
+PN304 = Parameter(0x304, "JOG speed", Fact("r/min", _M), _range(0, 10000), _default(500), _AT_ONCE)
+PN401 = Parameter(0x401, "Torque reference filter time constant", _TIME, _range(0, 65535), _default(40), _AT_ONCE)
+_TORQUE = Fact("%", _X)
+PN402 = Parameter(0x402, "Forward torque limit", _TORQUE, _range(0, 800, _X), _default(350), _AT_ONCE_RELATED)
+PN403 = Parameter(0x403, "Reverse torque limit", _TORQUE, _range(0, 800, _X), _default(350), _AT_ONCE_RELATED)
+PN500 = Parameter(0x500, "Position complete width", Fact("command units", _M), _range(0, 250), _default(3), _AT_ONCE)
+PN505 = Parameter(
+    0x505,
+    "Deviation counter over level",
+    Fact("256 command units", _M),
+    _range(1, 32767),
+    _default(1024),
+    _AT_ONCE,
+)
+PN600 = Parameter(0x600, "Regeneration resistance capacity", Fact("10 W", _M), None, _default(0), _AT_ONCE)
+
+PARAMETERS: tuple[Parameter, ...] = (
+    PN000,
+    PN001,
+    PN100,
+    PN101,
+    PN102,
+    PN103,
+    PN109,
+    PN10A,
+    PN110,
+    PN200,
+    PN202,
+    PN203,
+    PN204,
+    PN207,
+    PN208,
+    PN304,
+    PN401,
+    PN402,
+    PN403,
+    PN500,
+    PN505,
+    PN600,
+)
+"""In the manual's order."""

@@ -1,0 +1,234 @@
+"""What is not certain about a SmartStep, as switches, and how certain each default is.
+
+The manual lost its figures and has misprints; a profile says how one drive is taken to behave, and each switch that
+rests on inference is listed as a doubt, to be settled on a bench.
+Source: manual, all chapters; where it is silent, public manuals of related drives.
+"""
+
+from dataclasses import dataclass, replace
+from enum import Enum, StrEnum
+
+from ldcnd.errors import ConfigError
+
+
+class Confidence(Enum):
+    """Where a fact comes from, strongest first."""
+
+    STATED = "S"
+    """The manual says so."""
+    CORRECTED = "S*"
+    """The manual says so through an evident misprint."""
+    RELATED = "X"
+    """A public manual of a related drive says so."""
+    INFERRED_HIGH = "I-high"
+    INFERRED_MEDIUM = "I-med"
+    INFERRED_LOW = "I-low"
+    RECOLLECTED = "M"
+    """No source was found; a hint for people, never a reason to refuse."""
+    OPEN = "?"
+
+
+class Standing(StrEnum):
+    """What a bench has said about a doubt."""
+
+    ASSUMED = "assumed"
+    BENCH_VERIFIED = "bench_verified"
+    CONTRADICTED = "contradicted"
+
+
+class Framing(StrEnum):
+    """How characters are made."""
+
+    SEVEN_EVEN = "7e1"
+    SOFT_PARITY = "8n1-soft-parity"
+
+
+class Wiring(StrEnum):
+    """Which pairs the line has; the manual knows four wires only (1.1)."""
+
+    FOUR_WIRE = "4-wire"
+    TWO_WIRE = "2-wire"
+
+
+class Echo(StrEnum):
+    """Whether the host hears its own characters; recognised by count only, never by content."""
+
+    NONE = "none"
+    EXPECT = "expect"
+    PROBE = "probe"
+
+
+class EepromWrite(StrEnum):
+    """What a write to EEPROM needs; it endures 10,000 of them (manual 2.2, note)."""
+
+    DENY = "deny"
+    CONFIRM = "confirm"
+    ALLOW = "allow"
+
+
+class StringChecksum(StrEnum):
+    """What the checksum of a string reply covers; it stands before the data."""
+
+    AUTO = "auto"
+    HEADER = "header"
+    ALL = "all"
+    TRAILER = "trailer"
+    """The header's own, and a second one after the data."""
+
+
+class CountUnit(StrEnum):
+    """What the count of a string reference counts."""
+
+    BYTES = "bytes"
+    WORDS = "words"
+    CHARS = "chars"
+
+
+class TraceWordLayout(StrEnum):
+    """Where the I/O bit and the value sit in a trace memory word."""
+
+    MSB_IO = "msb-io"
+    LSB_IO_SHIFT = "lsb-io-shift"
+    LSB_IO_MASK = "lsb-io-mask"
+    RAW = "raw"
+
+
+class ByteOrder(StrEnum):
+    """Which half of a word comes first in a string."""
+
+    BIG = "big"
+    LITTLE = "little"
+
+
+class TriggerWordSource(StrEnum):
+    """Where the trigger condition word of a trace comes from; its bit positions are lost from the manual (4, 7))."""
+
+    NONE = "none"
+    CONFIGURED = "configured"
+    RAW = "raw"
+
+
+class CommandPulseGear(StrEnum):
+    """Which way command pulses are geared to motor speed; the two printed formulas contradict the table."""
+
+    NUM_DEN = "num/den"
+    DEN_NUM = "den/num"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerMap:
+    """The bits of the trigger condition word, found on a bench; there is no default.
+
+    Attributes:
+        trace1: object code of trace 1's data, `trace2` that of trace 2's, `io` that of the I/O data.
+        rising: enable bit of the rising edge, `falling` that of the falling edge.
+    """
+
+    trace1: int
+    trace2: int
+    io: int
+    rising: int
+    falling: int
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """One uncertain item.
+
+    Attributes:
+        key: the profile field that switches it, or a name of its own where no switch is possible.
+        confidence: of the default.
+    """
+
+    key: str
+    question: str
+    confidence: Confidence
+    standing: Standing = Standing.ASSUMED
+
+
+DOUBTS: tuple[Doubt, ...] = (
+    Doubt("framing", "does the adapter make 7E1 characters, or ldcnd", Confidence.STATED),
+    Doubt("wiring", "four wires; does a drive on two hear itself", Confidence.STATED),
+    Doubt("echo", "does the host hear its own characters", Confidence.INFERRED_HIGH),
+    Doubt(
+        "first_character_s", "0.2 s run from the command's CR to the first reply character", Confidence.INFERRED_MEDIUM
+    ),
+    Doubt("string_checksum", "the header alone is covered", Confidence.INFERRED_MEDIUM),
+    Doubt("string_count_unit", "the count counts bytes of memory", Confidence.INFERRED_HIGH),
+    Doubt("trace_chunk_bytes", "the longest string is not given", Confidence.OPEN),
+    Doubt("trace_word_layout", "bit 15 is the I/O bit, the value has 15 bits", Confidence.INFERRED_MEDIUM),
+    Doubt("trace_byte_order", "the high byte comes first", Confidence.INFERRED_HIGH),
+    Doubt("trigger_word", "0000H means no trigger; other bits unknown", Confidence.INFERRED_HIGH),
+    Doubt("command_pulse_gear", "numerator over denominator", Confidence.INFERRED_MEDIUM),
+    Doubt("encoder_counts_per_rev", "8000, from the printed speed formula", Confidence.STATED),
+    Doubt("run_active_low", "RUN is on while its bit is 0", Confidence.INFERRED_MEDIUM),
+    Doubt("reset_active_low", "RESET is on while its bit is 0", Confidence.INFERRED_MEDIUM),
+    Doubt("alarm_output_high", "/ALM is 1 in alarm", Confidence.INFERRED_MEDIUM),
+    Doubt("eeprom_changes_ram", "does an EEPROM write change the RAM value at once", Confidence.OPEN),
+    Doubt("unit_digit", "Pn000.2 is bits 11 to 8", Confidence.INFERRED_HIGH),
+    Doubt("switches_rule", "switch 6 off: switches overrule parameters", Confidence.RECOLLECTED),
+    Doubt("atomic_counter", "a string reference reads both counter halves at one instant", Confidence.OPEN),
+    Doubt("untriggered_start", "an untriggered trace starts at point 0", Confidence.INFERRED_HIGH),
+    Doubt("alarm_history_order", "history entry 0 is the newest", Confidence.INFERRED_MEDIUM),
+)
+
+
+RESPONSE_S = 0.3
+"""A drive answers within 0.2 s (manual 2.1), taken as command CR to first reply character, plus 0.1 s of margin."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmartStepProfile:
+    """How one drive is taken to behave.
+
+    Attributes:
+        first_character_s: the longest wait from the end of a command to its reply.
+        gap_s: the longest silence inside a reply.
+        quiet_s: silence before each command.
+        attempts: how often a repeatable command is sent in all; like `gap_s` and `quiet_s` it is for the line's owner.
+        trace_chunk_bytes: 2 to 1000, even.
+        trace_verify: read each chunk twice; the string checksum may not cover the data.
+        atomic_counter: read both halves of a counter by one string reference.
+        eeprom_changes_ram: None: unknown, so both addresses are read after a write.
+    """
+
+    framing: Framing = Framing.SEVEN_EVEN
+    wiring: Wiring = Wiring.FOUR_WIRE
+    echo: Echo = Echo.NONE
+    first_character_s: float = RESPONSE_S
+    gap_s: float = 0.06
+    quiet_s: float = 0.005
+    attempts: int = 3
+    eeprom_write: EepromWrite = EepromWrite.CONFIRM
+    string_checksum: StringChecksum = StringChecksum.AUTO
+    string_count_unit: CountUnit = CountUnit.BYTES
+    trace_chunk_bytes: int = 200
+    trace_verify: bool = True
+    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
+    trace_byte_order: ByteOrder = ByteOrder.BIG
+    trigger_word: TriggerWordSource = TriggerWordSource.NONE
+    trigger_map: TriggerMap | None = None
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
+    encoder_counts_per_rev: int = 8000
+    run_active_low: bool = True
+    reset_active_low: bool = True
+    alarm_output_high: bool = True
+    atomic_counter: bool = False
+    eeprom_changes_ram: bool | None = None
+    doubts: tuple[Doubt, ...] = DOUBTS
+
+    def settled(self, key: str, standing: Standing) -> "SmartStepProfile":
+        """Return this profile with a bench's verdict on one doubt.
+
+        Raises:
+            ConfigError: no doubt has this key.
+        """
+        if all(doubt.key != key for doubt in self.doubts):
+            known = ", ".join(doubt.key for doubt in self.doubts)
+            raise ConfigError(f"there is no doubt {key!r}; there are {known}", value=key)
+        doubts = tuple(replace(doubt, standing=standing) if doubt.key == key else doubt for doubt in self.doubts)
+        return replace(self, doubts=doubts)
+
+
+SMARTSTEP = SmartStepProfile()

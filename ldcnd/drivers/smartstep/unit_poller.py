@@ -1,0 +1,266 @@
+"""Polling one drive word by word: which item is due, which words it takes, what they say together.
+
+Another node's turn fits between any two words. A drive that does not answer is asked for one word only, more and more
+seldom, because each question costs the others of its line a third of a second.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.poller import Poller
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.smartstep.addresses import Register
+from ldcnd.drivers.smartstep.commands import reference, with_response_time
+from ldcnd.drivers.smartstep.counters import Counter, CounterQuality, CounterReading, CounterValue
+from ldcnd.drivers.smartstep.monitors import COUNTERS, WORDS, counter_value, word_value
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile
+from ldcnd.drivers.smartstep.refusals import Refusal
+from ldcnd.drivers.smartstep.status import INPUT_SIGNALS, OUTPUT_SIGNALS, SPEED_FEEDBACK
+from ldcnd.errors import BusError
+from ldcnd.exchange import Exchange, Timing
+from ldcnd.log import get_logger
+from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import TelemetryItem
+
+log = get_logger("smartstep")
+
+MISSES_BEFORE_BACKOFF = 3
+FIRST_BACKOFF_S = 1.0
+LONGEST_BACKOFF_S = 10.0
+NEVER_S = float("inf")
+PUT_OFF_S = 1.0
+"""Longer than an exchange takes beside the drive's response; not for ever, because the bus keeps the date till then."""
+
+
+class Basic(Enum):
+    """What is polled beside monitors."""
+
+    IDENTITY = "identity"
+    STATE = "state"
+    VELOCITY = "velocity"
+    POSITION = "position"
+
+
+Item = Basic | MonitorName
+
+BASIC_WORDS: Mapping[Basic, tuple[int, ...]] = {
+    Basic.IDENTITY: (Register.DRIVER_TYPE, Register.SOFTWARE_VERSION),
+    Basic.STATE: (Register.PRESENT_ALARM, INPUT_SIGNALS.address, OUTPUT_SIGNALS.address),
+    Basic.VELOCITY: (SPEED_FEEDBACK.address,),
+}
+PUBLISHED = {
+    Basic.STATE: TelemetryItem.STATE,
+    Basic.VELOCITY: TelemetryItem.VELOCITY,
+    Basic.POSITION: TelemetryItem.POSITION,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class UnitWords:
+    """The latest words of a drive; complete only once each was read.
+
+    Attributes:
+        words: by address.
+        position: the feedback counter.
+    """
+
+    words: Mapping[int, int]
+    position: CounterValue
+
+
+@dataclass(frozen=True, slots=True)
+class Listeners:
+    """Who is told; none of them waits.
+
+    Attributes:
+        read: of an item that was read completely, with all that is known of the drive.
+        monitored: of a monitor.
+        identified: of driver type and software version, whenever the drive may be another one.
+        missed: of a poll that brought nothing.
+    """
+
+    read: Callable[[UnitWords, TelemetryItem, Timing], None]
+    monitored: Callable[[MonitorValue, Timing], None]
+    identified: Callable[[int, int], None]
+    missed: Callable[[BusError], None]
+
+
+class UnitPoller(Poller[int | Refusal]):
+    """Polls one drive; deadlines are absolute, and missed periods are skipped."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        unit: int,
+        profile: SmartStepProfile,
+        rates_hz: Mapping[Item, float],
+        start_at_s: float,
+        listeners: Listeners,
+    ) -> None:
+        self.node = unit
+        self.due_at_s = start_at_s
+        self._bus = bus
+        self._loop = asyncio.get_running_loop()
+        self._profile = profile
+        self._listeners = listeners
+        self._periods_s: dict[Item, float] = {item: 1.0 / rate for item, rate in rates_hz.items() if rate > 0}
+        self._due_s: dict[Item, float] = dict.fromkeys(self._periods_s, start_at_s)
+        self._due_s[Basic.IDENTITY] = start_at_s
+        self._words: dict[int, int] = {}
+        self._position: CounterValue | None = None
+        self._at_rest_since_position = False
+        self._item: Item | None = None
+        self._left: list[int] = []
+        self._counter: CounterReading | None = None
+        self._address = 0
+        self._low_timing: Timing | None = None
+        self._misses = 0
+
+    def forget_position(self) -> None:
+        """The counter was cleared: what it said before is no help any more."""
+        self._at_rest_since_position = False
+
+    # -- poller ------------------------------------------------------------------------------------------------------
+
+    def next_exchange(self, now_s: float) -> Exchange[int | Refusal]:
+        """See `Poller`.
+
+        The line takes its next turn before it delivers the last reply; which word is next depends on that reply, so
+        the turn after this one is put off until then.
+        """
+        self.due_at_s = now_s + self._profile.first_character_s + PUT_OFF_S
+        if self._misses >= MISSES_BEFORE_BACKOFF:
+            self._address = Register.PRESENT_ALARM
+        else:
+            if self._item is None:
+                self._begin(now_s)
+            wanted = self._counter.wanted if self._counter else None
+            self._address = wanted.address if wanted else self._left.pop(0)
+        return with_response_time(reference(self.node, self._address), self._profile)
+
+    def deliver(self, reply: int | Refusal, timing: Timing) -> None:
+        """See `Poller`."""
+        if self._misses >= MISSES_BEFORE_BACKOFF:
+            self._back(timing.received_at_s)
+        self._misses = 0
+        if self._item and isinstance(reply, Refusal):
+            self._give_up(self._item, reply)
+        elif self._counter and isinstance(reply, int):
+            self._take_half(self._counter, reply, timing)
+        elif self._item and isinstance(reply, int):
+            self._words[self._address] = reply
+            if not self._left:
+                self._finish(self._item, timing)
+        self._next_turn(timing.received_at_s if self._item else min(self._due_s.values()))
+
+    def missed(self, error: BusError) -> None:
+        """See `Poller`."""
+        self._misses += 1
+        self._abandon()
+        self._at_rest_since_position = False
+        self._listeners.missed(error)
+        now_s = self._loop.time()
+        if self._misses < MISSES_BEFORE_BACKOFF:
+            self._next_turn(now_s)
+        else:
+            doublings = min(10, self._misses - MISSES_BEFORE_BACKOFF)
+            self._next_turn(now_s + min(LONGEST_BACKOFF_S, FIRST_BACKOFF_S * 2.0**doublings))
+
+    def _next_turn(self, at_s: float) -> None:
+        """Ask for the next turn; the line may take it before this returns."""
+        self.due_at_s = at_s
+        if self._bus.is_open:
+            self._bus.add_poller(self)
+
+    # -- items -------------------------------------------------------------------------------------------------------
+
+    def _begin(self, now_s: float) -> None:
+        """Take up the item that has waited longest."""
+        item = self._item = min(self._due_s, key=self._due_s.__getitem__)
+        due_s = self._due_s[item]
+        if item is Basic.IDENTITY:
+            self._due_s[item] = NEVER_S
+        else:
+            period_s = self._periods_s[item]
+            behind = max(0, int((now_s - due_s) / period_s))
+            self._due_s[item] = due_s + (behind + 1) * period_s
+        self._left = []
+        counter = _counter_of(item)
+        if counter:
+            last = self._position if item is Basic.POSITION and self._at_rest_since_position else None
+            self._counter = CounterReading(counter, last.raw if last else None)
+        elif isinstance(item, MonitorName):
+            self._left.append(WORDS[item].address)
+        else:
+            self._left.extend(BASIC_WORDS[item])
+
+    def _abandon(self) -> None:
+        """Leave the item that is being read; it comes again in its turn."""
+        self._item = self._counter = self._low_timing = None
+        self._left = []
+
+    def _give_up(self, item: Item, refusal: Refusal) -> None:
+        """Ask no more for what the drive does not have."""
+        log.warning("item not there", unit=self.node, item=item.value, reason=str(refusal))
+        self._abandon()
+        if item is not Basic.STATE:
+            self._due_s[item] = NEVER_S
+
+    def _back(self, now_s: float) -> None:
+        """The drive answers again: it may have been off, or be another one."""
+        self._words.clear()
+        self._position = None
+        for item in self._periods_s:
+            if self._due_s[item] < NEVER_S:
+                self._due_s[item] = now_s
+        self._due_s[Basic.IDENTITY] = now_s
+
+    def _finish(self, item: Item, timing: Timing) -> None:
+        self._abandon()
+        if isinstance(item, MonitorName):
+            self._listeners.monitored(word_value(item, self._words[WORDS[item].address]), timing)
+        elif item is Basic.IDENTITY:
+            self._listeners.identified(*(self._words[address] for address in BASIC_WORDS[Basic.IDENTITY]))
+        else:
+            self._tell(item, timing)
+
+    def _tell(self, item: Basic, timing: Timing) -> None:
+        """Tell of an item once the first reading of the drive is complete."""
+        if item is Basic.VELOCITY and self._words[SPEED_FEEDBACK.address]:
+            self._at_rest_since_position = False
+        needed: Sequence[int] = (*BASIC_WORDS[Basic.STATE], *BASIC_WORDS[Basic.VELOCITY])
+        if self._position and all(address in self._words for address in needed):
+            self._listeners.read(UnitWords(self._words, self._position), PUBLISHED[item], timing)
+
+    # -- counters ----------------------------------------------------------------------------------------------------
+
+    def _take_half(self, reading: CounterReading, word: int, timing: Timing) -> None:
+        if reading.wanted is not None and reading.wanted.address in _LOW_HALVES:
+            self._low_timing = timing  # the low half tells how far it has turned, at this instant
+        reading.take(word)
+        if reading.wanted:
+            return
+        item, low_timing = self._item, self._low_timing or timing
+        self._abandon()
+        value = reading.value
+        if value is None:
+            log.warning("counter moves too fast to be read", unit=self.node, item=item.value if item else "")
+        elif isinstance(item, MonitorName):
+            resolved = value.quality is CounterQuality.RESOLVED
+            self._listeners.monitored(counter_value(item, value.signed, resolved=resolved), low_timing)
+        else:
+            self._position = value
+            self._at_rest_since_position = self._words.get(SPEED_FEEDBACK.address) == 0
+            self._tell(Basic.POSITION, low_timing)
+
+
+_LOW_HALVES = frozenset(counter.low.address for counter in Counter)
+
+
+def _counter_of(item: Item) -> Counter | None:
+    if item is Basic.POSITION:
+        return Counter.FEEDBACK
+    return COUNTERS.get(item) if isinstance(item, MonitorName) else None

@@ -1,0 +1,96 @@
+"""Reading words of one drive, whatever happens on the line: shared by all that asks a unit between its polls."""
+
+from typing import TypeVar
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.drivers.smartstep import commands
+from ldcnd.drivers.smartstep.drive_errors import drive_error
+from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile
+from ldcnd.drivers.smartstep.refusals import Refusal
+from ldcnd.errors import BusDown, BusError, OutcomeUnknown, ReplyTimeout, WrongState
+from ldcnd.exchange import Exchange
+
+ValueT = TypeVar("ValueT")
+
+READ_BACK_ROUNDS = 4
+"""Rounds of the bus's own attempts before a write whose reply was lost stays unknown."""
+
+
+class Words:
+    """One drive as the words at its addresses.
+
+    Attributes:
+        self_hearing: the drive takes its own replies for commands. A zero word, or the reply to a setting, makes it
+            answer itself without end, so nothing is asked any more.
+    """
+
+    def __init__(self, bus: Bus, axis: str, unit: int, profile: SmartStepProfile) -> None:
+        self.axis = axis
+        self.unit = unit
+        self.self_hearing = False
+        self._bus = bus
+        self._profile = profile
+
+    async def ask(self, exchange: Exchange[ValueT | Refusal], lane: Lane = Lane.COMMAND) -> ValueT:
+        """Run one exchange, in the response time of the profile.
+
+        Raises:
+            WrongState: the drive hears itself.
+            DriveFault: the drive declined; a setting's address error is told apart from "busy tracing" by the mode.
+            BusError: the line failed.
+        """
+        if self.self_hearing:
+            raise WrongState(
+                f"axis {self.axis}: the drive takes its own replies for commands; nothing is asked on these wires",
+                axis=self.axis,
+                value="self_hearing",
+                remedy="use four wires",
+            )
+        answer = await self._bus.execute(commands.with_response_time(exchange, self._profile), lane)
+        if isinstance(answer, Refusal):
+            mode = await self._mode_of(answer)
+            raise drive_error(self.axis, answer, mode)
+        return answer
+
+    async def read(self, address: int) -> int:
+        """Read one word.
+
+        Raises:
+            As `ask`.
+        """
+        return await self.ask(commands.reference(self.unit, address))
+
+    async def read_back(self, address: int) -> int:
+        """Read a word that decides what became of a write; tries longer than others.
+
+        Raises:
+            OutcomeUnknown: the line does not let it through.
+        """
+        for _ in range(READ_BACK_ROUNDS):
+            try:
+                return await self.read(address)
+            except ReplyTimeout:
+                continue
+            except BusDown:
+                break
+        raise OutcomeUnknown(
+            f"axis {self.axis}: a write could not be read back from {address:04X}H; it may or may not have been done",
+            axis=self.axis,
+            remedy="read the parameter before anything else",
+        )
+
+    async def mode(self) -> OperatingMode | int:
+        """Read the operating mode."""
+        return await self.ask(commands.read_operating_mode(self.unit))
+
+    async def _mode_of(self, refusal: Refusal) -> OperatingMode | int:
+        """Return the mode in which a drive declined, as far as it matters for the reason."""
+        if refusal.reason_in(OperatingMode.DATA_TRACE) is refusal.reason:
+            return OperatingMode.NORMAL
+        try:
+            answer = await self._bus.execute(commands.read_operating_mode(self.unit))
+        except BusError:
+            return OperatingMode.NORMAL  # that the drive declined is certain, only the reason is not
+        return OperatingMode.NORMAL if isinstance(answer, Refusal) else answer

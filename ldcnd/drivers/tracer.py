@@ -1,0 +1,138 @@
+"""The contract between the daemon and whatever records a trace: a drive's own recorder, or the host that polls it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ldcnd.errors import DriveFault, ValueOutOfRange
+from ldcnd.model.requests import TraceRequest
+from ldcnd.model.traces import DriveTraceInfo, TraceChannel, TracePhase, TraceSource
+
+Progress = Callable[[TracePhase], None]
+"""Told of each new phase of a trace; does not wait."""
+
+
+class TraceTimedOut(DriveFault):
+    """The trigger did not come, or the samples did not, in the time allowed."""
+
+
+def require_channels(axis: str, request: TraceRequest, known: tuple[str, ...]) -> None:
+    """Check the channels of a request and of its trigger.
+
+    Raises:
+        ValueOutOfRange: there is no such channel, one is named twice, or the trigger watches one that is not recorded.
+    """
+    for name in request.channels:
+        if name not in known:
+            raise ValueOutOfRange(
+                f"axis {axis}: cannot trace {name!r}; there are {', '.join(known)}", axis=axis, value=name
+            )
+    if len(set(request.channels)) < len(request.channels):
+        raise ValueOutOfRange(f"axis {axis}: a channel is named twice: {', '.join(request.channels)}", axis=axis)
+    if request.trigger and request.trigger.channel not in request.channels:
+        raise ValueOutOfRange(
+            f"axis {axis}: the trigger watches {request.trigger.channel!r}, which is not recorded",
+            axis=axis,
+            value=request.trigger.channel,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """What a trace will be, as far as it can differ from what was asked for.
+
+    Attributes:
+        channels: in the order of the values.
+        raw_columns: names of the raw columns.
+        interval_s: time between two samples; 0 is as fast as the line allows.
+        samples: how many, `pre_trigger` of them before the trigger.
+        phase: in which it begins.
+    """
+
+    channels: tuple[TraceChannel, ...]
+    raw_columns: tuple[str, ...]
+    interval_s: float
+    samples: int
+    pre_trigger: int
+    phase: TracePhase
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A finished trace; columns are as long as `offsets_ns`.
+
+    Attributes:
+        offsets_ns: when each sample was true, relative to the zero instant: the trigger, or the first sample.
+        zero_from_s: the zero instant is not earlier than this, in loop time, and not later than `zero_until_s`.
+        values: a column for each channel.
+        raw: a column for each raw column.
+        trigger_index: the sample that fired the trigger; None without one.
+        missed: polls that brought no sample.
+        drive: settings and assumptions of a drive's own recorder.
+        doubts: what makes the values doubtful.
+    """
+
+    offsets_ns: tuple[int, ...]
+    zero_from_s: float
+    zero_until_s: float
+    values: tuple[tuple[float | None, ...], ...]
+    raw: tuple[tuple[int | float | None, ...], ...]
+    trigger_index: int | None = None
+    missed: int = 0
+    drive: DriveTraceInfo | None = None
+    doubts: tuple[str, ...] = ()
+
+
+class ArmedTrace(ABC):
+    """A trace that has begun or waits for its trigger.
+
+    Attributes:
+        granted: what it will be.
+    """
+
+    granted: Granted
+
+    @abstractmethod
+    async def record(self, progress: Progress) -> Recorded:
+        """Wait for the end of the trace and return it; called once. When cancelled it leaves nothing armed.
+
+        Raises:
+            TraceTimedOut: it did not end in time; nothing is left armed.
+            DriveFault: the drive declined, or has lost its settings.
+            BusError: the line failed.
+        """
+
+
+class Tracer(ABC):
+    """What can trace one axis, one trace at a time.
+
+    Attributes:
+        source: who takes the samples.
+        channels: what can be recorded.
+    """
+
+    source: TraceSource
+    channels: tuple[str, ...]
+
+    @abstractmethod
+    async def arm(self, request: TraceRequest) -> ArmedTrace:
+        """Begin a trace, or make it wait for its trigger; moves nothing.
+
+        Raises:
+            ValueOutOfRange: there is no such channel, or no such interval; nothing was set.
+            NotSupported: the drive has no such trigger; nothing was set.
+            WrongState: the drive is not ready for it; nothing was set.
+            BusyTracing: the drive's recorder is in use.
+            BusError: the line failed; nothing is left armed unless the line prevented it.
+        """
+
+    @abstractmethod
+    async def disarm(self) -> bool:
+        """End a trace that somebody else has left armed; return whether there was one.
+
+        Raises:
+            BusError: the line failed.
+        """
+
+    def disconnected(self) -> None:  # noqa: B027 - a drive's own recorder runs on without its line
+        """The line, or the drive's power, is gone."""
