@@ -1,0 +1,1 @@
+"""What simulated lines of every family share: time, bytes, faults, motors."""

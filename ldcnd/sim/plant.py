@@ -1,0 +1,132 @@
+"""The machine on a simulated drive's shaft: DC motor, load, encoder, limit switches, index pulse, potentiometer.
+
+Time is counted in steps of one servo cycle; the drive says for how many steps which duty was on the motor. Nothing here
+knows a protocol. The motor has no inductance: its current follows the voltage at once, as seen from a servo cycle.
+"""
+
+import math
+import random
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class MotorPlant:
+    """The constants of one machine; positions are encoder counts from where the shaft is at power-up.
+
+    The defaults are a small servo motor (3000 1/min at 24 V) that position gains of KP=350 KD=3000 KI=400 IL=400 and of
+    KP=100 KD=1000 KI=50 IL=200 hold with a damping ratio of about 0.7.
+
+    Attributes:
+        torque_nm_per_a: also the back EMF constant in V s/rad.
+        friction_nm: Coulomb friction, also at standstill.
+        viscous_nm_s: viscous friction per rad/s.
+        reverse_limit_counts: the reverse limit switch is actuated here and below.
+        forward_limit_counts: the forward limit switch is actuated here and above.
+        stop_margin_counts: the hard stops lie so far behind the switches.
+        index_at_counts: where an index pulse begins.
+        index_spacing_counts: from there to the next one; None for a revolution.
+        index_width_counts: 4 is an ungated Z track. Firmware samples it once per servo cycle and may miss it.
+        pot_span_counts: the potentiometer turns from 0 to full scale over this range of travel.
+        pot_noise: standard deviation of its reading, as a share of full scale.
+        seed: of the potentiometer's noise.
+    """
+
+    counts_per_rev: int = 2000
+    supply_v: float = 24.0
+    resistance_ohm: float = 1.2
+    torque_nm_per_a: float = 0.0767
+    inertia_kg_m2: float = 5.0e-5
+    viscous_nm_s: float = 1.0e-5
+    friction_nm: float = 0.004
+    reverse_limit_counts: int = -100_000
+    forward_limit_counts: int = 100_000
+    stop_margin_counts: int = 2000
+    index_at_counts: int = 700
+    index_spacing_counts: int | None = None
+    index_width_counts: int = 4
+    pot_span_counts: tuple[int, int] = (-105_000, 105_000)
+    pot_noise: float = 0.0
+    seed: int = 1
+
+
+class Shaft:
+    """The moving part of a machine.
+
+    Attributes:
+        position_counts: where the shaft is, with fraction.
+        velocity_counts: counts per step.
+        stalled: something holds it.
+    """
+
+    def __init__(self, plant: MotorPlant, step_s: float) -> None:
+        self.plant = plant
+        self.position_counts = 0.0
+        self.velocity_counts = 0.0
+        self.stalled = False
+        self._dice = random.Random(plant.seed)  # noqa: S311 - reproducible on purpose
+        radians_per_count = math.tau / plant.counts_per_rev
+        torque, resistance, inertia = plant.torque_nm_per_a, plant.resistance_ohm, plant.inertia_kg_m2
+        counts_per_step = step_s / radians_per_count
+        damping_per_s = (torque * torque / resistance + plant.viscous_nm_s) / inertia
+        self._driven_decay = math.exp(-damping_per_s * step_s)
+        self._coasting_decay = math.exp(-plant.viscous_nm_s / inertia * step_s)
+        # the velocity that full duty approaches, times the share of the way that one step covers
+        full_duty = torque * plant.supply_v / resistance / (inertia * damping_per_s) * counts_per_step
+        self._gain = full_duty * (1.0 - self._driven_decay)
+        self._friction = plant.friction_nm / inertia * step_s * counts_per_step
+        self._back_emf_v = torque / counts_per_step
+        self._lowest = float(plant.reverse_limit_counts - plant.stop_margin_counts)
+        self._highest = float(plant.forward_limit_counts + plant.stop_margin_counts)
+
+    def step(self, duty: float | None) -> None:
+        """Let one step pass with a duty of -1 to 1 on the motor, or None with its windings open."""
+        before = self.velocity_counts
+        velocity = before * self._coasting_decay if duty is None else before * self._driven_decay + duty * self._gain
+        if velocity > self._friction:
+            velocity -= self._friction
+        elif velocity < -self._friction:
+            velocity += self._friction
+        else:
+            velocity = 0.0
+        if self.stalled:
+            velocity = before = 0.0
+        if velocity == 0.0 == before:
+            self.velocity_counts = 0.0
+            return
+        position = self.position_counts + 0.5 * (before + velocity)
+        if not self._lowest < position < self._highest:
+            position = min(max(position, self._lowest), self._highest)
+            velocity = 0.0
+        self.position_counts = position
+        self.velocity_counts = velocity
+
+    def current_a(self, duty: float | None) -> float:
+        """Return the motor current with that duty on the motor, positive when it drives forward."""
+        if duty is None:
+            return 0.0
+        return (duty * self.plant.supply_v - self._back_emf_v * self.velocity_counts) / self.plant.resistance_ohm
+
+    @property
+    def on_reverse_limit(self) -> bool:
+        """Whether the reverse limit switch is actuated."""
+        return self.position_counts <= self.plant.reverse_limit_counts
+
+    @property
+    def on_forward_limit(self) -> bool:
+        """Whether the forward limit switch is actuated."""
+        return self.position_counts >= self.plant.forward_limit_counts
+
+    @property
+    def on_index(self) -> bool:
+        """Whether the encoder's index is in its pulse."""
+        plant = self.plant
+        spacing = plant.index_spacing_counts or plant.counts_per_rev
+        return (math.floor(self.position_counts) - plant.index_at_counts) % spacing < plant.index_width_counts
+
+    def potentiometer(self) -> float:
+        """Read the potentiometer: 0 to 1 of full scale, a new sample of its noise each time."""
+        low, high = self.plant.pot_span_counts
+        share = (self.position_counts - low) / (high - low)
+        if self.plant.pot_noise:
+            share += self._dice.gauss(0.0, self.plant.pot_noise)
+        return min(max(share, 0.0), 1.0)
