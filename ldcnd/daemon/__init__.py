@@ -1,0 +1,1 @@
+"""The one place where buses, drives and clients meet."""

@@ -1,0 +1,79 @@
+"""How often each item of one axis is asked for; merges what is due into one exchange."""
+
+from collections.abc import Callable, Mapping
+
+from ldcnd.axis_config import RatesConfig
+from ldcnd.bus.poller import Poller
+from ldcnd.drivers.driver import AxisDriver, AxisReading
+from ldcnd.errors import BusError
+from ldcnd.exchange import Exchange, Timing
+from ldcnd.model.samples import TelemetryItem
+
+Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], None]
+Missed = Callable[[BusError], None]
+
+
+def wanted_rates_hz(rates: RatesConfig, *, adc: bool) -> Mapping[TelemetryItem, float]:
+    """Return the items that are polled and how often; `adc` tells whether the drive has a converter."""
+    wanted = {
+        TelemetryItem.POSITION: rates.position,
+        TelemetryItem.VELOCITY: rates.velocity,
+        TelemetryItem.ADC: rates.adc if adc else 0.0,
+        TelemetryItem.STATE: rates.state,
+    }
+    return {item: rate for item, rate in wanted.items() if rate > 0}
+
+
+class AxisPoller(Poller[AxisReading]):
+    """Polls one axis at the rate of its fastest item; the drive's state comes with every poll.
+
+    Slower items ride along with the poll that is nearest to their own due time, so they are never more than half a poll
+    period early or late, and the line carries one periodic exchange an axis. Deadlines are absolute: a late poll does
+    not shift the next one, and missed periods are skipped, not made up for.
+    """
+
+    def __init__(
+        self,
+        driver: AxisDriver,
+        rates_hz: Mapping[TelemetryItem, float],
+        start_at_s: float,
+        deliver: Deliver,
+        missed: Missed,
+    ) -> None:
+        self.node = driver.spec.address
+        self._driver = driver
+        self._periods_s = {item: 1.0 / rate for item, rate in rates_hz.items()}
+        self._period_s = min(self._periods_s.values())
+        self._due_s = dict.fromkeys(self._periods_s, start_at_s)
+        self._deliver = deliver
+        self._missed = missed
+        self._asked: frozenset[TelemetryItem] = frozenset()
+        self.due_at_s = start_at_s
+        self.deadline_at_s = start_at_s + self._period_s
+
+    def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
+        """See `Poller`."""
+        self.due_at_s = _next_on_grid(self.due_at_s, self._period_s, now_s)
+        self.deadline_at_s = self.due_at_s + self._period_s
+        nearer_s = now_s + self._period_s / 2
+        due = []
+        for item, due_s in self._due_s.items():
+            if due_s <= nearer_s:
+                due.append(item)
+                self._due_s[item] = _next_on_grid(due_s, self._periods_s[item], now_s)
+        self._asked = frozenset(due)
+        return self._driver.reading(self._asked)
+
+    def deliver(self, reply: AxisReading, timing: Timing) -> None:
+        """See `Poller`."""
+        self._deliver(reply, self._asked, timing)
+
+    def missed(self, error: BusError) -> None:
+        """See `Poller`."""
+        self._missed(error)
+
+
+def _next_on_grid(due_s: float, period_s: float, now_s: float) -> float:
+    """Return the first due time after `now_s` that is whole periods, at least one, behind `due_s`."""
+    behind = max(0, int((now_s - due_s) / period_s))
+    return due_s + (behind + 1) * period_s

@@ -1,0 +1,329 @@
+"""One axis at work: takes commands in turn, lets stops overtake them, digests readings, publishes.
+
+Commands of one axis run one after another in its own task. A stop never waits for them: it withdraws what is still
+queued, and whatever a command does next finds that the epoch has moved on.
+"""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from ldcnd.axis_config import AxisConfig
+from ldcnd.bus.bus import Bus
+from ldcnd.daemon import guards
+from ldcnd.daemon.axis_commands import AxisCommands
+from ldcnd.daemon.axis_motion import AxisMotion
+from ldcnd.daemon.axis_telemetry import AxisTelemetry
+from ldcnd.daemon.axis_tracker import AxisTracker, Ended
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.host_tracer import HostTracer, host_channels
+from ldcnd.daemon.observed_tracker import ObservedTracker
+from ldcnd.daemon.parameters import Parameters
+from ldcnd.daemon.preview import preview
+from ldcnd.daemon.procedure import Turn
+from ldcnd.daemon.publishing import Publisher
+from ldcnd.daemon.trace_recorder import TRACE_VERBS, TraceRecorder
+from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.scaling import Scale
+from ldcnd.errors import BusError, LdcndError, NotSupported, RequestRefused, ShuttingDown, StopLatched, TooManyRequests
+from ldcnd.exchange import Timing
+from ldcnd.log import get_logger
+from ldcnd.model.axes import Capability
+from ldcnd.model.preview import PlanReply, PlanRequest
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import BufferMode, Request, Verb
+from ldcnd.model.samples import TelemetryItem
+
+log = get_logger("axis")
+
+QUEUED_COMMANDS = 8
+STOP_ROUNDS = 5
+"""Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Pending:
+    """A command on its way to the drive and the caller who waits."""
+
+    turn: Turn
+    request: Request
+    future: "asyncio.Future[CommandReply]"
+
+
+class AxisService:
+    """The commands, the state and the telemetry of one axis."""
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        bus: Bus,
+        driver: AxisDriver,
+        publisher: Publisher,
+        clock: Clock,
+        next_command_id: Callable[[], str],
+        ended: Ended,
+    ) -> None:
+        self.config = config
+        self.driver = driver
+        self.scale = Scale(config.counts_per_unit or 1.0, reverse=config.direction == "reverse")
+        self.stoppable = Capability.STOP in driver.capabilities
+        tracker = AxisTracker if self.stoppable else ObservedTracker
+        self.tracker = tracker(config.name, config.unit, ended)
+        self.telemetry = AxisTelemetry(
+            publisher,
+            self.tracker,
+            self.scale,
+            adc_full_scale=driver.adc_full_scale,
+            adc_volts=config.adc_volts,
+        )
+        self._bus = bus
+        self._clock = clock
+        self._next_command_id = next_command_id
+        self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
+        self._commands = AxisCommands(self._motion)
+        self._queue: asyncio.Queue[_Pending | None] = asyncio.Queue(QUEUED_COMMANDS)  # None only wakes
+        self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
+        channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
+        tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
+        self.traces = TraceRecorder(config.name, tracer, publisher, clock)
+        self._successors = asyncio.Lock()
+        self._changed = asyncio.Event()
+        self._epoch = 0
+        self._closed = False
+
+    # -- life --------------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Carry out commands, one after another, until cancelled; then every caller has its answer."""
+        pending = None
+        try:
+            while True:
+                pending = await self._next()
+                if pending is None:
+                    await self._step()
+                elif not pending.future.done():
+                    await self._carry_out(pending)
+        finally:
+            self._closed = True
+            self._epoch += 1
+            self._changed.set()
+            ending = ShuttingDown(f"axis {self.config.name}: the daemon is stopping", axis=self.config.name)
+            if pending and not pending.future.done():
+                pending.future.set_exception(ending)
+            self._refuse_queued(ending)
+
+    def reconfigure(self, config: AxisConfig) -> None:
+        """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
+        self.config = config
+        self._motion.reconfigure(config)
+
+    def connected(self, *, referenced: bool) -> None:
+        """The line came up; `referenced` when the drive's position is known to be right."""
+        self.tracker.referenced = referenced
+        if referenced:
+            self.telemetry.origin_counts = 0.0
+
+    def disconnected(self) -> None:
+        """The line is gone."""
+        self.traces.disconnected()
+        self.tracker.disconnected(self._clock.now_ns())
+        self.telemetry.stale(self._clock.now_ns())
+
+    def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
+        """Take a reading from the poller."""
+        self.tracker.observed(reading, timing, self._clock.now_ns())
+        self._changed.set()
+        self._commands.observed(reading, timing)
+        if self._commands.step_due:
+            with contextlib.suppress(asyncio.QueueFull):  # then the axis is awake anyway
+                self._queue.put_nowait(None)
+        t, t_error_ns = self._clock.stamp(timing)
+        self.telemetry.reading(reading, asked, t, t_error_ns)
+
+    def missed(self, _error: BusError) -> None:
+        """Take note that a poll brought nothing."""
+        before = self.tracker.link
+        self.tracker.missed(self._clock.now_ns())
+        if self.tracker.link is not before:
+            log.warning("drive does not answer", axis=self.config.name, link=self.tracker.link.value)
+            self.telemetry.stale(self._clock.now_ns())
+
+    def monitored(self, value: MonitorValue, timing: Timing) -> None:
+        """Take a monitor from the family's own poller."""
+        t, t_error_ns = self._clock.stamp(timing)
+        self.telemetry.monitor(value, t, t_error_ns)
+
+    # -- commands ----------------------------------------------------------------------------------------------------
+
+    async def execute(self, verb: Verb, request: Request, command_id: str | None = None) -> CommandReply:
+        """Carry out a command in its turn; returns once the drive has acknowledged it.
+
+        Args:
+            verb: what to do.
+            request: with which values.
+            command_id: names the command; one is made when it is missing.
+
+        Raises:
+            RequestRefused: it cannot be done; nothing was sent.
+            BusError: the line failed; `OutcomeUnknown` when the drive may have started.
+        """
+        command_id = command_id or self._next_command_id()
+        if verb in (Verb.STOP, Verb.QUICK_STOP) and self.stoppable:
+            await self.stop(StopMode.SMOOTH if verb is Verb.STOP else StopMode.ABRUPT)
+            return CommandReply(command_id=command_id, axis=self.config.name, verb=verb)
+        if Capability(verb.value) not in self.driver.capabilities:
+            raise NotSupported(
+                f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
+            )
+        if self._closed:
+            raise ShuttingDown("the daemon is stopping", axis=self.config.name)
+        try:
+            return await self._enqueue(command_id, verb, request)
+        except asyncio.QueueFull:
+            raise TooManyRequests(
+                f"axis {self.config.name}: {QUEUED_COMMANDS} commands wait already",
+                axis=self.config.name,
+                limit=QUEUED_COMMANDS,
+                remedy="wait for a reply before sending the next command",
+            ) from None
+
+    async def in_turn(self, mode: BufferMode, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
+        """Carry out a move after what the axis is doing: after having halted that, or after its end.
+
+        Raises:
+            StopLatched: a stop, or a later aborting move, came first.
+            LdcndError: as the move itself.
+        """
+        if mode is BufferMode.ABORTING and self.tracker.command:
+            await self.bring_to_rest(StopMode.SMOOTH)
+        still_wanted = self._turn("", Verb.HALT).still_wanted
+        async with self._successors:  # those who wait are served in the order in which they came
+            while self.tracker.command:
+                self._changed.clear()
+                await self._changed.wait()
+                still_wanted()
+            return await execute()
+
+    def preview(self, request: PlanRequest, obstacles: tuple[str, ...]) -> PlanReply:
+        """Tell what a motion would do; no effect. See `preview`."""
+        return preview(self._motion, self._bus, request, obstacles)
+
+    async def stop(self, mode: StopMode) -> bool:
+        """Stop at once, whatever the state, and latch; return whether the drive confirmed it.
+
+        The latch and the new epoch hold from this call on, confirmed or not. A drive that takes no stop over its line
+        is not latched either: nothing could clear that, and nothing here moves it.
+        """
+        if not self.stoppable:
+            log.warning("this drive cannot be stopped over its line", axis=self.config.name)
+            return False
+        self.tracker.latch_stop()
+        log.info("stop", axis=self.config.name, mode=mode.value)
+        return await self.bring_to_rest(mode, Verb.STOP)
+
+    async def bring_to_rest(self, mode: StopMode, verb: Verb = Verb.HALT) -> bool:
+        """Stop at once, before anything that waits; return whether the drive confirmed it."""
+        if not self.stoppable:
+            return False
+        self._epoch += 1
+        self._changed.set()
+        overtaken = self._overtaken("a queued command")
+        self._refuse_queued(overtaken)
+        self._bus.withdraw(self.driver.spec.address, overtaken)
+        if not self.tracker.energised:
+            mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
+        try:
+            return await self._confirmed_stop(mode, verb)
+        finally:
+            self._publish_state()
+
+    async def _confirmed_stop(self, mode: StopMode, verb: Verb) -> bool:
+        for _ in range(STOP_ROUNDS):
+            try:
+                await self.driver.stop(mode)
+            except BusError as error:
+                log.error("stop not confirmed", axis=self.config.name, reason=error.message)
+                if self._bus.is_open:
+                    continue
+                return False
+            if mode is StopMode.OFF:
+                self.tracker.powered(on=False, now_s=self._clock.now_s())
+            else:
+                self._commands.brought_to_rest(self._next_command_id(), verb)
+            return True
+        return False
+
+    async def _enqueue(self, command_id: str, verb: Verb, request: Request) -> CommandReply:
+        future: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
+        self._queue.put_nowait(_Pending(self._turn(command_id, verb), request, future))
+        return await future
+
+    def _turn(self, command_id: str, verb: Verb) -> Turn:
+        epoch = self._epoch
+
+        def still_wanted() -> None:
+            if epoch != self._epoch:
+                raise self._overtaken(verb)
+
+        return Turn(command_id, verb, still_wanted)
+
+    async def _carry_out(self, pending: _Pending) -> None:
+        turn = pending.turn
+        try:
+            if turn.verb in TRACE_VERBS:
+                reply = await self.traces.carry_out(turn.command_id, turn.verb, pending.request)
+            elif self._parameters and Parameters.takes(turn.verb):
+                reply = await self._parameters.carry_out(turn.command_id, turn.verb, pending.request)
+            else:
+                reply = await self._commands.carry_out(turn, pending.request)
+        except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
+            if not pending.future.done():
+                pending.future.set_exception(error)
+            return
+        log.info("accepted", axis=self.config.name, verb=turn.verb.value, command_id=turn.command_id)
+        if not pending.future.done():
+            pending.future.set_result(reply)
+
+    def _require_reachable(self) -> None:
+        guards.check_reachable(self.tracker.view())
+
+    async def _read(self) -> AxisReading:
+        """Read the drive's state out of turn."""
+        return await self._bus.execute(self.driver.reading(frozenset()))
+
+    async def _next(self) -> _Pending | None:
+        """Return the next command, or None when a step of the procedure under way may be due."""
+        if self._commands.step_due:
+            return None
+        deadline_s = self._commands.deadline_s
+        try:
+            async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
+                return await self._queue.get()
+        except TimeoutError:
+            return None
+
+    async def _step(self) -> None:
+        """Let the procedure under way take its step, if one is due."""
+        if not self._commands.step_due and self._clock.now_s() < self._commands.deadline_s:
+            return
+        try:
+            await self._commands.step(self._turn(self._next_command_id(), Verb.HALT))
+        except LdcndError as error:
+            log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
+
+    def _refuse_queued(self, error: RequestRefused) -> None:
+        while not self._queue.empty():
+            pending = self._queue.get_nowait()
+            if pending and not pending.future.done():
+                pending.future.set_exception(error)
+
+    def _overtaken(self, what: str) -> StopLatched:
+        return StopLatched(
+            f"axis {self.config.name}: {what} was overtaken by a stop", axis=self.config.name, remedy="send reset"
+        )
+
+    def _publish_state(self) -> None:
+        self.telemetry.state(self._clock.now_ns())

@@ -1,0 +1,191 @@
+"""Readings and states of one axis as samples, in axis units."""
+
+from ldcnd.daemon.axis_tracker import ActiveCommand, AxisTracker
+from ldcnd.daemon.publishing import Publisher
+from ldcnd.drivers.driver import AxisReading
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.scaling import Scale
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.monitors import MonitorSample
+from ldcnd.model.samples import (
+    AdcSample,
+    CurrentCommand,
+    FaultEntry,
+    FaultSample,
+    PositionSample,
+    StateSample,
+    TelemetryItem,
+    VelocitySample,
+)
+
+StateKey = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, ActiveCommand | None, str | None]
+FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
+
+
+class AxisTelemetry:
+    """Publishes one axis; states and faults go out when they change and at their own rate in between."""
+
+    def __init__(
+        self, publisher: Publisher, tracker: AxisTracker, scale: Scale, *, adc_full_scale: int | None, adc_volts: float
+    ) -> None:
+        self.origin_counts = 0.0
+        self._publisher = publisher
+        self._tracker = tracker
+        self._scale = scale
+        self._adc_full_scale = adc_full_scale
+        self._adc_volts = adc_volts
+        self._last_state: StateKey | None = None
+        self._last_faults: FaultKey | None = None
+
+    def position(self, counts: float) -> float:
+        """Return the position in axis units that a count of the drive stands for."""
+        return self._scale.to_units(counts - self.origin_counts)
+
+    def reading(self, reading: AxisReading, asked: frozenset[TelemetryItem], t: int, t_error_ns: int) -> None:
+        """Publish what was asked for, and the state if it changed."""
+        tracker, scale = self._tracker, self._scale
+        axis, unit, quality = tracker.name, tracker.unit, tracker.quality
+        counts, velocity, adc = reading.position_counts, reading.velocity_counts_per_s, reading.adc_counts
+        if TelemetryItem.POSITION in asked:
+            lag = reading.following_error_counts
+            sample_lag = None if lag is None else scale.to_units(lag)
+            value = self.position(counts)
+            self._publisher.publish(
+                axis,
+                TelemetryItem.POSITION,
+                lambda seq: PositionSample(
+                    t=t,
+                    t_error_ns=t_error_ns,
+                    seq=seq,
+                    quality=quality,
+                    value=value,
+                    unit=unit,
+                    counts=counts,
+                    following_error=sample_lag,
+                ),
+            )
+        if TelemetryItem.VELOCITY in asked:
+            self._publisher.publish(
+                axis,
+                TelemetryItem.VELOCITY,
+                lambda seq: VelocitySample(
+                    t=t,
+                    t_error_ns=t_error_ns,
+                    seq=seq,
+                    quality=quality,
+                    value=scale.to_units(velocity),
+                    unit=f"{unit}/s",
+                    counts_per_s=velocity,
+                ),
+            )
+        if TelemetryItem.ADC in asked and adc is not None and self._adc_full_scale:
+            full_scale = self._adc_full_scale
+            self._publisher.publish(
+                axis,
+                TelemetryItem.ADC,
+                lambda seq: AdcSample(
+                    t=t,
+                    t_error_ns=t_error_ns,
+                    seq=seq,
+                    quality=quality,
+                    counts=adc,
+                    full_scale=full_scale,
+                    volts=adc / full_scale * self._adc_volts,
+                ),
+            )
+        self.state(t, t_error_ns, due=TelemetryItem.STATE in asked)
+
+    def state(self, t: int, t_error_ns: int = 0, *, due: bool = False) -> None:
+        """Publish state and faults if they changed, or if they are due anyway."""
+        tracker = self._tracker
+        state = _state_of(tracker)
+        if due or state != self._last_state:
+            self._last_state = state
+            self._publisher.publish(
+                tracker.name, TelemetryItem.STATE, lambda seq: _state_sample(tracker, t, t_error_ns, seq)
+            )
+        faults = (tracker.active_faults, tracker.first_fault)
+        if due or faults != self._last_faults:
+            self._last_faults = faults
+            self._publisher.publish(
+                tracker.name,
+                TelemetryItem.FAULT,
+                lambda seq: FaultSample(
+                    t=t,
+                    t_error_ns=t_error_ns,
+                    seq=seq,
+                    quality=tracker.quality,
+                    active=tracker.active_faults,
+                    first=tracker.first_fault,
+                ),
+            )
+
+    def monitor(self, value: MonitorValue, t: int, t_error_ns: int) -> None:
+        """Publish a monitor; a counter that had to be corrected is doubtful."""
+        quality = self._tracker.quality
+        if value.resolved and quality is Quality.GOOD:
+            quality = Quality.UNCERTAIN
+        self._publisher.publish_monitor(
+            self._tracker.name,
+            value.name,
+            lambda seq: MonitorSample(
+                t=t,
+                t_error_ns=t_error_ns,
+                seq=seq,
+                quality=quality,
+                value=value.value,
+                unit=value.unit,
+                title=value.title,
+                high=value.high,
+            ),
+        )
+
+    def stale(self, t: int) -> None:
+        """Publish the last values once more as what they are now: not measurements any more."""
+        for item in (TelemetryItem.POSITION, TelemetryItem.VELOCITY, TelemetryItem.ADC):
+            self._publisher.publish_stale(self._tracker.name, item, self._tracker.quality)
+        self.state(t)
+
+
+def _state_of(tracker: AxisTracker) -> StateKey:
+    """Return what a state sample says besides when; compared after every poll, so no model is built for it."""
+    return (
+        tracker.quality,
+        tracker.state,
+        tracker.enabled,
+        tracker.referenced,
+        tracker.moving,
+        tracker.link,
+        tracker.stop_latched,
+        tracker.command,
+        tracker.last_error,
+    )
+
+
+def _state_sample(tracker: AxisTracker, t: int, t_error_ns: int, seq: int) -> StateSample:
+    command = tracker.command
+    return StateSample(
+        t=t,
+        t_error_ns=t_error_ns,
+        seq=seq,
+        quality=tracker.quality,
+        state=tracker.state,
+        enabled=tracker.enabled,
+        referenced=tracker.referenced,
+        moving=tracker.moving,
+        link=tracker.link,
+        stop_latched=tracker.stop_latched,
+        command=command and _current(command),
+        last_error=tracker.last_error,
+    )
+
+
+def _current(command: ActiveCommand) -> CurrentCommand:
+    duration_s = command.duration_s
+    return CurrentCommand(
+        command_id=command.command_id,
+        verb=command.verb,
+        since=command.since_ns,
+        target=command.target,
+        expected_end=None if duration_s is None else command.since_ns + round(duration_s * 1e9),
+    )

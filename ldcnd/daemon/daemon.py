@@ -1,0 +1,177 @@
+"""The daemon as a whole: in which order things start and stop."""
+
+import asyncio
+import contextlib
+from importlib.metadata import version
+
+from ldcnd.config import RigConfig
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.control import Control
+from ldcnd.daemon.describing import Describing
+from ldcnd.daemon.health import HealthWatch
+from ldcnd.daemon.loss_policies import LeaseWatch, apply_policy
+from ldcnd.daemon.planning import plan_rig
+from ldcnd.daemon.publishing import Publisher
+from ldcnd.daemon.requests import Requests
+from ldcnd.daemon.rig import Rig
+from ldcnd.log import get_logger
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Declaration, Session
+from ldcnd.model.axes import LinkState
+from ldcnd.model.meta import DaemonInfo
+
+log = get_logger("daemon")
+
+API = 1
+"""Version of keys and payloads: within one, fields are only ever added."""
+TOKEN_PERIOD_S = 0.2
+STOP_TIME_S = 2.0
+"""A daemon that is told to end gives its axes so long to confirm what their policies say."""
+
+
+class Daemon:
+    """Serves one rig over one session until it is told to end."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        session: Session,
+        rig: Rig,
+        control: Control,
+        publisher: Publisher,
+        clock: Clock,
+        instance: str,
+    ) -> None:
+        self.rig = rig
+        self._control = control
+        self._config = config
+        self._session = session
+        self._keys = Keys(config.rig)
+        self._publisher = publisher
+        self._clock = clock
+        self._instance = instance
+        self._started_ns = clock.now_ns()
+        self._serving = asyncio.Event()
+        self._ending = asyncio.Event()
+        self._health = HealthWatch(rig, self._keys, publisher, clock)
+        self._describing = Describing(rig, self._keys, publisher, self._info, plan_rig(config), self._health)
+
+    @property
+    def config(self) -> RigConfig:
+        """With what it runs at present."""
+        return self._config
+
+    def end(self) -> None:
+        """Ask the daemon to stop its axes and to leave; `run` returns when that is done."""
+        self._ending.set()
+
+    def reconfigure(self, config: RigConfig) -> None:
+        """Take other limits, speeds and rates of axes; everything else is as before, see `plan_reload`."""
+        self._config = config
+        self._describing.plan = plan_rig(config)
+        axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
+        for bus in self.rig.buses:
+            bus.reconfigure(axes)
+
+    async def wait_serving(self) -> None:
+        """Return as soon as questions and commands are answered, whether or not any line is up."""
+        await self._serving.wait()
+
+    async def wait_up(self) -> None:
+        """Return as soon as every line is up."""
+        for bus in self.rig.buses:
+            await bus.wait_up()
+
+    async def run(self) -> None:
+        """Serve until `end` is called or the caller is cancelled.
+
+        Start: lines first, then questions, then commands, so that whoever can ask finds an answer. Stop: commands are
+        refused, what moves comes to rest, tokens go, lines close.
+        """
+        async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
+            leases = LeaseWatch(self.rig, self._control.authority, self._clock, group)
+            requests = Requests(self.rig, self._keys, group, self._control, leases)
+            serving = [group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses]
+            try:
+                await self._declare(declared, requests)
+                serving.append(group.create_task(self._watch_axes(group), name="liveliness"))
+                serving.append(group.create_task(leases.run(), name="leases"))
+                serving.append(group.create_task(self._health.run(), name="health"))
+                self._serving.set()
+                log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._instance)
+                await self._ending.wait()
+                requests.close()
+                await self._come_to_rest()
+            finally:
+                for task in serving:
+                    task.cancel()
+                for axis in self.rig.axes:
+                    self._publisher.withdraw(axis)
+        log.info("ended", rig=self.rig.name)
+
+    async def _declare(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
+        keys, session = self._keys, self._session
+        describing = self._describing
+
+        async def until_end(declaration: Declaration) -> None:
+            declared.push_async_callback(declaration.close)
+
+        await until_end(await session.serve(keys.all_telemetry, describing.on_telemetry, complete=False))
+        await until_end(await session.serve(keys.all_meta, describing.on_meta, complete=True))
+        for stop in keys.all_stops:
+            await until_end(await session.serve(stop, requests.on_stop, complete=True, urgent=True))
+        await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
+        await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
+        await until_end(await session.declare_token(keys.alive(self._instance)))
+
+    def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
+        """Notice another daemon on the same rig: two of them would move every axis twice."""
+        address = self._keys.parse_alive(key)
+        if address.axis is not None or address.instance == self._instance:
+            return
+        log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
+        self._control.commands.rival = address.instance if alive else None
+
+    async def _come_to_rest(self) -> None:
+        """The daemon ends: do to each axis what its policy says; bounded."""
+        try:
+            async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
+                for name, axis in self.rig.axes.items():
+                    group.create_task(
+                        apply_policy(axis, axis.config.loss.daemon, "the daemon ends"), name=f"rest {name}"
+                    )
+        except TimeoutError:
+            log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
+
+    async def _watch_axes(self, group: asyncio.TaskGroup) -> None:
+        """Keep one liveliness token for each axis whose drive answers; act when one is back that still moves."""
+        tokens: dict[str, Declaration] = {}
+        known: set[str] = set()
+        try:
+            while True:
+                for name, axis in self.rig.axes.items():
+                    alive = axis.tracker.link is not LinkState.DOWN
+                    if alive and name not in tokens:
+                        if name in known:
+                            policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
+                            group.create_task(policy, name=f"bus loss {name}")
+                        known.add(name)
+                        tokens[name] = await self._session.declare_token(self._keys.alive_axis(self._instance, name))
+                    elif not alive and name in tokens:
+                        await tokens.pop(name).close()
+                await asyncio.sleep(TOKEN_PERIOD_S)
+        finally:
+            for token in tokens.values():
+                await token.close()
+
+    def _info(self) -> DaemonInfo:
+        return DaemonInfo(
+            rig=self.rig.name,
+            version=version("ldcnd"),
+            api=API,
+            instance=self._instance,
+            started=self._started_ns,
+            encoding=self._config.telemetry.encoding,
+            axes=tuple(self.rig.axes),
+            buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
+        )

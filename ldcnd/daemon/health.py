@@ -1,0 +1,141 @@
+"""How the rig is doing: gathers what the lines count and publishes it once a second."""
+
+import asyncio
+from collections.abc import Mapping
+
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.daemon.axis_service import AxisService
+from ldcnd.daemon.bus_service import BusService
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.publishing import Publisher
+from ldcnd.daemon.rig import Rig
+from ldcnd.messaging.keys import Keys
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth
+from ldcnd.model.samples import TelemetryItem
+
+PERIOD_S = 1.0
+LAG_LOOKS = 10
+"""So many times in a period a timer is looked at for how late it comes."""
+LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
+
+
+class HealthWatch:
+    """Reports on one rig.
+
+    Attributes:
+        latest: the newest report of each key.
+    """
+
+    def __init__(self, rig: Rig, keys: Keys, publisher: Publisher, clock: Clock) -> None:
+        self.latest: dict[str, Frozen] = {}
+        self._rig = rig
+        self._keys = keys
+        self._publisher = publisher
+        self._clock = clock
+        self._seq = 0
+        self._missed = 0
+        self._busy_s: dict[str, float] = {}
+        self._published: dict[str, int] = {}
+
+    async def run(self) -> None:
+        """Report each second until cancelled; then take the reports off the network."""
+        self._note_counters()
+        last_s = due_s = self._clock.now_s()
+        try:
+            while True:
+                lag_s = 0.0
+                for _ in range(LAG_LOOKS):
+                    due_s += PERIOD_S / LAG_LOOKS
+                    await asyncio.sleep(due_s - self._clock.now_s())
+                    lag_s = max(lag_s, self._clock.now_s() - due_s)
+                now_s = self._clock.now_s()
+                held_up = int((now_s - due_s) / PERIOD_S)
+                self._missed += held_up
+                due_s += held_up * PERIOD_S
+                self._report(now_s - last_s, lag_s)
+                last_s = now_s
+        finally:
+            for key in self.latest:
+                self._publisher.withdraw_report(key)
+
+    def _report(self, period_s: float, lag_s: float) -> None:
+        """Publish all reports.
+
+        Args:
+            period_s: how long ago the one before was.
+            lag_s: how late a timer came since.
+        """
+        t = self._clock.now_ns()
+        reports: dict[str, Frozen] = {
+            self._keys.health: DaemonHealth(
+                t=t,
+                seq=self._seq,
+                loop_lag_s=lag_s,
+                published=self._publisher.published,
+                missed_reports=self._missed,
+            )
+        }
+        for bus in self._rig.buses:
+            reports[self._keys.bus_health(bus.bus.settings.name)] = self._bus(bus, t, period_s)
+        self._seq += 1
+        self._note_counters()
+        self.latest = reports
+        for key, report in reports.items():
+            self._publisher.publish_report(key, report, t)
+
+    def _bus(self, service: BusService, t: int, period_s: float) -> BusHealth:
+        bus, statistics = service.bus, service.bus.statistics
+        name = bus.settings.name
+        return BusHealth(
+            t=t,
+            seq=self._seq,
+            bus=name,
+            up=service.report is not None,
+            utilisation=(statistics.wire_busy_s - self._busy_s[name]) / period_s,
+            exchanges=statistics.exchanges,
+            timeouts=statistics.timeouts,
+            corrupt_replies=statistics.corrupt_replies,
+            rejected_packets=statistics.rejected_packets,
+            resent=statistics.resent,
+            resynchronisations=statistics.resynchronisations,
+            stray_bytes=statistics.stray_bytes,
+            losses=statistics.losses,
+            lanes=tuple(_lane(service, lane) for lane in Lane),
+            axes=tuple(self._axis(axis, t, period_s) for axis in service.axes),
+        )
+
+    def _axis(self, axis: AxisService, t: int, period_s: float) -> AxisHealth:
+        name = axis.config.name
+        last = self._publisher.last.get(self._keys.telemetry(name, TelemetryItem.POSITION))
+        return AxisHealth(
+            axis=name,
+            link=axis.tracker.link,
+            sample_age_s=max(0.0, (t - last.measured_at_ns) / 1e9) if last else None,
+            rate_wanted_hz=axis.config.rates.position,
+            rate_hz=max(0, self._positions(name) - self._published[name]) / period_s,
+            faults=len(axis.tracker.active_faults),
+        )
+
+    def _positions(self, axis: str) -> int:
+        """Return how many positions of an axis were published so far."""
+        last = self._publisher.last.get(self._keys.telemetry(axis, TelemetryItem.POSITION))
+        return last.sample.seq + 1 if last else 0
+
+    def _note_counters(self) -> None:
+        self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}
+        self._published = {axis: self._positions(axis) for axis in self._rig.axes}
+
+
+def _lane(service: BusService, lane: Lane) -> LaneHealth:
+    latency = service.bus.statistics.latency[lane]
+    return LaneHealth.model_validate(
+        {
+            "lane": LANES[lane],
+            "waiting": service.bus.waiting(lane),
+            "exchanges": sum(latency.counts),
+            "p50_s": latency.quantile_s(0.5),
+            "p99_s": latency.quantile_s(0.99),
+            "longest_s": latency.longest_s,
+        }
+    )

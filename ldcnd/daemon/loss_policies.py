@@ -1,0 +1,57 @@
+"""What happens when somebody disappears: clients whose lease ended, the line, the daemon itself."""
+
+import asyncio
+
+from ldcnd.axis_config import LossPolicy
+from ldcnd.daemon.authority import Authority
+from ldcnd.daemon.axis_service import AxisService
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.rig import Rig
+from ldcnd.drivers.driver import StopMode
+from ldcnd.log import get_logger
+from ldcnd.model.axes import Moving
+
+log = get_logger("loss")
+
+EXPIRY_PERIOD_S = 0.05
+"""A lease that ends is acted upon within this time, besides at every command."""
+
+STOP_MODES = {
+    LossPolicy.HALT: StopMode.SMOOTH,
+    LossPolicy.QUICK_STOP: StopMode.ABRUPT,
+    LossPolicy.POWER_OFF: StopMode.OFF,
+}
+
+
+class LeaseWatch:
+    """Ends leases in time and brings what moved under them to rest."""
+
+    def __init__(self, rig: Rig, authority: Authority, clock: Clock, group: asyncio.TaskGroup) -> None:
+        self._rig = rig
+        self._authority = authority
+        self._clock = clock
+        self._group = group
+
+    async def run(self) -> None:
+        """Watch until cancelled."""
+        while True:
+            self.expire()
+            await asyncio.sleep(EXPIRY_PERIOD_S)
+
+    def expire(self) -> None:
+        """End what was not renewed in time; called before any command that waited is looked at."""
+        for lease in self._authority.expire(self._clock.now_s()):
+            log.warning("lease ended", client=lease.client, axes=sorted(lease.axes))
+            for name in sorted(lease.axes):
+                axis = self._rig.axis(name)
+                self._group.create_task(
+                    apply_policy(axis, axis.config.loss.client, "client loss"), name=f"client loss {name}"
+                )
+
+
+async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> None:
+    """Do to an axis that moves, or may move, what its policy says."""
+    if policy is LossPolicy.RUN_TO_TARGET or axis.tracker.moving is Moving.NO:
+        return
+    log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)
+    await axis.bring_to_rest(STOP_MODES[policy])

@@ -1,0 +1,213 @@
+"""From a configuration to what its lines promise, before anything is opened.
+
+A plan that cannot hold is refused with the smallest changes that would make it hold, unless the line is told to skip
+polls. Reckoned with the longest replies and waits; see docs/explanation/timing.md for the analysis.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+from ldcnd.axis_config import AxisConfig
+from ldcnd.bus.cost import Cost, LineTiming, cost_of
+from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, largest, plan_line
+from ldcnd.bus.response_times import meets_deadlines
+from ldcnd.bus_config import BAUDS, BusConfig
+from ldcnd.config import RigConfig
+from ldcnd.daemon.axis_poller import wanted_rates_hz
+from ldcnd.drivers.ldcn.costs import price_list
+from ldcnd.drivers.ldcn.registers import BaudCodes
+from ldcnd.drivers.price_list import PriceList
+from ldcnd.errors import ConfigError, ValueOutOfRange
+from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigPlan
+from ldcnd.model.samples import TelemetryItem
+
+PLANNED_FAMILY = "ldcn"
+SLOWEST_HZ = 0.01
+
+
+def plan_rig(config: RigConfig) -> RigPlan:
+    """Plan every line that polls by rates; a line of another family paces itself."""
+    buses = tuple(plan_bus(bus) for bus in config.bus if bus.family == PLANNED_FAMILY)
+    return RigPlan(rig=config.rig, holds=all(bus.holds for bus in buses), buses=buses)
+
+
+def require_plan(config: RigConfig) -> RigPlan:
+    """Return the plan of a rig.
+
+    Raises:
+        ConfigError: a line cannot carry what is asked of it; says by how much, and what would make it fit.
+    """
+    plan = plan_rig(config)
+    refused = [bus for bus in plan.buses if not bus.holds and bus.overload == "refuse"]
+    if refused:
+        raise ConfigError("\n".join(_refusal(bus) for bus in refused))
+    return plan
+
+
+def plan_bus(bus: BusConfig) -> BusPlan:
+    """Plan one line."""
+    prices = _prices(bus, bus.baud)
+    timing = _timing(bus, bus.baud, prices)
+    polls = _polls(bus, timing, prices)
+    plan = plan_line(polls, _urgent(bus, timing, prices))
+    return BusPlan(
+        bus=bus.name,
+        baud=bus.baud,
+        node_baud=timing.node_baud,
+        turnaround_s=timing.turnaround_s,
+        adapter_latency_s=timing.adapter_latency_s,
+        load=plan.load,
+        mean_load=plan.mean_load,
+        commands_per_s=plan.commands_per_s,
+        stop_wait_s=plan.stop_wait_s,
+        stop_s=plan.stop_s,
+        stop_after_loss_s=plan.stop_after_loss_s,
+        holds=plan.holds,
+        overload=bus.overload,
+        remedies=() if plan.holds else tuple(_remedies(bus, polls)),
+        polls=tuple(_described(bus, plan, prices)),
+    )
+
+
+# -- what the line is asked to carry ---------------------------------------------------------------------------------
+
+
+def _prices(bus: BusConfig, baud: int) -> Mapping[str, PriceList]:
+    codes = BaudCodes(bus.divisors)
+    models = {axis.model for axis in bus.axis}
+    return MappingProxyType({model: price_list(model, baud, codes) for model in sorted(models)})
+
+
+def _timing(bus: BusConfig, baud: int, prices: Mapping[str, PriceList]) -> LineTiming:
+    return LineTiming(
+        host_baud=baud,
+        node_baud=min(price.node_baud for price in prices.values()),
+        adapter_latency_s=bus.adapter_latency_ms / 1000,
+    )
+
+
+def _polls(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> list[Poll]:
+    polls = []
+    for axis in bus.axis:
+        price = prices[axis.model]
+        rates_hz = wanted_rates_hz(axis.rates, adc=True)
+        rate_hz = max(rates_hz.values())
+        bare_s = cost_of(price.reading(frozenset()), timing).mean_s
+        extra_s = {item: cost_of(price.reading(frozenset([item])), timing).mean_s - bare_s for item in rates_hz}
+        mean_s = bare_s + math.fsum(extra_s[item] * rates_hz[item] / rate_hz for item in rates_hz)
+        items = tuple(item.value for item in rates_hz)
+        # drives in analog positioning send their converter's value with every reply
+        polls.append(Poll(axis.name, items, rate_hz, _longest(price, timing), mean_s))
+    return polls
+
+
+def _longest(price: PriceList, timing: LineTiming) -> Cost:
+    return cost_of(price.reading(frozenset(TelemetryItem)), timing)
+
+
+def _urgent(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> Urgent:
+    commands = [cost_of(exchange, timing) for price in prices.values() for exchange in price.commands.values()]
+    stops = [cost_of(price.stop, timing) for price in prices.values() if price.stop]
+    byte_s = timing.bits_per_byte / timing.host_baud
+    return Urgent(
+        command_s=max(command.longest_s for command in commands),
+        stop_s=max((stop.longest_s for stop in stops), default=0.0),
+        recovery_s=max(len(price.flush) * byte_s + price.settle_s for price in prices.values()),
+        margin_s=bus.margin_ms / 1000,
+    )
+
+
+# -- what would make it fit ------------------------------------------------------------------------------------------
+
+
+def _remedies(bus: BusConfig, polls: Sequence[Poll]) -> list[str]:
+    """Return changes of one setting each, any of which is enough."""
+    remedies = []
+    cap = largest(lambda hz: _fits(_capped(polls, hz)), SLOWEST_HZ, max(poll.rate_hz for poll in polls))
+    if cap is not None:
+        shown = math.floor(cap * 100) / 100 if cap < 10 else math.floor(cap * 10) / 10  # noqa: PLR2004 - digits
+        remedies.append(f"no rate above {shown:g} Hz")
+    for baud in BAUDS:
+        if baud > bus.baud and _reached(bus, baud):
+            prices = _prices(bus, baud)
+            if _fits(_polls(bus, _timing(bus, baud, prices), prices)):
+                remedies.append(f"baud = {baud}")
+                break
+    if bus.adapter_latency_ms:
+        prices = _prices(bus, bus.baud)
+        timing = replace(_timing(bus, bus.baud, prices), adapter_latency_s=0.0)
+        if _fits(_polls(bus, timing, prices)):
+            remedies.append("adapter_latency_ms = 0, with an adapter that passes replies on at once")
+    remedies.append('overload = "skip": polls then come as often as the line allows')
+    return remedies
+
+
+def _capped(polls: Sequence[Poll], most_hz: float) -> list[Poll]:
+    return [replace(poll, rate_hz=min(poll.rate_hz, most_hz)) for poll in polls]
+
+
+def _fits(polls: Sequence[Poll]) -> bool:
+    return meets_deadlines([poll.task for poll in polls])
+
+
+def _reached(bus: BusConfig, baud: int) -> bool:
+    """Tell whether every drive of the line has this rate."""
+    try:
+        BusConfig.model_validate(bus.model_dump() | {"baud": baud})
+        _prices(bus, baud)
+    except (ValueError, ValueOutOfRange):
+        return False
+    return True
+
+
+# -- saying it -------------------------------------------------------------------------------------------------------
+
+
+def _described(bus: BusConfig, plan: LinePlan, prices: Mapping[str, PriceList]) -> list[PollPlan]:
+    described = []
+    axes = {axis.name: axis for axis in bus.axis}
+    for poll, response_s in zip(plan.polls, plan.responses_s, strict=True):
+        axis = axes[poll.axis]
+        longest = prices[axis.model].reading(frozenset(TelemetryItem))
+        described.append(
+            PollPlan(
+                axis=poll.axis,
+                address=axis.address,
+                request_bytes=len(longest.request),
+                reply_bytes=longest.reply_bytes,
+                rate_hz=poll.rate_hz,
+                longest_s=poll.cost.longest_s,
+                response_s=_bounded(response_s),
+                holds=response_s <= poll.task.period_s,
+                items=tuple(_items(axis, poll, response_s)),
+            )
+        )
+    return described
+
+
+def _items(axis: AxisConfig, poll: Poll, response_s: float) -> list[ItemPlan]:
+    """Slower items ride along with the nearest poll, so they may be due half a poll period before it."""
+    riding_s = poll.task.period_s / 2
+    return [
+        ItemPlan(
+            item=item.value,
+            rate_hz=rate_hz,
+            response_s=_bounded(response_s if rate_hz == poll.rate_hz else response_s + riding_s),
+        )
+        for item, rate_hz in wanted_rates_hz(axis.rates, adc=True).items()
+    ]
+
+
+def _bounded(response_s: float) -> float | None:
+    return None if math.isinf(response_s) else response_s
+
+
+def _refusal(bus: BusPlan) -> str:
+    late = ", ".join(poll.axis for poll in bus.polls if not poll.holds)
+    return (
+        f"bus {bus.bus}: at {bus.baud} baud the polls need {bus.load:.0%} of the line when drives are slow"
+        f" ({bus.mean_load:.0%} on average), and those of {late} can miss their turns;"
+        f" any of these is enough: {'; '.join(bus.remedies)}"
+    )

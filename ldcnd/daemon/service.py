@@ -1,0 +1,166 @@
+"""The daemon as a service: says when it is ready and what works, feeds the watchdog, reloads when asked, ends in order.
+
+The watchdog is fed only while every bus keeps to its own plan. So it ends a daemon whose loop hangs and one whose loop
+runs while a line does not; a line without adapter or without drives is no reason, and is told in the status instead.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+from ldcnd.config import RigConfig
+from ldcnd.daemon import systemd
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.planning import require_plan
+from ldcnd.daemon.reloading import Reload, plan_reload
+from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.systemd import Notifier
+from ldcnd.errors import ConfigError
+from ldcnd.log import get_logger
+from ldcnd.model.axes import LinkState
+
+log = get_logger("service")
+
+STATUS_PERIOD_S = 1.0
+FEEDINGS = 3
+"""The watchdog is fed so often within its time."""
+TRIES, TRY_PERIOD_S = 50, 0.1
+RELOAD_TIME_S = 10.0
+"""A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
+
+
+class Service:
+    """Runs a daemon and keeps its service manager informed.
+
+    Args:
+        daemon: what to run.
+        notifier: where to say it.
+        load: reads the configuration again, as it was read at the start.
+        monotonic_ns: CLOCK_MONOTONIC, which the service manager compares with its own.
+    """
+
+    def __init__(
+        self,
+        daemon: Daemon,
+        notifier: Notifier,
+        load: Callable[[], RigConfig],
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._daemon = daemon
+        self._notifier = notifier
+        self._load = load
+        self._monotonic_ns = monotonic_ns
+        self._asked = asyncio.Event()
+        self._ending = False
+        self._stuck: tuple[str, ...] = ()
+        self._remark = ""
+
+    def reload(self) -> None:
+        """Ask for the configuration to be read again; requests that come meanwhile are one."""
+        self._asked.set()
+
+    def end(self) -> None:
+        """Say that the daemon ends, and end it; `run` returns when its axes have come to rest."""
+        self._ending = True
+        self._notifier.tell(systemd.STOPPING, systemd.status(self._status()))
+        self._daemon.end()
+
+    async def run(self) -> None:
+        """Serve until `end` is called or the caller is cancelled."""
+        async with asyncio.TaskGroup() as group:
+            beside = [group.create_task(self._reload_when_asked(), name="reload")]
+            if self._notifier.is_heard:
+                beside.append(group.create_task(self._report(), name="service manager"))
+            try:
+                await self._daemon.run()
+            finally:
+                for task in beside:
+                    task.cancel()
+
+    async def _report(self) -> None:
+        await self._daemon.wait_serving()
+        watchdog_s = self._notifier.watchdog_s
+        period_s = min(STATUS_PERIOD_S, watchdog_s / FEEDINGS) if watchdog_s else STATUS_PERIOD_S
+        told = self._status()
+        await self._assure(systemd.READY, systemd.status(told))
+        while True:
+            messages = [systemd.WATCHDOG] if self._turning() else []
+            if (now := self._status()) != told:
+                messages.append(systemd.status(now))
+                told = now
+            self._notifier.tell(*messages)
+            await asyncio.sleep(period_s)
+
+    async def _assure(self, *messages: str) -> None:
+        """Tell what is told only once, again and again for a while if the service manager is too busy to take it."""
+        for _ in range(TRIES):
+            if self._notifier.tell(*messages):
+                return
+            await asyncio.sleep(TRY_PERIOD_S)
+
+    def _turning(self) -> bool:
+        now_s = asyncio.get_running_loop().time()
+        stuck = tuple(bus.bus.settings.name for bus in self._daemon.rig.buses if not bus.bus.turning(now_s))
+        if stuck and stuck != self._stuck:
+            log.error("not turning", buses=stuck, watchdog_s=self._notifier.watchdog_s)
+        self._stuck = stuck
+        return not stuck
+
+    def _status(self) -> str:
+        if self._ending:
+            return "stopping: axes come to rest"
+        stuck = [f"bus {name} does not turn" for name in self._stuck]
+        return "; ".join(filter(None, [describe(self._daemon.rig), *stuck, self._remark]))
+
+    # -- reloading ---------------------------------------------------------------------------------------------------
+
+    async def _reload_when_asked(self) -> None:
+        await self._daemon.wait_serving()
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            await self._assure(systemd.reloading(self._monotonic_ns()))
+            self._remark = await self._reload()
+            await self._assure(systemd.READY, systemd.status(self._status()))
+
+    async def _reload(self) -> str:
+        """Take what can be taken; return what the status must say about the rest."""
+        try:
+            async with asyncio.timeout(RELOAD_TIME_S):
+                reload = await asyncio.to_thread(self._prepare, self._daemon.config)
+        except TimeoutError:
+            log.error("configuration not reloaded", reason=f"not read within {RELOAD_TIME_S:g} s")
+            return "configuration not reloaded: it cannot be read"
+        except ConfigError as error:
+            log.error("configuration not reloaded", reason=error.message, code=error.code.value)
+            return f"configuration not reloaded: {error.message.splitlines()[0]}"
+        self._daemon.reconfigure(reload.config)
+        log.info("configuration reloaded", changed=reload.changed)
+        if not reload.refused:
+            return ""
+        log.warning("changes need a restart", keys=reload.refused)
+        return f"restart needed for {', '.join(reload.refused)}"
+
+    def _prepare(self, running: RigConfig) -> Reload:
+        """Read and judge the file, beside the loop: lines go on meanwhile."""
+        reload = plan_reload(running, self._load())
+        require_plan(reload.config)
+        return reload
+
+
+def describe(rig: Rig) -> str:
+    """Return in one line what of a rig works and what does not."""
+    buses_up = sum(bus.report is not None for bus in rig.buses)
+    down = [name for name, axis in rig.axes.items() if axis.tracker.link is LinkState.DOWN]
+    parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {len(rig.axes) - len(down)}/{len(rig.axes)} axes up"]
+    for bus in rig.buses:
+        if bus.report is None:
+            why = bus.problem if bus.bus.is_open else bus.bus.loss_reason or bus.problem
+            parts.append(f"bus {bus.bus.settings.name}: {why}")
+    lost = [axis for bus in rig.buses if bus.report for axis in down if axis in {one.config.name for one in bus.axes}]
+    if lost:
+        parts.append(f"no answer from {', '.join(lost)}")
+    faulty = [name for name, axis in rig.axes.items() if axis.tracker.active_faults]
+    if faulty:
+        parts.append(f"faults on {', '.join(faulty)}")
+    return "; ".join(parts)

@@ -1,0 +1,1 @@
+"""Keys, encodings and sessions: the road between the daemon and its clients."""

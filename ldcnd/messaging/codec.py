@@ -1,0 +1,250 @@
+"""Payloads: models to bytes and back, JSON or msgpack, and errors as replies.
+
+Both encodings mean the same: a msgpack payload is held to the rules of JSON, strictly: a number is not a string, true
+is not 1. JSON is sent as exactly `application/json`, because stock tools compare the whole name; msgpack names the
+schema.
+"""
+
+import math
+import sys
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+from typing import TypeVar
+
+import msgpack
+import pydantic
+import pydantic_core
+
+from ldcnd import errors
+from ldcnd.errors import LdcndError, MalformedRequest, PayloadTooLarge
+from ldcnd.model.errors import ErrorReply, ReceivedError
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.schemas import schema_name
+
+MAX_PAYLOAD_BYTES = 16 * 1024
+"""No payload that is decoded is longer: the largest description has a quarter of this."""
+
+ECHO_CHARACTERS = 80
+"""An error repeats so much of what it complains about."""
+
+_WHITE_SPACE = b" \t\r\n"
+
+ModelT = TypeVar("ModelT", bound=Frozen)
+
+
+class Encoding(StrEnum):
+    """How a payload is encoded; the value is its name on the wire, without the schema."""
+
+    JSON = "application/json"
+    MSGPACK = "application/msgpack"
+
+
+_ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
+    {
+        error.code: error
+        for error in (
+            errors.ReplyTimeout,
+            errors.BadReply,
+            errors.PacketRejected,
+            errors.OutcomeUnknown,
+            errors.BusDown,
+            errors.BusBusy,
+            errors.NetworkMismatch,
+            errors.DriveFault,
+            errors.AddressRefused,
+            errors.DataRefused,
+            errors.ByteCountRefused,
+            errors.BusyTracing,
+            errors.MalformedRequest,
+            errors.PayloadTooLarge,
+            errors.WildcardRefused,
+            errors.UnknownVerb,
+            errors.UnknownAxis,
+            errors.NotSupported,
+            errors.EepromBudgetSpent,
+            errors.ValueOutOfRange,
+            errors.PositionLimit,
+            errors.VelocityLimit,
+            errors.AccelerationLimit,
+            errors.WrongState,
+            errors.NotReferenced,
+            errors.StopLatched,
+            errors.AxisUnreachable,
+            errors.TooManyRequests,
+            errors.DuplicateDaemon,
+            errors.ShuttingDown,
+            errors.LeaseRequired,
+            errors.LeaseHeld,
+            errors.LeaseExpired,
+            errors.LeaseUnknown,
+            errors.StaleSequence,
+            errors.CommandExpired,
+            errors.CommandIdReused,
+            errors.UnknownCommand,
+            errors.ConfigError,
+            errors.SessionError,
+            errors.InternalError,
+        )
+    }
+)
+
+
+def encode(model: Frozen, encoding: Encoding) -> tuple[bytes, str]:
+    """Return a model's payload and the name of its encoding on the wire."""
+    if encoding is Encoding.JSON:
+        return model.model_dump_json().encode(), encoding.value
+    return msgpack.packb(model.model_dump(mode="json")), f"{encoding.value};{schema_name(type(model))}"
+
+
+def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
+    """Return the model that a request stands for, strictly; an empty payload has no fields.
+
+    Args:
+        model: what it must be.
+        payload: at most `MAX_PAYLOAD_BYTES`.
+        encoding: its name on the wire; when it names neither JSON nor msgpack, the payload's first byte tells.
+
+    Raises:
+        PayloadTooLarge: the payload is too long.
+        MalformedRequest: anything else; names the first field that is wrong and what is allowed there.
+    """
+    try:
+        return model.model_validate_json(_text(payload, encoding), strict=True)
+    except pydantic.ValidationError as error:
+        raise _explained(model, error) from None
+
+
+def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
+    """Return the model that a daemon's answer or sample stands for, without the fields that only a newer daemon knows.
+
+    For clients: within one version of the interface fields are only ever added, so what is unknown may be ignored.
+
+    Args:
+        model: what it must be.
+        payload: as for `decode`.
+        encoding: as for `decode`.
+
+    Raises:
+        PayloadTooLarge: the payload is too long.
+        MalformedRequest: a known field is missing or wrong.
+    """
+    try:
+        return model.model_validate_json(_text(payload, encoding), strict=True, extra="ignore")
+    except pydantic.ValidationError as error:
+        raise _explained(model, error) from None
+
+
+def decode_error(payload: bytes, encoding: str) -> LdcndError:
+    """Return the error that a daemon answers with.
+
+    Raises:
+        MalformedRequest: the payload is no error.
+    """
+    return rebuild_error(decode_received(ReceivedError, payload, encoding))
+
+
+def reply_encoding(encoding: str) -> Encoding:
+    """Return how to answer a query of that encoding: alike, and in JSON when it does not say."""
+    return _named(encoding) or Encoding.JSON
+
+
+def error_reply(error: LdcndError) -> ErrorReply:
+    """Return what the network may know of an error."""
+    return ErrorReply(
+        code=error.code,
+        message=error.message,
+        retryable=error.retryable,
+        axis=error.axis,
+        value=_finite(error.value),
+        limit=_finite(error.limit),
+        nearest=error.nearest if error.nearest is None or math.isfinite(error.nearest) else None,
+        remedy=error.remedy,
+    )
+
+
+def rebuild_error(reply: ReceivedError) -> LdcndError:
+    """Return the error that a reply tells of, of the class that has its code; the root when no class has it."""
+    known = _ERRORS.get(reply.code)
+    return (known or LdcndError)(
+        reply.message if known else f"{reply.message} ({reply.code}, an error code newer than this client)",
+        axis=reply.axis,
+        value=reply.value,
+        limit=reply.limit,
+        nearest=reply.nearest,
+        remedy=reply.remedy,
+    )
+
+
+def _text(payload: bytes, encoding: str) -> bytes:
+    """Return a payload as JSON."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise PayloadTooLarge(
+            f"the payload has {len(payload)} bytes, more than the {MAX_PAYLOAD_BYTES} that any request may have",
+            value=len(payload),
+            limit=MAX_PAYLOAD_BYTES,
+        )
+    if not payload:
+        return b"{}"
+    return _as_json(payload) if _told(payload, encoding) is Encoding.MSGPACK else payload
+
+
+def _named(encoding: str) -> Encoding | None:
+    try:
+        return Encoding(encoding.partition(";")[0].strip().lower())
+    except ValueError:
+        return None
+
+
+def _told(payload: bytes, encoding: str) -> Encoding:
+    """Look at the payload when the encoding is not named: clients often send bytes and say no more."""
+    if named := _named(encoding):
+        return named
+    return Encoding.JSON if payload[:1] == b"{" or payload[:1] in _WHITE_SPACE else Encoding.MSGPACK
+
+
+def _as_json(payload: bytes) -> bytes:
+    try:
+        return pydantic_core.to_json(msgpack.unpackb(payload))
+    # what msgpack cannot read, and what JSON cannot say: both libraries raise kinds of ValueError
+    except (ValueError, msgpack.UnpackException) as error:
+        raise MalformedRequest(
+            "the payload is neither a JSON object nor a msgpack map of text keys: " + _short(str(error)),
+            remedy=f"send {Encoding.JSON.value} or {Encoding.MSGPACK.value}",
+        ) from None
+
+
+def _explained(model: type[Frozen], error: pydantic.ValidationError) -> MalformedRequest:
+    """Say in one sentence what is wrong with the first field that is."""
+    first = error.errors(include_url=False)[0]
+    field = ".".join(str(part) for part in first["loc"])
+    fields = ", ".join(model.model_fields) or "none"
+    value = first["input"]
+    context = first.get("ctx", {})
+    match first["type"]:
+        case "json_invalid":
+            return MalformedRequest(f"the payload is not valid JSON: {_short(str(context.get('error', '')))}")
+        case "extra_forbidden":
+            return MalformedRequest(f"{_short(field)}: there is no such field; the fields are: {fields}")
+        case "missing":
+            return MalformedRequest(f"{field}: this field is missing; the fields are: {fields}")
+    what = first["msg"][:1].lower() + first["msg"][1:]
+    limits = (context[bound] for bound in ("ge", "gt", "le", "lt") if bound in context)
+    return MalformedRequest(
+        f"{_short(field) or 'the payload'}: {_short(what)}, not {_short(repr(value))}",
+        value=_finite(value) if type(value) in {int, float, str} else _short(repr(value)),
+        limit=next(limits, None),
+    )
+
+
+def _finite(value: float | str | None) -> float | str | None:
+    """Return what JSON can carry of a value: no infinity, no NaN, nothing endless."""
+    if isinstance(value, str):
+        return _short(value)
+    if value is None or abs(value) <= sys.float_info.max:
+        return value
+    return _short(str(value))
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= ECHO_CHARACTERS else text[: ECHO_CHARACTERS - 3] + "..."

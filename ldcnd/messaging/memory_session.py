@@ -1,0 +1,236 @@
+"""Sessions inside one process, for tests in virtual time: the broker stands in for the whole network.
+
+Keys match, queries are routed and tokens appear as with Zenoh; there is no latency and no loss but what the bounded
+hand-over loses. Not modelled: access control, network faults, and the default choice of the nearest queryable.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from functools import partial
+
+from ldcnd.errors import OutcomeUnknown, SessionError
+from ldcnd.messaging.hand_over import HandOver, Intake, TokenChanges
+from ldcnd.messaging.keys import matches
+from ldcnd.messaging.session import (
+    NO_PARAMETERS,
+    QUERY_TIMEOUT_S,
+    UNDELIVERED_SAMPLES,
+    Answer,
+    Declaration,
+    OnQuery,
+    OnSample,
+    OnToken,
+    Qos,
+    Query,
+    Sample,
+    SampleKind,
+    Session,
+)
+
+
+@dataclass(eq=False, slots=True)
+class _Queryable:
+    key: str
+    intake: Intake
+    complete: bool
+
+
+@dataclass(eq=False, slots=True)
+class _Subscription:
+    key: str
+    samples: HandOver[Sample]
+
+
+@dataclass(eq=False, slots=True)
+class _TokenWatch:
+    key: str
+    changes: TokenChanges
+
+
+@dataclass(eq=False, slots=True)
+class _Pending:
+    """A query under way: the answers of those that were asked."""
+
+    awaited: int
+    done: asyncio.Future[None]
+    answers: list[Answer] = field(default_factory=list)
+
+    def take(self, answers: tuple[Answer, ...]) -> None:
+        self.answers.extend(answers)
+        self.awaited -= 1
+        if not self.awaited and not self.done.done():
+            self.done.set_result(None)
+
+
+class MemoryBroker:
+    """The network that its sessions share."""
+
+    def __init__(self) -> None:
+        self.queryables: list[_Queryable] = []
+        self.subscriptions: list[_Subscription] = []
+        self.watches: list[_TokenWatch] = []
+        self.tokens: list[str] = []
+
+    @asynccontextmanager
+    async def session(self) -> AsyncIterator["MemorySession"]:
+        """Join the network for as long as the context lasts."""
+        session = MemorySession(self)
+        try:
+            yield session
+        finally:
+            await session.close()
+
+    def asked(self, key: str) -> list[_Queryable]:
+        """Return who is to answer a query: one complete queryable if there is any, otherwise all that match.
+
+        A complete queryable answers alone only for a key without wildcards; what it covers of others is not worked out.
+        """
+        found = [queryable for queryable in self.queryables if matches(queryable.key, key)]
+        complete = [queryable for queryable in found if queryable.complete and "*" not in key]
+        return complete[:1] or found
+
+    def show_token(self, key: str) -> None:
+        """Tell the watches of a token, unless another session shows the same."""
+        if key not in self.tokens:
+            self._tell(key, alive=True)
+        self.tokens.append(key)
+
+    def withdraw_token(self, key: str) -> None:
+        """Tell the watches that a token is gone, unless another session shows the same."""
+        self.tokens.remove(key)
+        if key not in self.tokens:
+            self._tell(key, alive=False)
+
+    def _tell(self, key: str, *, alive: bool) -> None:
+        for watch in self.watches:
+            if matches(watch.key, key):
+                watch.changes.offer(key, alive=alive)
+
+
+class MemorySession(Session):
+    """One participant; made by `MemoryBroker.session`."""
+
+    def __init__(self, broker: MemoryBroker) -> None:
+        self._broker = broker
+        self._loop = asyncio.get_running_loop()
+        self._declarations: list[Declaration] = []
+        self._closed = False
+
+    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+        """Offer the sample to every subscription that matches; quality of service makes no difference here."""
+        del qos
+        self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+
+    def delete(self, key: str) -> None:
+        """Offer the news to every subscription that matches."""
+        self._offer(Sample(key, b"", "", SampleKind.DELETE, None))
+
+    async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
+        """Answer queries; nothing is in the way of an answer here, so urgent only means not to be refused."""
+        self._must_be_open()
+        queryable = _Queryable(key, Intake(self._loop, on_query, urgent=urgent), complete)
+
+        def undeclare() -> None:
+            self._broker.queryables.remove(queryable)
+            queryable.intake.close()
+
+        self._broker.queryables.append(queryable)
+        return self._declared(undeclare)
+
+    async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
+        """Take samples."""
+        self._must_be_open()
+        subscription = _Subscription(key, HandOver(self._loop, on_sample, UNDELIVERED_SAMPLES))
+
+        def undeclare() -> None:
+            self._broker.subscriptions.remove(subscription)
+            subscription.samples.close()
+
+        self._broker.subscriptions.append(subscription)
+        return self._declared(undeclare)
+
+    async def query(
+        self,
+        key: str,
+        payload: bytes = b"",
+        *,
+        encoding: str = "",
+        parameters: Mapping[str, str] = NO_PARAMETERS,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        urgent: bool = False,
+    ) -> list[Answer]:
+        """Ask whoever serves the key; nothing is overtaken, because nothing waits on its way."""
+        del urgent
+        self._must_be_open()
+        asked = self._broker.asked(key)
+        if not asked:
+            return []
+        pending = _Pending(len(asked), self._loop.create_future())
+        for queryable in asked:
+            if queryable.intake.admit():
+                send = partial(_answer, pending, queryable.intake)
+                queryable.intake.offer(Query(key, parameters, payload, encoding, send))
+            else:
+                Query(key, parameters, payload, encoding, pending.take).refuse(queryable.intake.refusal(key))
+        try:
+            async with asyncio.timeout(timeout_s):
+                await pending.done
+        except TimeoutError:
+            if not pending.answers:
+                raise OutcomeUnknown(
+                    f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same"
+                ) from None
+        return list(pending.answers)
+
+    async def declare_token(self, key: str) -> Declaration:
+        """Show a token."""
+        self._must_be_open()
+        self._broker.show_token(key)
+        return self._declared(partial(self._broker.withdraw_token, key))
+
+    async def watch_tokens(self, key: str, on_token: OnToken) -> Declaration:
+        """Learn of tokens."""
+        self._must_be_open()
+        watch = _TokenWatch(key, TokenChanges(self._loop, on_token))
+
+        def undeclare() -> None:
+            self._broker.watches.remove(watch)
+            watch.changes.close()
+
+        self._broker.watches.append(watch)
+        for token in dict.fromkeys(self._broker.tokens):
+            if matches(key, token):
+                watch.changes.offer(token, alive=True)
+        return self._declared(undeclare)
+
+    async def close(self) -> None:
+        """Leave the network."""
+        self._closed = True
+        for declaration in tuple(self._declarations):
+            await declaration.close()
+
+    def _offer(self, sample: Sample) -> None:
+        self._must_be_open()
+        for subscription in self._broker.subscriptions:
+            if matches(subscription.key, sample.key):
+                subscription.samples.offer(sample)
+
+    def _declared(self, undeclare: Callable[[], None]) -> Declaration:
+        async def take_back() -> None:
+            self._declarations.remove(declaration)
+            undeclare()
+
+        declaration = Declaration(take_back)
+        self._declarations.append(declaration)
+        return declaration
+
+    def _must_be_open(self) -> None:
+        if self._closed:
+            raise SessionError("the session is closed")
+
+
+def _answer(pending: _Pending, intake: Intake, answers: tuple[Answer, ...]) -> None:
+    intake.leave()
+    pending.take(answers)

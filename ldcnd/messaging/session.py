@@ -1,0 +1,257 @@
+"""The contract of a messaging session: what daemon and client need of Zenoh, and nothing else.
+
+Callbacks run on the event loop, one after the other, and must not block. What arrives faster than the loop takes it is
+bounded: a subscription keeps its newest samples, a queryable refuses what is too much.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+
+from ldcnd.errors import InternalError, LdcndError
+from ldcnd.messaging.codec import Encoding, encode, error_reply
+
+UNDELIVERED_SAMPLES = 64
+"""A subscription keeps so many samples that its callback has not had yet; the oldest gives way."""
+
+PENDING_QUERIES = 64
+"""A queryable has so many unanswered queries at most; the next is refused with too_many_requests."""
+
+UNDELIVERED_TOKENS = 1024
+"""A token watch keeps so many changes that its callback has not had yet; the oldest gives way."""
+
+PENDING_URGENT_QUERIES = 4096
+"""The same for an urgent queryable: a bound on memory, not on clients; a stop is not refused for being one of many."""
+
+QUERY_TIMEOUT_S = 2.0
+"""A client waits so long for the answers to a query unless it says otherwise."""
+
+NO_PARAMETERS: Mapping[str, str] = MappingProxyType({})
+
+
+class Qos(StrEnum):
+    """How a sample travels; none of them ever makes the publisher wait."""
+
+    TELEMETRY = "telemetry"
+    """Periodic values: dropped when the network is full, the next one is on its way."""
+    EVENT = "event"
+    """State changes and faults: overtake telemetry, sent at once."""
+    BULK = "bulk"
+    """Traces: only what bandwidth is left."""
+
+
+class SampleKind(StrEnum):
+    """What happened to a key."""
+
+    PUT = "put"
+    DELETE = "delete"
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A value that was published, or the news that a key has none any more."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    kind: SampleKind
+    measured_at_ns: int | None
+    """When the value was true, UTC in ns since 1970; when it was sent if nobody said; None if nobody stamped it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One answer to a query; an error answer carries an `ErrorReply`."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    measured_at_ns: int | None = None
+    is_error: bool = False
+
+
+Send = Callable[[tuple[Answer, ...]], None]
+"""Takes all answers to one query, once, from any thread, without blocking."""
+
+
+class Query:
+    """A question to be answered exactly once, on the event loop, now or later.
+
+    Either one `reply` without a key, or one `refuse` or `reply_error`, or any number of `reply` with a key each and
+    then `finish`. A query that is dropped without an answer is answered with an internal error.
+
+    Attributes:
+        key: as it was asked; may be an expression with wildcards.
+        parameters: what followed the `?` of the selector, not percent-decoded.
+        payload: empty when there was none.
+        encoding: of the payload, as the client named it; empty when it did not.
+    """
+
+    __slots__ = ("_answered", "_answers", "_send", "encoding", "key", "parameters", "payload")
+
+    def __init__(self, key: str, parameters: Mapping[str, str], payload: bytes, encoding: str, send: Send) -> None:
+        self.key = key
+        self.parameters = parameters
+        self.payload = payload
+        self.encoding = encoding
+        self._send = send
+        self._answers: list[Answer] = []
+        self._answered = False
+
+    def reply(self, payload: bytes, encoding: str, key: str | None = None, measured_at_ns: int | None = None) -> None:
+        """Answer; for good without a key, with one value of several when a key is given.
+
+        Args:
+            payload: the value.
+            encoding: of the payload.
+            key: the key that has this value; must match the query's. `finish` ends the answer.
+            measured_at_ns: when the value was true, UTC in ns since 1970.
+
+        Raises:
+            InternalError: the query was answered already.
+        """
+        self._refuse_second_answer()
+        self._answers.append(Answer(key or self.key, payload, encoding, measured_at_ns))
+        if key is None:
+            self.finish()
+
+    def reply_error(self, payload: bytes, encoding: str) -> None:
+        """Answer with an encoded `ErrorReply`, for good; values given before are not sent.
+
+        Raises:
+            InternalError: the query was answered already.
+        """
+        self._refuse_second_answer()
+        self._answers = [Answer(self.key, payload, encoding, is_error=True)]
+        self.finish()
+
+    def refuse(self, error: LdcndError) -> None:
+        """Answer with an error, for good, as JSON.
+
+        Raises:
+            InternalError: the query was answered already.
+        """
+        self.reply_error(*encode(error_reply(error), Encoding.JSON))
+
+    def finish(self) -> None:
+        """End an answer of several values, or of none.
+
+        Raises:
+            InternalError: the query was answered already.
+        """
+        self._refuse_second_answer()
+        self._answered = True
+        self._send(tuple(self._answers))
+
+    def abandon(self) -> None:
+        """Answer with an internal error unless the query was answered; for whoever gives a query up."""
+        if not self._answered:
+            self.refuse(InternalError(f"{self.key}: the query was dropped without an answer; the log has more"))
+
+    def _refuse_second_answer(self) -> None:
+        if self._answered:
+            raise InternalError(f"{self.key}: the query was answered already")
+
+    def __del__(self) -> None:
+        """Leave no client waiting for a query that was forgotten."""
+        # attributes are missing when the constructor failed
+        if not getattr(self, "_answered", True):
+            self.abandon()
+
+
+OnQuery = Callable[[Query], None]
+OnSample = Callable[[Sample], None]
+OnToken = Callable[[str, bool], None]
+"""Learns that the token of a key has appeared (True) or vanished (False)."""
+
+
+class Declaration:
+    """Something that a session has made known to the network; made by its session."""
+
+    def __init__(self, take_back: Callable[[], Awaitable[None]]) -> None:
+        self._take_back = take_back
+        self._closed = False
+
+    async def close(self) -> None:
+        """Take it back; safe to call twice. No callback runs afterwards, undelivered queries are refused."""
+        if not self._closed:
+            self._closed = True
+            await self._take_back()
+
+
+class Session(ABC):
+    """One participant in the network. Closing it takes back everything that it has declared.
+
+    After `close` every other method raises `SessionError`.
+    """
+
+    @abstractmethod
+    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+        """Publish a value without waiting; what the network cannot take is dropped.
+
+        Args:
+            key: a concrete key.
+            payload: the value.
+            encoding: of the payload.
+            qos: how it travels; one for all values of a key keeps them in order.
+            measured_at_ns: when the value was true, UTC in ns since 1970; the time of sending when missing.
+        """
+
+    @abstractmethod
+    def delete(self, key: str) -> None:
+        """Say, without waiting, that a key has no value any more."""
+
+    @abstractmethod
+    async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
+        """Answer the queries that match a key expression.
+
+        Args:
+            key: the expression.
+            on_query: takes a query; if it raises, the query is answered with an internal error.
+            complete: this session alone can answer everything below the key, so one such session is asked, not all.
+            urgent: answers do not queue behind the answers of other declarations, and so many queries may be
+                unanswered that none is refused in practice.
+        """
+
+    @abstractmethod
+    async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
+        """Take the samples that match a key expression; the oldest are lost when the loop is too slow."""
+
+    @abstractmethod
+    async def query(
+        self,
+        key: str,
+        payload: bytes = b"",
+        *,
+        encoding: str = "",
+        parameters: Mapping[str, str] = NO_PARAMETERS,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        urgent: bool = False,
+    ) -> list[Answer]:
+        """Ask, and return all answers; none at all when nobody serves the key or access control forbids it.
+
+        Args:
+            key: a key or an expression with wildcards.
+            payload: what is asked.
+            encoding: of the payload.
+            parameters: of the selector; neither `;` nor `=` nor `|` in names and values.
+            timeout_s: how long to wait for the last answer; what has arrived by then is returned.
+            urgent: overtakes everything else on its way, for stops.
+
+        Raises:
+            OutcomeUnknown: no answer came in time; the query may be carried out all the same, even later.
+        """
+
+    @abstractmethod
+    async def declare_token(self, key: str) -> Declaration:
+        """Show a liveliness token; it vanishes with its declaration, with the session and with the process."""
+
+    @abstractmethod
+    async def watch_tokens(self, key: str, on_token: OnToken) -> Declaration:
+        """Learn of the tokens that match a key expression, first of those that are there, this session's included."""
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Leave the network within 3 s, whatever the others do; safe to call twice."""

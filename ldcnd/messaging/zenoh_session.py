@@ -1,0 +1,384 @@
+"""The session on a real Zenoh network; with `zenoh_config`, the only module that knows zenoh.
+
+Zenoh calls back on its own threads: there, items are handed over to the loop and nothing else happens, because one
+blocked callback holds up everything that comes over the same link. What may block on a peer that does not read runs on
+worker threads; a publication drops instead of blocking. Answers of urgent declarations have workers of their own.
+
+Source: behaviour of eclipse-zenoh 1.10.2, measured.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol, TypedDict
+
+import zenoh
+from zenoh.handlers import Callback
+
+from ldcnd.errors import OutcomeUnknown, SessionError, ValueOutOfRange
+from ldcnd.log import get_logger
+from ldcnd.messaging import zenoh_failures
+from ldcnd.messaging.hand_over import Collector, HandOver, Intake, TokenChanges
+from ldcnd.messaging.login_probe import refusals
+from ldcnd.messaging.session import (
+    NO_PARAMETERS,
+    QUERY_TIMEOUT_S,
+    UNDELIVERED_SAMPLES,
+    Answer,
+    Declaration,
+    OnQuery,
+    OnSample,
+    OnToken,
+    Qos,
+    Query,
+    Sample,
+    SampleKind,
+    Session,
+)
+from ldcnd.messaging.workers import Workers
+from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+
+__all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
+
+log = get_logger("zenoh")
+
+OPEN_TIME_S = 10.0
+DECLARE_TIME_S = 5.0
+DRAIN_TIME_S = 1.0
+"""On closing, answers that were given have so long to leave."""
+CLOSE_TIME_S = 1.5
+"""Then Zenoh has so long to say goodbye; with a frozen, congested peer it can take 12 s, and is left to itself."""
+QUERY_GRACE_S = 0.5
+"""Zenoh ends a query at its time-out; it is given up for lost so much later."""
+
+
+class _Travel(TypedDict):
+    congestion_control: zenoh.CongestionControl
+    priority: zenoh.Priority
+    express: bool
+
+
+_DROP = zenoh.CongestionControl.DROP
+_TRAVEL: Mapping[Qos, _Travel] = {
+    Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
+    Qos.EVENT: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True},
+    Qos.BULK: {"congestion_control": _DROP, "priority": zenoh.Priority.BACKGROUND, "express": False},
+}
+
+
+class _Undeclarable(Protocol):
+    def undeclare(self) -> None: ...
+
+
+@asynccontextmanager
+async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator["ZenohSession"]:
+    """Join the network for as long as the context lasts.
+
+    Raises:
+        ConfigError: Zenoh does not accept a setting or the configuration file.
+        SessionError: an endpoint cannot be used; says which and what to do.
+    """
+    config = zenoh_config(settings)
+    listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
+    workers = Workers("zenoh open", 1)
+    try:
+        entity = await workers.run(partial(zenoh.open, config), OPEN_TIME_S, zenoh.Session.close)
+    except zenoh.ZError as error:
+        about_connecting = zenoh_failures.is_about_connecting(str(error))
+        if about_connecting and (refused := await refusals(connect, root_certificate(config))):
+            raise zenoh_failures.login_refused(refused) from error
+        raise zenoh_failures.opening_failed(str(error), listen, connect) from error
+    except TimeoutError:
+        raise zenoh_failures.opening_timed_out(OPEN_TIME_S, listen, connect) from None
+    finally:
+        await workers.stop(DRAIN_TIME_S)
+    session = ZenohSession(entity)
+    try:
+        share_sockets(listen)
+        yield session
+    finally:
+        await session.close()
+
+
+@dataclass(slots=True)
+class _Outlet:
+    """The way out of one key; its publisher is declared in the background after the first sample."""
+
+    qos: Qos
+    publisher: zenoh.Publisher | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Declared:
+    """Holds on to what was declared, because Zenoh takes back what is garbage collected."""
+
+    entity: _Undeclarable
+    stop: Callable[[], object]
+
+
+class ZenohSession(Session):
+    """One participant; made by `open_zenoh_session`."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._loop = asyncio.get_running_loop()
+        self._workers = Workers("zenoh", 3)
+        self._urgent_workers = Workers("zenoh urgent", 2)
+        self._declared: list[_Declared] = []
+        self._outlets: dict[str, _Outlet] = {}
+        self._stamp_id = session.new_timestamp().get_id()
+        self._closed = False
+
+    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+        """Publish; cheaper once the key's publisher is declared, which happens in the background."""
+        self._must_be_open()
+        timestamp = _stamp(measured_at_ns, self._stamp_id)
+        outlet = self._outlets.get(key) or self._new_outlet(key, qos)
+        try:
+            if outlet.publisher and outlet.qos is qos:
+                outlet.publisher.put(payload, encoding=encoding, timestamp=timestamp)
+            else:
+                self._session.put(key, payload, encoding=encoding, timestamp=timestamp, **_TRAVEL[qos])
+        except zenoh.ZError as error:
+            raise SessionError(f"{key}: cannot publish: {error}") from error
+
+    def delete(self, key: str) -> None:
+        """Say that a key has no value any more, in order with its values."""
+        self._must_be_open()
+        outlet = self._outlets.get(key)
+        try:
+            self._session.delete(key, **_TRAVEL[outlet.qos if outlet else Qos.EVENT])
+        except zenoh.ZError as error:
+            raise SessionError(f"{key}: cannot delete: {error}") from error
+
+    async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
+        """Answer queries."""
+        intake = Intake(self._loop, on_query, urgent=urgent)
+        workers = self._urgent_workers if urgent else self._workers
+
+        def take(asked: zenoh.Query) -> None:
+            admitted = intake.admit()
+            if not admitted and workers.is_full:
+                # ends the query without an answer, and may hold up the link of this one client
+                return
+            path = _AnswerPath(asked, workers, self._stamp_id, intake.leave if admitted else lambda: None)
+            query = Query(
+                key=str(asked.key_expr),
+                parameters=dict(asked.parameters),  # type: ignore[call-overload] # its stub has no true iterator
+                payload=b"" if asked.payload is None else asked.payload.to_bytes(),
+                encoding="" if asked.encoding is None else str(asked.encoding),
+                send=path.send,
+            )
+            if admitted:
+                intake.offer(query)
+            else:
+                query.refuse(intake.refusal(query.key))
+
+        return await self._declare(
+            lambda: self._session.declare_queryable(key, Callback(take, indirect=False), complete=complete),
+            intake.close,
+        )
+
+    async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
+        """Take samples."""
+        samples = HandOver(self._loop, on_sample, UNDELIVERED_SAMPLES)
+
+        def take(sample: zenoh.Sample) -> None:
+            samples.offer(_sample(sample))
+
+        return await self._declare(
+            lambda: self._session.declare_subscriber(key, Callback(take, indirect=False)), samples.close
+        )
+
+    async def query(
+        self,
+        key: str,
+        payload: bytes = b"",
+        *,
+        encoding: str = "",
+        parameters: Mapping[str, str] = NO_PARAMETERS,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        urgent: bool = False,
+    ) -> list[Answer]:
+        """Ask, one answer from one complete queryable or from all the others; repeated answers are kept."""
+        self._must_be_open()
+        if timeout_s <= 0:
+            raise ValueOutOfRange(f"{key}: a query needs time; {timeout_s:g} s is none", value=timeout_s, limit=0)
+        collector = Collector[zenoh.Reply](self._loop)
+        token = zenoh.CancellationToken()
+        workers = self._urgent_workers if urgent else self._workers
+
+        def ask() -> None:
+            self._session.get(
+                zenoh.Selector(key, dict(parameters)),
+                Callback(collector.take, collector.end, indirect=False),
+                target=zenoh.QueryTarget.BEST_MATCHING,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+                priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
+                express=True,
+                payload=payload if payload or encoding else None,
+                encoding=encoding or None,
+                cancellation_token=token,
+            )
+
+        try:
+            async with asyncio.timeout(timeout_s + QUERY_GRACE_S):
+                await workers.run(ask, timeout_s, lambda _: None)
+                await collector.done.wait()
+        except zenoh.ZError as error:
+            raise SessionError(f"{key}: cannot ask: {error}") from error
+        except TimeoutError:
+            if not collector.items:
+                raise _no_answer(key, timeout_s) from None
+        finally:
+            if not collector.done.is_set():
+                # waits for a callback that is running, so not here
+                workers.submit(token.cancel)
+        return _answers(key, collector.items, timeout_s)
+
+    async def declare_token(self, key: str) -> Declaration:
+        """Show a token."""
+        return await self._declare(lambda: self._session.liveliness().declare_token(key), lambda: None)
+
+    async def watch_tokens(self, key: str, on_token: OnToken) -> Declaration:
+        """Learn of tokens."""
+        changes = TokenChanges(self._loop, on_token)
+
+        def take(sample: zenoh.Sample) -> None:
+            changes.offer(str(sample.key_expr), alive=sample.kind == zenoh.SampleKind.PUT)
+
+        return await self._declare(
+            lambda: self._session.liveliness().declare_subscriber(key, Callback(take, indirect=False), history=True),
+            changes.close,
+        )
+
+    async def close(self) -> None:
+        """Refuse what was not begun, send the answers there are, leave; what Zenoh cannot finish is left to itself."""
+        if self._closed:
+            return
+        self._closed = True
+        for declared in self._declared:
+            declared.stop()
+        closer = Workers("zenoh close", 1)
+        try:
+            await self._workers.stop(DRAIN_TIME_S / 2)
+            await self._urgent_workers.stop(DRAIN_TIME_S / 2)
+        finally:
+            try:
+                await closer.run(self._session.close, CLOSE_TIME_S, lambda _: None)
+            except (TimeoutError, zenoh.ZError) as error:
+                log.warning("left the network without a goodbye", reason=str(error) or "a peer takes nothing")
+            finally:
+                self._declared.clear()
+                await closer.stop(DRAIN_TIME_S / 10)
+
+    async def _declare(self, make: Callable[[], _Undeclarable], stop: Callable[[], object]) -> Declaration:
+        self._must_be_open()
+        try:
+            entity = await self._workers.run(make, DECLARE_TIME_S, lambda late: late.undeclare())
+        except zenoh.ZError as error:
+            raise SessionError(f"cannot declare: {error}") from error
+        except TimeoutError:
+            raise SessionError(f"cannot declare within {DECLARE_TIME_S:g} s: a peer takes nothing") from None
+        self._declared.append(declared := _Declared(entity, stop))
+        return Declaration(partial(self._undeclare, declared))
+
+    async def _undeclare(self, declared: _Declared) -> None:
+        """Take a declaration back, then stop its callback: what arrives in between is still served."""
+        if self._closed:
+            return
+        self._declared.remove(declared)
+        try:
+            await self._workers.run(declared.entity.undeclare, DECLARE_TIME_S, lambda _: None)
+        except (TimeoutError, zenoh.ZError) as error:
+            log.warning("declaration not taken back", reason=str(error) or "a peer takes nothing")
+        finally:
+            declared.stop()
+
+    def _new_outlet(self, key: str, qos: Qos) -> _Outlet:
+        outlet = self._outlets[key] = _Outlet(qos)
+
+        def declare() -> None:
+            try:
+                outlet.publisher = self._session.declare_publisher(key, **_TRAVEL[qos])
+            except zenoh.ZError as error:
+                log.debug("publisher not declared", key=key, reason=str(error))
+
+        self._workers.submit(declare)
+        return outlet
+
+    def _must_be_open(self) -> None:
+        if self._closed:
+            raise SessionError("the session is closed")
+
+
+@dataclass(frozen=True, slots=True)
+class _AnswerPath:
+    """The way of the answers to one query: from the loop to a worker, and from there to Zenoh."""
+
+    asked: zenoh.Query
+    workers: Workers
+    stamp_id: zenoh.TimestampId
+    on_gone: Callable[[], None]
+
+    def send(self, answers: tuple[Answer, ...]) -> None:
+        self.workers.submit(partial(self._answer, answers))
+
+    def _answer(self, answers: tuple[Answer, ...]) -> None:
+        """Answer and end the query; takes as long as the client needs to read, until Zenoh closes its link."""
+        asked = self.asked
+        try:
+            for answer in answers:
+                if answer.is_error:
+                    asked.reply_err(answer.payload, encoding=answer.encoding)
+                else:
+                    stamp = _stamp(answer.measured_at_ns, self.stamp_id)
+                    asked.reply(answer.key, answer.payload, encoding=answer.encoding, timestamp=stamp)
+            asked.drop()  # type: ignore[no-untyped-call] # the stub leaves its result open
+        except zenoh.ZError as error:
+            log.warning("answer lost", reason=str(error))
+        finally:
+            self.on_gone()
+
+
+def _sample(sample: zenoh.Sample) -> Sample:
+    put = sample.kind == zenoh.SampleKind.PUT
+    return Sample(
+        key=str(sample.key_expr),
+        payload=sample.payload.to_bytes(),
+        encoding=str(sample.encoding) if put else "",
+        kind=SampleKind.PUT if put else SampleKind.DELETE,
+        measured_at_ns=_stamped_ns(sample.timestamp),
+    )
+
+
+def _answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> list[Answer]:
+    answers: list[Answer] = []
+    for reply in replies:
+        if (sample := reply.ok) is not None:
+            stamp = _stamped_ns(sample.timestamp)
+            answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), stamp))
+        elif (error := reply.err) is not None:
+            answers.append(Answer(key, error.payload.to_bytes(), str(error.encoding), is_error=True))
+    # Zenoh itself says so, in the place of whoever did not answer
+    arrived = [answer for answer in answers if not (answer.is_error and answer.payload == b"Timeout")]
+    if len(arrived) < len(answers) and not arrived:
+        raise _no_answer(key, timeout_s)
+    return arrived
+
+
+def _no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
+    return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
+
+
+def _stamp(at_ns: int | None, stamp_id: zenoh.TimestampId) -> zenoh.Timestamp | None:
+    """Return Zenoh's timestamp of an instant; exact, its resolution is a quarter of a nanosecond."""
+    return None if at_ns is None else zenoh.Timestamp(zenoh.NTP64(*divmod(at_ns, 10**9)), stamp_id)
+
+
+def _stamped_ns(timestamp: zenoh.Timestamp | None) -> int | None:
+    return None if timestamp is None else timestamp.get_time_as_ntp64().as_nanos()

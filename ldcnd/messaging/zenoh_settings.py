@@ -1,0 +1,62 @@
+"""Settings of a Zenoh session, as paths into Zenoh's configuration; knows no zenoh.
+
+Zenoh's own defaults are not fit for hardware: it listens on every interface, scouts by multicast and shares memory.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+LEASE_MS = 2000
+"""The others learn within this time that this process has frozen or that its cable was pulled."""
+
+RETRY_MS = (100, 1000)
+"""Whoever is late or lost is looked for after the first of these times, then less often, but as often as the second."""
+
+WAIT_BEFORE_CLOSE_US = 200_000
+"""A peer that takes nothing for so long, while something waits that may not be dropped, loses its link."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohSettings:
+    """How to join the network. Nothing is scouted for: one listens, others connect.
+
+    Attributes:
+        listen: endpoints to listen on, such as `tcp/127.0.0.1:7447`; none means not to listen.
+        connect: endpoints to connect to; a peer keeps trying in the background, a client fails at once.
+        mode: peers serve clients without any router; clients talk to one peer or router; None leaves it to the file.
+        config_file: a Zenoh configuration to start from, for TLS and access control; its endpoints count when none are
+            given here, and scouting is off unless it says otherwise. Relative file names in it count from its folder.
+        instance: names this program to those who look at the network.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    mode: Literal["peer", "client"] | None = "peer"
+    config_file: Path | None = None
+    instance: str = "ldcnd"
+
+    def required(self) -> dict[str, object]:
+        """Return what holds whatever the configuration file says."""
+        return {
+            **({"mode": self.mode} if self.mode else {}),
+            "listen/exit_on_failure": True,
+            "connect/retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]},
+            "metadata": {"name": self.instance},
+            # every sample carries when it was true
+            "timestamping/enabled": True,
+            # a receiver that stalls loses queries in it, and opening it needs mlock
+            "transport/shared_memory/enabled": False,
+            "transport/link/tx/lease": LEASE_MS,
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE_US,
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        }
+
+    def optional(self) -> dict[str, object]:
+        """Return what a configuration file may state otherwise, where it is false or empty here."""
+        return {
+            "listen/endpoints": self.listen,
+            "connect/endpoints": self.connect,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+        }
