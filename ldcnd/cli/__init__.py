@@ -1,0 +1,1 @@
+"""The `ldcnd` command: one module per noun."""

@@ -1,0 +1,105 @@
+"""How commands find a running daemon: Zenoh's usual flags, a session, a rig."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import TypeVar
+
+import click
+
+from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.errors import SessionError, UnknownAxis
+from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.model.frozen import Frozen
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+ResultT = TypeVar("ResultT")
+CommandT = TypeVar("CommandT", bound=Callable[..., object])
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Where to look for the daemon.
+
+    Attributes:
+        connect: endpoints to connect to.
+        listen: endpoints to listen on.
+        config: a Zenoh configuration file to start from.
+        rig: which rig; None when only one can be reached.
+        as_json: print JSON lines instead of text.
+    """
+
+    connect: tuple[str, ...]
+    listen: tuple[str, ...]
+    config: Path | None
+    rig: str | None
+    as_json: bool
+
+    def run(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> ResultT:
+        """Open a session, find the rig, do the work, and close."""
+
+        async def within() -> ResultT:
+            async with self._client() as client:
+                return await work(client)
+
+        return asyncio.run(within())
+
+    def show(self, model: Frozen, text: str) -> None:
+        """Print one result."""
+        print(model.model_dump_json() if self.as_json else text, flush=True)
+
+    @asynccontextmanager
+    async def _client(self) -> AsyncIterator[RigClient]:
+        endpoints = self.connect or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))
+        settings = ZenohSettings(
+            mode="client" if endpoints else None if self.config else "peer",
+            connect=endpoints,
+            listen=self.listen,
+            config_file=self.config,
+        )
+        async with open_zenoh_session(settings) as session:
+            rig = self.rig
+            if rig is None:
+                rigs = [daemon.rig for daemon in await find_rigs(session)]
+                if not rigs:
+                    raise SessionError(
+                        f"no daemon answers at {', '.join(endpoints) or 'the configured endpoints'}",
+                        remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role"
+                        " sees none either",
+                    )
+                if len(rigs) > 1:
+                    raise UnknownAxis(
+                        f"there are several rigs: {', '.join(sorted(rigs))}", remedy="choose one with --rig"
+                    )
+                rig = rigs[0]
+            yield RigClient(session, rig)
+
+
+def _target_options(command: CommandT) -> CommandT:
+    """Give a command the options that make a `Target`."""
+    for option in (
+        click.option("--json", "as_json", is_flag=True, help="Print JSON lines."),
+        click.option("--rig", help="Which rig, when several can be reached."),
+        click.option("--config", type=click.Path(path_type=Path), help="Zenoh configuration file to start from."),
+        click.option("--listen", "-l", multiple=True, help="Zenoh endpoint to listen on; may be repeated."),
+        click.option("--connect", "-e", multiple=True, help=f"Zenoh endpoint of the daemon [{DEFAULT_ENDPOINT}]."),
+    ):
+        command = option(command)
+    return command
+
+
+def with_target(work: Callable[..., None]) -> Callable[..., None]:
+    """Give a command its options for finding the daemon, as one `Target` in front of its own arguments."""
+
+    @_target_options
+    @wraps(work)
+    def command(**options: object) -> None:
+        # click has converted the five options to the types of the fields
+        target = Target(**{name: options.pop(name) for name in Target.__slots__})  # type: ignore[arg-type]
+        work(target, **options)
+
+    return command

@@ -1,0 +1,78 @@
+"""`ldcnd doctor`: examine a line before a daemon uses it; opens the port itself and only reads."""
+
+import asyncio
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus_config import BusConfig
+from ldcnd.config import RigConfig, load_config
+from ldcnd.daemon.smartstep_line import build_line
+from ldcnd.drivers.smartstep.axis import SmartStepAxis
+from ldcnd.drivers.smartstep.commissioning import examine
+from ldcnd.errors import BusDown, ConfigError
+from ldcnd.model.findings import Finding, Verdict
+
+OPEN_TIME_S = 5.0
+
+
+@click.group()
+def command() -> None:
+    """Examine a line by reading only; no daemon may use it meanwhile."""
+
+
+@command.command()
+@click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
+@click.option("--bus", "name", required=True, help="The line to examine.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
+def smartstep(config: Path, name: str, *, as_json: bool) -> None:
+    """Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."""
+    rig = load_config(config)
+    settings = next((bus for bus in rig.bus if bus.name == name and bus.family == "smartstep"), None)
+    if settings is None:
+        raise ConfigError(f"{config}: no smartstep line {name!r}")
+    wrong = False
+
+    def show(finding: Finding) -> None:
+        nonlocal wrong
+        wrong = wrong or finding.verdict is Verdict.WRONG
+        doubt = f"  [{finding.settles}]" if finding.settles else ""
+        text = f"{finding.axis:8} {finding.verdict:5} {finding.what:16} {finding.text}{doubt}"
+        print(finding.model_dump_json() if as_json else text, flush=True)
+
+    asyncio.run(examine_line(rig, settings, show))
+    sys.exit(1 if wrong else 0)
+
+
+async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None]) -> None:
+    """Open a line, examine every configured drive on it, and close it.
+
+    Raises:
+        BusDown: the port does not open.
+    """
+    bus, network = build_line(rig, settings, None, {})
+    bus.resync = network.resync
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name=f"bus {settings.name}")
+        try:
+            await _opened(bus, settings)
+            for axis in network.axes.values():
+                if isinstance(axis, SmartStepAxis):
+                    async for finding in examine(bus, axis):
+                        show(finding)
+        finally:
+            owner.cancel()
+
+
+async def _opened(bus: Bus, settings: BusConfig) -> None:
+    try:
+        async with asyncio.timeout(OPEN_TIME_S):
+            await bus.wait_opened()
+    except TimeoutError:
+        raise BusDown(
+            f"bus {settings.name}: {settings.port} did not open within {OPEN_TIME_S:g} s",
+            remedy="end the daemon that has it, or correct the port",
+        ) from None

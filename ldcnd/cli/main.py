@@ -1,0 +1,87 @@
+"""The entry point: finds the subcommand's module only when it is called, so that help and completion stay quick."""
+
+import importlib
+import sys
+from typing import NoReturn
+
+import click
+
+from ldcnd.errors import ConfigError, LdcndError, SessionError
+
+EXIT_FAILED = 1
+"""The daemon refused, or something failed; the message says what."""
+EXIT_UNREACHABLE = 3
+"""No daemon answered."""
+EXIT_CONFIG = 78
+"""The configuration cannot work (EX_CONFIG)."""
+
+COMMANDS = {
+    "run": ("ldcnd.cli.run", "Run the daemon."),
+    "check-config": ("ldcnd.cli.check_config", "Validate a configuration without opening anything."),
+    "plan": ("ldcnd.cli.plan", "Show what the lines of a configuration promise, before any hardware is there."),
+    "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
+    "axis": ("ldcnd.cli.axis", "List, watch, move, stop and home axes of a running daemon."),
+    "why": ("ldcnd.cli.why", "Tell why an axis cannot move, and what would clear that."),
+    "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
+    "drill": ("ldcnd.cli.drill", "Rehearse what happens when somebody disappears."),
+    "bus": ("ldcnd.cli.bus", "Look at the lines of a running daemon."),
+    "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),
+    "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),
+    "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
+    "trace": ("ldcnd.cli.trace", "Record an axis against time, look at the result, draw it."),
+    "doctor": ("ldcnd.cli.doctor", "Examine a line by reading only, before a daemon uses it."),
+    "pki": ("ldcnd.cli.pki", "Make certificates and access rules for a network with mutual TLS."),
+    "schema": ("ldcnd.cli.schema", "Write or check the JSON Schemas of the public models."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose commands are imported when they are used."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """Return the names in the order of the table."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Import the command's module and return its `command`."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(COMMANDS[cmd_name][0])
+        command = module.command
+        if not isinstance(command, click.Command):
+            raise TypeError(f"{module.__name__}.command is not a command")
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="ldcnd")
+def cli() -> None:
+    """Own RS-485 servo lines and expose their drives over Zenoh.
+
+    Exit codes: 0 done; 1 refused or failed; 2 wrong usage; 3 no daemon answers; 78 wrong configuration.
+    """
+
+
+def main() -> NoReturn:
+    """Run the command line and exit with a documented code."""
+    try:
+        cli.main(standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        sys.exit(130)
+    except ConfigError as error:
+        print(error.message, file=sys.stderr)
+        sys.exit(EXIT_CONFIG)
+    except LdcndError as error:
+        print(f"{error.message} [{error.code}]", file=sys.stderr)
+        if error.remedy:
+            print(f"  {error.remedy}", file=sys.stderr)
+        sys.exit(EXIT_UNREACHABLE if isinstance(error, SessionError) else EXIT_FAILED)
+    sys.exit(0)

@@ -1,0 +1,51 @@
+"""`ldcnd metrics`: the health of a running daemon for Prometheus, from a process of its own."""
+
+import asyncio
+import signal
+
+import click
+
+from ldcnd.cli.connection import Target, with_target
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import ConfigError
+
+DEFAULT_ADDRESS = "127.0.0.1:9464"
+
+
+@click.command()
+@click.option("--address", default=DEFAULT_ADDRESS, show_default=True, help="Where to serve HTTP, as HOST:PORT.")
+@with_target
+def command(target: Target, address: str) -> None:
+    """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for whoever reads them."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        raise click.BadParameter(f"{address!r} is not HOST:PORT", param_hint="--address")
+    target.run(lambda client: _serve(client, host.strip("[]"), int(port)))
+
+
+async def _serve(client: RigClient, host: str, port: int) -> None:
+    try:
+        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415 - an optional package
+
+        from ldcnd.metrics.exposition import HealthCollector  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError("prometheus-client is not installed", remedy="install ldcnd[metrics]") from error
+    loop = asyncio.get_running_loop()
+    collector = HealthCollector(client.rig, loop.time)
+    registry = CollectorRegistry()
+    registry.register(collector)
+    ending = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ending.set)
+    async with client.health(collector.take):
+        try:
+            server, thread = start_http_server(port, host, registry)
+        except OSError as error:
+            raise ConfigError(f"cannot serve on {host}:{port}: {error.strerror}", value=port) from error
+        click.echo(f"metrics on http://{host}:{server.server_port}/metrics")
+        try:
+            await ending.wait()
+        finally:
+            server.shutdown()
+            server.server_close()
+            thread.join()

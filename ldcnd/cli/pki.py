@@ -1,0 +1,74 @@
+"""`ldcnd pki`: certificates and roles for a network with mutual TLS."""
+
+import datetime as dt
+from pathlib import Path
+
+import click
+
+from ldcnd.pki.access import Role
+
+try:
+    from ldcnd.pki.site import Site, new_login, set_up
+except ModuleNotFoundError as error:
+    if error.name is None or not error.name.startswith("cryptography"):
+        raise
+    raise click.ClickException("certificates need another library: pip install 'ldcnd[pki]'") from None
+
+FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+DAYS = 730
+
+
+@click.group()
+def command() -> None:
+    """Make certificates for mutual TLS, and the access rules that go with them.
+
+    FOLDER belongs to one site. Keep it on one machine: whoever has ca.key can make operators.
+    """
+
+
+@command.command()
+@FOLDER
+@click.option("--name", default="ldcnd site", show_default=True, help="Common name of the authority.")
+def init(folder: Path, name: str) -> None:
+    """Make the site's authority in FOLDER."""
+    set_up(folder, name, _now())
+    click.echo(f"{folder}: authority made; next: ldcnd pki add {folder} NAME --role daemon --ip ADDRESS")
+
+
+@command.command()
+@FOLDER
+@click.argument("name")
+@click.option("--role", type=click.Choice([role.value for role in Role]), required=True, help="What it may do.")
+@click.option("--host", "hosts", multiple=True, help="Host name at which clients find a daemon; may be repeated.")
+@click.option("--ip", "addresses", multiple=True, help="The same, an IP address.")
+@click.option("--days", type=click.IntRange(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
+def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
+    """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
+    login = new_login(name, Role(role), (*hosts, *addresses))
+    site = Site(folder)
+    file = site.add(login, _now(), days)
+    if login.role is Role.DAEMON:
+        click.echo(f'{file}: in the rig\'s configuration, [zenoh] config_file = "{file.resolve()}"')
+    else:
+        click.echo(f"{file}: hand it over on a safe way; use it as --config {file.name}")
+        _say_restart(site.daemon_files())
+
+
+@command.command()
+@FOLDER
+@click.argument("name")
+def revoke(folder: Path, name: str) -> None:
+    """Take the rights of a viewer or operator back."""
+    site = Site(folder)
+    site.revoke(name)
+    click.echo(f"{name}: revoked")
+    _say_restart(site.daemon_files())
+
+
+def _say_restart(files: tuple[Path, ...]) -> None:
+    for file in files:
+        click.echo(f"restart the daemon of {file}: rules are read at its start")
+
+
+def _now() -> dt.datetime:
+    return dt.datetime.now(dt.UTC)

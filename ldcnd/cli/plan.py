@@ -1,0 +1,52 @@
+"""`ldcnd plan`: what the lines of a configuration promise, before any hardware is there."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from ldcnd.config import load_config
+from ldcnd.daemon.planning import plan_rig
+from ldcnd.model.plan import BusPlan
+
+EXIT_OVERFULL = 1
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
+def command(config: Path, *, as_json: bool) -> None:
+    """Show how much of each line CONFIG uses and how late polls and stops can be; exits with 1 when it cannot hold."""
+    plan = plan_rig(load_config(config))
+    if as_json:
+        print(plan.model_dump_json())
+    else:
+        print("\n\n".join(_table(bus) for bus in plan.buses))
+    if not plan.holds:
+        sys.exit(EXIT_OVERFULL)
+
+
+def _table(bus: BusPlan) -> str:
+    lines = [
+        f"bus {bus.bus}, {bus.baud} baud (drives: {bus.node_baud:.0f}): {'holds' if bus.holds else 'CANNOT HOLD'}",
+        f"  load         {bus.load:6.1%} at worst, {bus.mean_load:.1%} on average",
+        f"  commands     {bus.commands_per_s:6.0f} /s before a poll misses its turn",
+        f"  stop         {_ms(bus.stop_wait_s)} to its first bit, {_ms(bus.stop_s)} to the drive's answer",
+        f"               {_ms(bus.stop_after_loss_s)} to the answer after a lost reply",
+        f"  assumed      {_ms(bus.turnaround_s)} host, {_ms(bus.adapter_latency_s)} adapter, for each exchange",
+        f"  {'axis':12} {'item':10} {'rate':>8} {'bytes':>7} {'on line':>10} {'read within':>12}",
+    ]
+    for poll in bus.polls:
+        size = f"{poll.request_bytes}/{poll.reply_bytes}"
+        lines += [
+            f"  {poll.axis:12} {item.item:10} {item.rate_hz:5g} Hz {size:>7} {_ms(poll.longest_s):>10}"
+            f" {_ms(item.response_s):>12}{'' if poll.holds else '  late'}"
+            for item in poll.items
+        ]
+    if bus.remedies:
+        lines += ["  would hold with any of:", *(f"    {remedy}" for remedy in bus.remedies)]
+    return "\n".join(lines)
+
+
+def _ms(seconds: float | None) -> str:
+    return "unbounded" if seconds is None else f"{seconds * 1e3:.2f} ms"

@@ -1,0 +1,63 @@
+"""`ldcnd run`: the daemon in the foreground."""
+
+import asyncio
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from ldcnd.config import RigConfig, load_config
+from ldcnd.daemon.assembly import open_daemon
+from ldcnd.daemon.planning import require_plan
+from ldcnd.daemon.process import held_awake, loop_factory, settle_heap
+from ldcnd.daemon.service import Service
+from ldcnd.daemon.systemd import Notifier
+from ldcnd.log import configure_logging, get_logger
+
+log = get_logger("run")
+
+
+@click.command()
+@click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
+@click.option("--listen", "-l", multiple=True, help="Listen here instead of the configured endpoints; may be repeated.")
+@click.option("--connect", "-e", multiple=True, help="Connect here too; may be repeated.")
+@click.option("--log-json", is_flag=True, help="Log JSON lines instead of text.")
+@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="info")
+def command(config: Path, listen: tuple[str, ...], connect: tuple[str, ...], *, log_json: bool, log_level: str) -> None:
+    """Own the lines of a rig and serve its drives until SIGTERM or SIGINT; moving axes are stopped first.
+
+    SIGHUP reads CONFIG again: limits, default speeds and rates change at once, the log names what needs a restart.
+    """
+    configure_logging(json=log_json, level=log_level)
+
+    def load() -> RigConfig:
+        rig = load_config(config)
+        require_plan(rig)
+        zenoh = rig.zenoh.model_copy(
+            update={"listen": listen or rig.zenoh.listen, "connect": (*rig.zenoh.connect, *connect)}
+        )
+        return rig.model_copy(update={"zenoh": zenoh})
+
+    rig = load()
+    with (
+        held_awake(wanted=rig.daemon.hold_cpu_awake),
+        asyncio.Runner(loop_factory=loop_factory(uvloop=rig.daemon.uvloop)) as runner,
+    ):
+        runner.run(serve(rig, load))
+
+
+async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
+    """Serve one rig until a signal asks to end; SIGHUP has its configuration read again."""
+    async with open_daemon(rig) as daemon:
+        service = Service(daemon, Notifier(), load)
+        handlers = {signal.SIGTERM: service.end, signal.SIGINT: service.end, signal.SIGHUP: service.reload}
+        loop = asyncio.get_running_loop()
+        for number, handler in handlers.items():
+            loop.add_signal_handler(number, handler)
+        settle_heap()
+        try:
+            await service.run()
+        finally:
+            for number in handlers:
+                loop.remove_signal_handler(number)

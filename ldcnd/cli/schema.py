@@ -1,0 +1,70 @@
+"""`ldcnd schema`: the generated files in `schemas/`."""
+
+from pathlib import Path
+
+import click
+
+from ldcnd.config_reference import config_reference
+from ldcnd.daemon.asyncapi import asyncapi_text
+from ldcnd.daemon.contract import as_markdown
+from ldcnd.errors import ConfigError
+from ldcnd.model.schemas import all_schemas
+
+
+@click.group()
+def command() -> None:
+    """Write or check the JSON Schemas of the public models."""
+
+
+@command.command()
+@click.argument("folder", type=click.Path(path_type=Path), default=Path("schemas"))
+def write(folder: Path) -> None:
+    """Write all schemas into FOLDER, removing those of models that are gone."""
+    folder.mkdir(exist_ok=True)
+    schemas = all_schemas()
+    for name, text in schemas.items():
+        (folder / f"{name}.json").write_text(text, encoding="utf-8")
+    for path in folder.glob("*.json"):
+        if path.stem not in schemas:
+            path.unlink()
+    click.echo(f"{len(schemas)} schemas in {folder}")
+
+
+@command.command()
+@click.argument("folder", type=click.Path(path_type=Path), default=Path("schemas"))
+def check(folder: Path) -> None:
+    """Fail when FOLDER differs from what the models say."""
+    schemas = all_schemas()
+    on_disk = {path.stem: path.read_text(encoding="utf-8") for path in folder.glob("*.json")}
+    differing = sorted(name for name in schemas.keys() | on_disk.keys() if schemas.get(name) != on_disk.get(name))
+    if differing:
+        raise ConfigError(f"{folder} differs from the models in: {', '.join(differing)}; run `ldcnd schema write`")
+    click.echo(f"{len(schemas)} schemas in {folder} are up to date")
+
+
+@command.command()
+@click.argument("page", type=click.Path(path_type=Path), default=Path("docs/reference/configuration.md"))
+def configuration(page: Path) -> None:
+    """Write the reference of the configuration file to PAGE."""
+    page.write_text(config_reference(), encoding="utf-8")
+    click.echo(str(page))
+
+
+@command.command()
+def asyncapi() -> None:
+    """Print the interface as an AsyncAPI 3 document (JSON)."""
+    click.echo(asyncapi_text(), nl=False)
+
+
+@command.command()
+@click.argument("page", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=False)
+def keys(page: Path | None) -> None:
+    """Print all keys as a Markdown table, or renew the table at the end of PAGE (docs/reference/keys.md)."""
+    table = as_markdown()
+    if page is None:
+        click.echo(table, nl=False)
+        return
+    before, found, _ = page.read_text(encoding="utf-8").partition(table.partition("\n")[0])
+    if not found:
+        raise ConfigError(f"{page}: has no table of keys")
+    page.write_text(before + table, encoding="utf-8")

@@ -1,0 +1,175 @@
+"""`ldcnd trace`: record an axis against time, look at the result, draw it."""
+
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.trace_file import column_title, load_trace, require_suffix, save_trace
+from ldcnd.cli.trace_plot import plot_trace
+from ldcnd.client.rig_client import RigClient
+from ldcnd.client.traces import Trace, arm_trace, fetch_trace, wait_for_trace
+from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
+from ldcnd.model.traces import LONGEST_WAIT_S, MOST_SAMPLES, TraceChannel, TraceReply, TraceTrigger, TriggerKind
+
+UPLOAD_S = 600.0
+"""A drive's memory over a busy line takes minutes at worst."""
+ABORT_S = 10.0
+FASTEST = "fastest"
+
+
+def _interval(_context: click.Context, _parameter: click.Parameter, value: str) -> float | str:
+    if value == FASTEST:
+        return FASTEST
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = 0.0
+    if not 0.0 < seconds < float("inf"):
+        raise click.BadParameter(f"{value!r} is neither seconds nor {FASTEST!r}")
+    return seconds
+
+
+def _trigger(_context: click.Context, _parameter: click.Parameter, value: str | None) -> TraceTrigger | None:
+    """Return a trigger that is given as CHANNEL:KIND or CHANNEL:KIND:LEVEL."""
+    if value is None:
+        return None
+    channel, _, rest = value.partition(":")
+    kind, _, level = rest.partition(":")
+    try:
+        return TraceTrigger(channel=channel, kind=TriggerKind(kind), level=float(level or 0.0))
+    except ValueError:
+        kinds = ", ".join(TriggerKind)
+        raise click.BadParameter(f"{value!r} is not CHANNEL:KIND:LEVEL with one of {kinds}") from None
+
+
+def _file(_context: click.Context, _parameter: click.Parameter, value: Path | None) -> Path | None:
+    return require_suffix(value) if value else None
+
+
+out_option = click.option(
+    "--out", type=click.Path(path_type=Path), callback=_file, help="Write the trace to FILE.csv or FILE.json."
+)
+
+
+@click.group()
+def command() -> None:
+    """Record an axis against time, and look at what was recorded."""
+
+
+@command.command()
+@click.argument("axis")
+@click.option("--channel", "-c", "channels", multiple=True, required=True, help="What to record; may be repeated.")
+@click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
+@click.option("--samples", type=click.IntRange(2, MOST_SAMPLES), default=500, help="How many samples [500].")
+@click.option("--pre", type=click.IntRange(0), default=0, help="So many of them before the trigger [0].")
+@click.option("--trigger", callback=_trigger, help="CHANNEL:KIND:LEVEL; kinds: rising, falling, either, above, below.")
+@click.option("--timeout", type=click.FloatRange(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")
+@out_option
+@with_target
+def take(
+    target: Target,
+    axis: str,
+    *,
+    channels: tuple[str, ...],
+    interval: float | str,
+    samples: int,
+    pre: int,
+    trigger: TraceTrigger | None,
+    timeout: float,
+    out: Path | None,
+) -> None:
+    """Record channels of AXIS; what it has is in `ldcnd axis list --json`."""
+    request = TraceRequest(
+        channels=channels,
+        interval_s=FASTEST if isinstance(interval, str) else interval,
+        samples=samples,
+        pre_trigger=pre,
+        trigger=trigger,
+        timeout_s=timeout,
+    )
+
+    async def work(client: RigClient) -> Trace:
+        reply = await arm_trace(client, axis, request)
+        print(_granted(reply), file=sys.stderr)
+        within_s = timeout + 2 * reply.interval_s * reply.samples + UPLOAD_S
+        await wait_for_trace(client, axis, reply.trace_id, within_s)
+        return await fetch_trace(client, axis, reply.trace_id)
+
+    _deliver(target, target.run(work), out)
+
+
+@command.command()
+@click.argument("axis")
+@out_option
+@with_target
+def last(target: Target, axis: str, out: Path | None) -> None:
+    """Fetch the last trace of AXIS, whoever took it."""
+    _deliver(target, target.run(lambda client: fetch_trace(client, axis)), out)
+
+
+@command.command()
+@click.argument("axis")
+@with_target
+def abort(target: Target, axis: str) -> None:
+    """End the trace of AXIS that is under way, or one that was left armed in its drive."""
+    reply = target.run(lambda client: client.command(axis, Verb.TRACE_ABORT, TraceAbortRequest(), ABORT_S))
+    target.show(reply, f"{axis}: trace ended")
+
+
+@command.command()
+@click.argument("file", type=click.Path(path_type=Path))
+def show(file: Path) -> None:
+    """Tell what is in FILE."""
+    print("\n".join(_summary(load_trace(file))))
+
+
+@command.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--output", "-o", type=click.Path(path_type=Path), required=True, help="Picture to write, such as a PNG.")
+def plot(file: Path, output: Path) -> None:
+    """Draw FILE; needs the extra `plot`."""
+    plot_trace(load_trace(file), output)
+
+
+def _granted(reply: TraceReply) -> str:
+    pace = f"every {reply.interval_s * 1e3:g} ms" if reply.interval_s else "as fast as the line allows"
+    return f"trace {reply.trace_id}: {reply.samples} samples by the {reply.source}, {pace}"
+
+
+def _deliver(target: Target, trace: Trace, out: Path | None) -> None:
+    if out:
+        save_trace(trace, out)
+    target.show(trace.header, "\n".join(_summary(trace)))
+
+
+def _summary(trace: Trace) -> list[str]:
+    header, offsets = trace.header, trace.offsets_ns
+    taken = datetime.fromtimestamp(header.t / 1e9, UTC).isoformat(timespec="milliseconds")
+    lines = [
+        f"{header.axis}, trace {header.trace_id}: {len(offsets)} samples by the {header.source}",
+        f"time 0 is {taken}, give or take {header.t_error_ns / 1e6:.3f} ms",
+        f"from {offsets[0] / 1e6:.3f} ms to {offsets[-1] / 1e6:.3f} ms",
+    ]
+    if header.trigger and header.trigger_index is not None:
+        trigger = header.trigger
+        lines.append(f"trigger at sample {header.trigger_index}: {trigger.channel} {trigger.kind} {trigger.level:g}")
+    lines += [_extremes(channel, column) for channel, column in zip(header.channels, trace.values, strict=True)]
+    if header.drive:
+        lines.append(f"words taken as {header.drive.word_layout}, {header.drive.byte_order} byte first")
+        lines += [
+            f"assumed [{doubt.confidence}]: {doubt.question}"
+            for doubt in header.drive.assumptions
+            if doubt.standing == "assumed"
+        ]
+    if header.problem:
+        lines.append(f"doubtful: {header.problem}")
+    return lines
+
+
+def _extremes(channel: TraceChannel, column: tuple[float | None, ...]) -> str:
+    known = [value for value in column if value is not None]
+    title = column_title(channel.name, channel.unit)
+    return f"  {title}: {min(known):g} to {max(known):g}" if known else f"  {title}: not known"

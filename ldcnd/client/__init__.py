@@ -1,0 +1,1 @@
+"""Typed access to a running daemon; knows the contract, not the machine."""

@@ -1,0 +1,87 @@
+"""Control over axes for the time of a context: acquired, renewed by itself, released."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from itertools import count
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import LdcndError, LeaseExpired
+from ldcnd.model.authority import AcquireRequest, LeaseReply, LeaseRequest
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import Request, Verb
+
+RENEWALS_PER_LEASE = 4
+"""So many renewals may be lost before a lease ends."""
+
+
+class Control:
+    """A lease that this program holds.
+
+    Attributes:
+        lease: as acquired.
+        lost: why it does not hold any more; None while it does.
+    """
+
+    def __init__(self, client: RigClient, lease: LeaseReply) -> None:
+        self.lease = lease
+        self.lost: LdcndError | None = None
+        self._client = client
+        self._sequence = count(1)
+
+    async def command(self, axis: str, verb: Verb, request: Request, timeout_s: float = 5.0) -> CommandReply:
+        """Send one command under the lease; see `RigClient.command`.
+
+        Raises:
+            LeaseExpired: the lease was lost.
+            LdcndError: as the daemon refused it.
+        """
+        if self.lost:
+            raise LeaseExpired(f"control was lost: {self.lost.message}", axis=axis, remedy="acquire it again")
+        stamped = request.model_copy(update={"lease": self.lease.lease, "sequence": next(self._sequence)})
+        return await self._client.command(axis, verb, stamped, timeout_s)
+
+    async def keep(self) -> None:
+        """Renew until cancelled or until the daemon says that the lease has ended."""
+        while self.lost is None:
+            await asyncio.sleep(self.lease.lease_s / RENEWALS_PER_LEASE)
+            try:
+                await self._client.rig_command(
+                    "renew", LeaseRequest(lease=self.lease.lease), LeaseReply, self.lease.lease_s
+                )
+            except LeaseExpired as error:
+                self.lost = error
+            except LdcndError:
+                continue  # an answer was lost; the next renewal is due soon
+
+    async def release(self) -> None:
+        """Give control back; it may have been taken away meanwhile."""
+        with contextlib.suppress(LeaseExpired):
+            await self._client.rig_command("release", LeaseRequest(lease=self.lease.lease), LeaseReply)
+
+
+@contextlib.asynccontextmanager
+async def control(
+    client: RigClient, name: str, *axes: str, lease_s: float = 1.0, force: bool = False
+) -> AsyncIterator[Control]:
+    """Hold control over axes (all, when none is named) until the context ends.
+
+    Args:
+        client: the rig.
+        name: who this is, for people.
+        axes: what to control.
+        lease_s: how soon the daemon shall act when this program disappears, 0.2 to 60 s.
+        force: take control away from whoever has it.
+
+    Raises:
+        LeaseHeld: somebody else controls one of the axes.
+    """
+    request = AcquireRequest(client=name, axes=axes, lease_s=lease_s, force=force)
+    held = Control(client, await client.rig_command("acquire", request, LeaseReply))
+    async with asyncio.TaskGroup() as group:
+        keeper = group.create_task(held.keep(), name=f"lease of {name}")
+        try:
+            yield held
+        finally:
+            keeper.cancel()
+            await held.release()

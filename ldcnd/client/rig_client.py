@@ -1,0 +1,258 @@
+"""One rig as a program sees it: what it is, what it says, what it does."""
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TypeVar
+
+from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
+from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
+from ldcnd.messaging.keys import RIG_ITSELF, ROOT, Keys
+from ldcnd.messaging.session import Answer, Sample, SampleKind, Session
+from ldcnd.model.axes import AxisInfo, LinkState
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.model.meta import BusInfo, DaemonInfo
+from ldcnd.model.monitors import MonitorName, MonitorSample
+from ldcnd.model.preview import PlanReply, PlanRequest
+from ldcnd.model.replies import CommandReply, StopReply
+from ldcnd.model.requests import REPLY_MODELS, Request, Verb
+from ldcnd.model.samples import SAMPLE_MODELS, StateSample, TelemetryItem
+from ldcnd.model.samples import Sample as Measurement
+from ldcnd.model.traces import TraceChunk, TraceHeader
+from ldcnd.model.why import WhyReply, WhyRequest
+
+ModelT = TypeVar("ModelT", bound=Frozen)
+
+NO_QUESTION = WhyRequest()
+ITEMS = frozenset(item.value for item in TelemetryItem)
+KEPT_SAMPLES = 256
+"""A watcher that is too slow keeps so many samples; the oldest give way."""
+
+
+class Samples:
+    """Telemetry of one rig as an endless iterator; drops the oldest when its reader is too slow.
+
+    Attributes:
+        dropped: how many samples the reader was too slow for.
+    """
+
+    def __init__(self, keys: Keys) -> None:
+        self.dropped = 0
+        self._keys = keys
+        self._kept: deque[tuple[str, Measurement]] = deque(maxlen=KEPT_SAMPLES)
+        self._ready = asyncio.Event()
+
+    def take(self, sample: Sample) -> None:
+        """Take a sample from the session."""
+        if sample.kind is SampleKind.DELETE:
+            return
+        address = self._keys.parse_telemetry(sample.key)
+        if address.item not in ITEMS:
+            return  # events, and what newer daemons publish
+        measurement = decode_received(SAMPLE_MODELS[TelemetryItem(address.item)], sample.payload, sample.encoding)
+        self.dropped += len(self._kept) == KEPT_SAMPLES
+        self._kept.append((address.axis, measurement))
+        self._ready.set()
+
+    def __aiter__(self) -> "Samples":
+        return self
+
+    async def __anext__(self) -> tuple[str, Measurement]:
+        """Return the axis and its next sample."""
+        while not self._kept:
+            self._ready.clear()
+            await self._ready.wait()
+        return self._kept.popleft()
+
+
+class RigClient:
+    """Asks and commands one rig over an open session."""
+
+    def __init__(self, session: Session, rig: str) -> None:
+        self.rig = rig
+        self._session = session
+        self._keys = Keys(rig)
+        self._instance: str | None = None
+
+    async def daemon(self) -> DaemonInfo:
+        """Return what the daemon says about itself.
+
+        Raises:
+            SessionError: no daemon serves this rig.
+        """
+        return self._one(await self._session.query(self._keys.daemon), DaemonInfo)
+
+    async def axes(self) -> list[AxisInfo]:
+        """Return all axes, in the order of their addresses."""
+        answers = await self._session.query(self._keys.axis_pattern)
+        axes = [self._decoded(answer, AxisInfo) for answer in answers]
+        return sorted(axes, key=lambda axis: (axis.bus, axis.address))
+
+    async def buses(self) -> list[BusInfo]:
+        """Return all lines."""
+        return [self._decoded(answer, BusInfo) for answer in await self._session.query(self._keys.bus_pattern)]
+
+    async def last(self, axis: str, item: TelemetryItem) -> Measurement | None:
+        """Return the last value of an item, or None when there is none yet."""
+        answers = await self._session.query(self._keys.telemetry(axis, item))
+        return self._decoded(answers[0], SAMPLE_MODELS[item]) if answers else None
+
+    async def monitors(self, axis: str) -> dict[MonitorName, MonitorSample]:
+        """Return the last value of every monitor that an axis publishes."""
+        answers = await self._session.query(self._keys.monitor(axis, "*"))
+        return {MonitorName(answer.key.rpartition("/")[2]): self._decoded(answer, MonitorSample) for answer in answers}
+
+    async def trace_header(self, axis: str) -> TraceHeader | None:
+        """Return how far an axis's last trace is, or None when there was none."""
+        answers = await self._session.query(self._keys.trace(axis))
+        return self._decoded(answers[0], TraceHeader) if answers else None
+
+    async def trace_chunk(self, axis: str, index: int) -> TraceChunk | None:
+        """Return samples of an axis's last trace, or None when it has no such chunk."""
+        answers = await self._session.query(self._keys.trace_chunk(axis, index))
+        return self._decoded(answers[0], TraceChunk) if answers else None
+
+    async def state(self, axis: str) -> StateSample | None:
+        """Return the axis's last state, or None when there is none yet."""
+        sample = await self.last(axis, TelemetryItem.STATE)
+        return sample if isinstance(sample, StateSample) else None
+
+    async def command(self, axis: str, verb: Verb, request: Request, timeout_s: float = 5.0) -> CommandReply:
+        """Send one command; returns once the drive has acknowledged it.
+
+        Raises:
+            LdcndError: as the daemon refused it, of the same class.
+            OutcomeUnknown: no answer came in time, or the daemon has disappeared; the command may be carried out all
+                the same.
+            SessionError: nobody serves this rig, or access control does not let this login command it.
+        """
+        if self._instance is None:
+            self._instance = (await self.daemon()).instance
+        meant = request if request.instance else request.model_copy(update={"instance": self._instance})
+        payload, encoding = encode(meant, Encoding.MSGPACK)
+        answers = await self._session.query(
+            self._keys.command(axis, verb), payload, encoding=encoding, timeout_s=timeout_s
+        )
+        if not answers:
+            raise await self._unanswered(f"axis {axis}: {verb}")
+        try:
+            return self._one(answers, REPLY_MODELS.get(verb, CommandReply))
+        except CommandExpired:
+            self._instance = None  # the daemon was restarted: this command is lost, the next one may be new
+            raise
+
+    async def rig_command(self, verb: str, request: Frozen, reply: type[ModelT], timeout_s: float = 5.0) -> ModelT:
+        """Ask the rig as a whole; see `RigDesk` for the verbs.
+
+        Raises:
+            LdcndError: as the daemon refused it, of the same class.
+        """
+        payload, encoding = encode(request, Encoding.MSGPACK)
+        key = self._keys.command(RIG_ITSELF, verb)
+        answers = await self._session.query(key, payload, encoding=encoding, timeout_s=timeout_s)
+        if not answers:
+            raise await self._unanswered(verb)
+        return self._one(answers, reply)
+
+    async def why(self, axis: str, request: WhyRequest = NO_QUESTION) -> WhyReply:
+        """Ask why a motion of an axis would be refused now, and what would clear that."""
+        payload, encoding = encode(request, Encoding.MSGPACK)
+        answers = await self._session.query(self._keys.command(axis, "why"), payload, encoding=encoding)
+        return self._one(answers, WhyReply)
+
+    async def plan(self, axis: str, request: PlanRequest) -> PlanReply:
+        """Ask what a motion would do; no effect."""
+        payload, encoding = encode(request, Encoding.MSGPACK)
+        answers = await self._session.query(self._keys.command(axis, "plan"), payload, encoding=encoding)
+        return self._one(answers, PlanReply)
+
+    async def stop(self, axis: str | None = None, timeout_s: float = 5.0) -> StopReply:
+        """Stop one axis, or the whole rig."""
+        answers = await self._session.query(self._keys.stop(axis), timeout_s=timeout_s, urgent=True)
+        return self._one(answers, StopReply)
+
+    @asynccontextmanager
+    async def samples(self, axis: str = "*", item: str = "*") -> AsyncIterator[Samples]:
+        """Subscribe to telemetry for the time of the context."""
+        samples = Samples(self._keys)
+        declaration = await self._session.subscribe(self._keys.telemetry_pattern(axis, item), samples.take)
+        try:
+            yield samples
+        finally:
+            await declaration.close()
+
+    @asynccontextmanager
+    async def published(self, take: Callable[[Sample], None]) -> AsyncIterator[None]:
+        """Hand all telemetry, events and health reports to `take`, as they come, for the time of the context."""
+        async with AsyncExitStack() as declared:
+            for key in (self._keys.all_telemetry, f"{self._keys.health}/**"):
+                declaration = await self._session.subscribe(key, take)
+                declared.push_async_callback(declaration.close)
+            yield
+
+    @asynccontextmanager
+    async def health(self, take: Callable[[DaemonHealth | BusHealth], None]) -> AsyncIterator[None]:
+        """Hand every health report to `take` for the time of the context."""
+
+        def decode(sample: Sample) -> None:
+            if sample.kind is SampleKind.DELETE:
+                return
+            if sample.key == self._keys.health:
+                take(decode_received(DaemonHealth, sample.payload, sample.encoding))
+            else:
+                take(decode_received(BusHealth, sample.payload, sample.encoding))
+
+        declaration = await self._session.subscribe(f"{self._keys.health}/**", decode)
+        try:
+            yield
+        finally:
+            await declaration.close()
+
+    async def wait_for_end(self, axis: str, command_id: str) -> StateSample:
+        """Wait until a command is not the axis's current one any more, and return the state after it.
+
+        Raises:
+            OutcomeUnknown: the drive stopped answering.
+        """
+        async with self.samples(axis, TelemetryItem.STATE) as states:
+            sample: Measurement | None = await self.state(axis)
+            while True:
+                if isinstance(sample, StateSample):
+                    if sample.link is LinkState.DOWN:
+                        raise OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
+                    if sample.command is None or sample.command.command_id != command_id:
+                        return sample
+                _, sample = await anext(states)
+
+    async def _unanswered(self, what: str) -> LdcndError:
+        """Return what it means that nobody answered a command: access control and absence look the same."""
+        try:
+            await self.daemon()
+        except SessionError:
+            return OutcomeUnknown(f"{what}: no answer, and no daemon serves rig {self.rig} now")
+        return SessionError(
+            f"{what}: the daemon of rig {self.rig} is there but did not get it; this login is not permitted to command",
+            remedy="use the login of an operator; right after a connection was lost, try again",
+        )
+
+    def _one(self, answers: list[Answer], model: type[ModelT]) -> ModelT:
+        if not answers:
+            raise SessionError(
+                f"nobody serves rig {self.rig}, or you are not permitted to ask",
+                remedy="check that the daemon runs and that you connect to it",
+            )
+        return self._decoded(answers[-1], model)
+
+    @staticmethod
+    def _decoded(answer: Answer, model: type[ModelT]) -> ModelT:
+        if answer.is_error:
+            raise decode_error(answer.payload, answer.encoding)
+        return decode_received(model, answer.payload, answer.encoding)
+
+
+async def find_rigs(session: Session) -> list[DaemonInfo]:
+    """Return the daemons that can be reached."""
+    answers = await session.query(f"{ROOT}/*/meta/daemon")
+    return [decode_received(DaemonInfo, answer.payload, answer.encoding) for answer in answers if not answer.is_error]

@@ -1,0 +1,121 @@
+"""Taking a trace and fetching it whole."""
+
+import asyncio
+from dataclasses import dataclass
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import DriveFault, InternalError, OutcomeUnknown, WrongState
+from ldcnd.model.requests import TraceRequest, Verb
+from ldcnd.model.traces import TraceChunk, TraceHeader, TracePhase, TraceReply
+
+LOOK_S = 0.1
+ARMING_S = 30.0
+"""A slow drive is told and asked some twenty words before its trace begins."""
+UNDER_WAY = frozenset({TracePhase.WAITING, TracePhase.RECORDING, TracePhase.UPLOADING})
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """A complete trace; columns are as long as `offsets_ns`.
+
+    Attributes:
+        header: what it is.
+        offsets_ns: when each sample was true, relative to the header's `t`.
+        values: a column for each of the header's channels.
+        raw: a column for each of the header's raw columns.
+    """
+
+    header: TraceHeader
+    offsets_ns: tuple[int, ...]
+    values: tuple[tuple[float | None, ...], ...]
+    raw: tuple[tuple[int | float | None, ...], ...]
+
+
+async def take_trace(client: RigClient, axis: str, request: TraceRequest, within_s: float) -> Trace:
+    """Arm a trace, wait for its end, and return it.
+
+    Args:
+        client: of the rig.
+        axis: to be traced.
+        request: what to record.
+        within_s: longest wait from its arming to its end.
+
+    Raises:
+        LdcndError: the daemon refused it.
+        DriveFault: it did not complete; says why.
+        OutcomeUnknown: it did not end in time, or gave way to another one; it may still be under way.
+    """
+    reply = await arm_trace(client, axis, request)
+    await wait_for_trace(client, axis, reply.trace_id, within_s)
+    return await fetch_trace(client, axis, reply.trace_id)
+
+
+async def arm_trace(client: RigClient, axis: str, request: TraceRequest) -> TraceReply:
+    """Arm a trace and return what it will be."""
+    reply = await client.command(axis, Verb.TRACE, request, ARMING_S)
+    if not isinstance(reply, TraceReply):
+        raise InternalError(f"trace was answered with {type(reply).__name__}")
+    return reply
+
+
+async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: float) -> TraceHeader:
+    """Wait for the end of a trace, good or bad.
+
+    Raises:
+        OutcomeUnknown: it did not end in time, or gave way to another one.
+    """
+    try:
+        async with asyncio.timeout(within_s):
+            while True:
+                header = await _header(client, axis, trace_id)
+                if header.phase not in UNDER_WAY:
+                    return header
+                await asyncio.sleep(LOOK_S)
+    except TimeoutError:
+        raise OutcomeUnknown(
+            f"axis {axis}: trace {trace_id} did not end within {within_s:g} s", axis=axis, remedy="send trace_abort"
+        ) from None
+
+
+async def fetch_trace(client: RigClient, axis: str, trace_id: str | None = None) -> Trace:
+    """Return a complete trace: the last one, which must be this one if an id is given.
+
+    Raises:
+        WrongState: there is none.
+        DriveFault: it did not complete; says why.
+        OutcomeUnknown: it gave way to another one.
+    """
+    header = await _header(client, axis, trace_id)
+    if header.phase is not TracePhase.COMPLETE:
+        raise DriveFault(
+            f"axis {axis}: trace {header.trace_id} is {header.phase.value}: {header.problem or 'it has no samples'}",
+            axis=axis,
+            value=header.phase.value,
+        )
+    chunks = [await _chunk(client, axis, header.trace_id, index) for index in range(header.chunks)]
+    return Trace(
+        header,
+        tuple(offset for chunk in chunks for offset in chunk.offsets_ns),
+        tuple(tuple(v for chunk in chunks for v in chunk.values[column]) for column in range(len(header.channels))),
+        tuple(tuple(v for chunk in chunks for v in chunk.raw[column]) for column in range(len(header.raw_columns))),
+    )
+
+
+async def _header(client: RigClient, axis: str, trace_id: str | None) -> TraceHeader:
+    header = await client.trace_header(axis)
+    if header is None:
+        raise WrongState(f"axis {axis}: there is no trace", axis=axis)
+    if trace_id not in (None, header.trace_id):
+        raise _replaced(axis, trace_id)
+    return header
+
+
+async def _chunk(client: RigClient, axis: str, trace_id: str, index: int) -> TraceChunk:
+    chunk = await client.trace_chunk(axis, index)
+    if chunk is None or chunk.trace_id != trace_id:
+        raise _replaced(axis, trace_id)
+    return chunk
+
+
+def _replaced(axis: str, trace_id: str | None) -> OutcomeUnknown:
+    return OutcomeUnknown(f"axis {axis}: trace {trace_id} gave way to another one", axis=axis)

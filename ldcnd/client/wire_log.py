@@ -1,0 +1,45 @@
+"""The flight recorder of a line, fetched page by page."""
+
+from dataclasses import dataclass
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.model.verbs import WIRE_LOG
+from ldcnd.model.wire_log import WireLogReply, WireLogRequest
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedWireLog:
+    """What was on a line.
+
+    Attributes:
+        bus: the line.
+        family: the drive family on it.
+        zero_ns: the wall time at which the records' clock was 0, UTC in ns since 1970.
+        lines: one record each.
+        lost: how many records were overwritten while the pages were fetched.
+    """
+
+    bus: str
+    family: str
+    zero_ns: int
+    lines: tuple[str, ...]
+    lost: int
+
+
+async def fetch_wire_log(client: RigClient, bus: str, seconds: float) -> FetchedWireLog:
+    """Fetch the last seconds of a line up to now; what happens while the pages travel is left out.
+
+    Raises:
+        LdcndError: as the daemon refused it, of the same class.
+    """
+    page = await client.rig_command(WIRE_LOG, WireLogRequest(bus=bus, seconds=seconds), WireLogReply)
+    first, end = page, page.end_record
+    lines = list(page.lines)
+    lost = 0
+    while page.next_record < end:
+        wanted = page.next_record
+        request = WireLogRequest(bus=bus, seconds=seconds, from_record=wanted)
+        page = await client.rig_command(WIRE_LOG, request, WireLogReply)
+        lost += min(page.first_record, end) - wanted
+        lines += page.lines[: max(0, end - page.first_record)]
+    return FetchedWireLog(first.bus, first.family, first.zero, tuple(lines), lost)

@@ -1,0 +1,1 @@
+"""Health of a rig as Prometheus metrics."""

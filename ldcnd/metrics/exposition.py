@@ -1,0 +1,113 @@
+"""Health reports as Prometheus metrics: their names, labels and meaning.
+
+Names follow the conventions of prometheus.io: base units, `_total` for what only grows.
+"""
+
+from collections.abc import Callable, Iterator
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from ldcnd.model.axes import LinkState
+from ldcnd.model.health import BusHealth, DaemonHealth
+
+FRESH_S = 5.0
+"""A report counts for so long: what is older says nothing about now."""
+ERRORS = ("timeouts", "corrupt_replies", "rejected_packets", "resynchronisations", "stray_bytes", "losses")
+
+
+class HealthCollector(Collector):
+    """The latest reports of one rig; `take` and `collect` may run in different threads.
+
+    Args:
+        rig: label of every metric.
+        now_s: a clock, in seconds; also called by whoever collects.
+    """
+
+    def __init__(self, rig: str, now_s: Callable[[], float]) -> None:
+        self._rig = rig
+        self._now_s = now_s
+        self._daemon: tuple[float, DaemonHealth] | None = None
+        self._buses: dict[str, tuple[float, BusHealth]] = {}
+
+    def take(self, report: DaemonHealth | BusHealth) -> None:
+        """Replace the report that came before."""
+        if isinstance(report, DaemonHealth):
+            self._daemon = (self._now_s(), report)
+        else:
+            self._buses = {**self._buses, report.bus: (self._now_s(), report)}  # a reader keeps the dict it has
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics; those of reports that have stopped coming are left out."""
+        since_s = self._now_s() - FRESH_S
+        daemon = self._daemon[1] if self._daemon and self._daemon[0] >= since_s else None
+        buses = [report for at_s, report in self._buses.values() if at_s >= since_s]
+        up = GaugeMetricFamily("ldcnd_daemon_up", "1 while the daemon reports", labels=["rig"])
+        up.add_metric([self._rig], 1.0 if daemon else 0.0)
+        yield up
+        yield from self._of_daemon(daemon)
+        yield from self._of_buses(buses)
+        yield from self._of_lanes(buses)
+        yield from self._of_axes(buses)
+
+    def _of_daemon(self, daemon: DaemonHealth | None) -> Iterator[Metric]:
+        lag = GaugeMetricFamily("ldcnd_loop_lag_seconds", "Longest that a timer came too late lately", labels=["rig"])
+        published = CounterMetricFamily("ldcnd_published", "Samples and events published", labels=["rig"])
+        missed = CounterMetricFamily("ldcnd_missed_reports", "Health reports that were left out", labels=["rig"])
+        if daemon:
+            lag.add_metric([self._rig], daemon.loop_lag_s)
+            published.add_metric([self._rig], daemon.published)
+            missed.add_metric([self._rig], daemon.missed_reports)
+        yield from (lag, published, missed)
+
+    def _of_buses(self, buses: list[BusHealth]) -> Iterator[Metric]:
+        labels = ["rig", "bus"]
+        up = GaugeMetricFamily("ldcnd_bus_up", "1 while the drives of a line are polled", labels=labels)
+        busy = GaugeMetricFamily("ldcnd_bus_utilisation_ratio", "Share of time with bytes on the wire", labels=labels)
+        exchanges = CounterMetricFamily("ldcnd_bus_exchanges", "Requests sent", labels=labels)
+        resent = CounterMetricFamily("ldcnd_bus_resent", "Exchanges sent again", labels=labels)
+        errors = CounterMetricFamily("ldcnd_bus_errors", "What went wrong on a line", labels=[*labels, "kind"])
+        for bus in buses:
+            values = [self._rig, bus.bus]
+            up.add_metric(values, float(bus.up))
+            busy.add_metric(values, bus.utilisation)
+            exchanges.add_metric(values, bus.exchanges)
+            resent.add_metric(values, bus.resent)
+            counts = bus.model_dump(include=set(ERRORS))
+            for kind in ERRORS:
+                errors.add_metric([*values, kind], counts[kind])
+        yield from (up, busy, exchanges, resent, errors)
+
+    def _of_lanes(self, buses: list[BusHealth]) -> Iterator[Metric]:
+        labels = ["rig", "bus", "lane"]
+        waiting = GaugeMetricFamily("ldcnd_lane_waiting", "Exchanges that wait", labels=labels)
+        exchanges = CounterMetricFamily("ldcnd_lane_exchanges", "Replies", labels=labels)
+        latency = GaugeMetricFamily(
+            "ldcnd_lane_latency_seconds", "From queueing to the reply, since the start", labels=[*labels, "quantile"]
+        )
+        for bus in buses:
+            for lane in bus.lanes:
+                values = [self._rig, bus.bus, lane.lane]
+                waiting.add_metric(values, lane.waiting)
+                exchanges.add_metric(values, lane.exchanges)
+                for quantile, value in (("0.5", lane.p50_s), ("0.99", lane.p99_s), ("1", lane.longest_s)):
+                    latency.add_metric([*values, quantile], value)
+        yield from (waiting, exchanges, latency)
+
+    def _of_axes(self, buses: list[BusHealth]) -> Iterator[Metric]:
+        labels = ["rig", "bus", "axis"]
+        up = GaugeMetricFamily("ldcnd_axis_up", "1 while the drive answers", labels=labels)
+        age = GaugeMetricFamily("ldcnd_axis_sample_age_seconds", "Age of the latest position", labels=labels)
+        wanted = GaugeMetricFamily("ldcnd_axis_rate_wanted_hertz", "Positions asked for", labels=labels)
+        rate = GaugeMetricFamily("ldcnd_axis_rate_hertz", "Positions published", labels=labels)
+        faults = GaugeMetricFamily("ldcnd_axis_faults", "Faults that stand", labels=labels)
+        for bus in buses:
+            for axis in bus.axes:
+                values = [self._rig, bus.bus, axis.axis]
+                up.add_metric(values, float(axis.link is LinkState.UP))
+                if axis.sample_age_s is not None:
+                    age.add_metric(values, axis.sample_age_s)
+                wanted.add_metric(values, axis.rate_wanted_hz)
+                rate.add_metric(values, axis.rate_hz)
+                faults.add_metric(values, axis.faults)
+        yield from (up, age, wanted, rate, faults)
