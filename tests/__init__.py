@@ -1,0 +1,1 @@
+"""Tests, from vectors and properties up to real processes."""

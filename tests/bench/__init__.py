@@ -1,0 +1,1 @@
+"""What the daemon costs, measured against a floor in the same run: `python -m tests.bench`."""

@@ -1,0 +1,82 @@
+"""`python -m tests.bench`: measure, print a table, keep the figures as JSON."""
+
+import argparse
+import json
+import logging
+import platform
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+
+import structlog
+
+from tests.bench import bus_efficiency, system_calls, virtual_time
+from tests.bench.bus_efficiency import FLOOR, Result
+from tests.bench.processes import build_programs
+from tests.bench.report import Row, table
+from tests.bench.sources import NoCompiler
+
+EFFICIENCY = {
+    (115_200, "uvloop"): 0.985,
+    (115_200, "asyncio"): 0.97,
+    (19_200, "uvloop"): 0.99,
+    (19_200, "asyncio"): 0.99,
+}
+
+
+def main() -> None:
+    """Run the whole bench, or the parts of it that the options leave."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=9, help="interleaved rounds for each rate")
+    parser.add_argument("--virtual-seconds", type=float, default=60.0, help="length of a run on the jumping clock")
+    parser.add_argument("--no-processes", action="store_true", help="only what runs on the jumping clock")
+    parser.add_argument("--json", type=Path, help="keep the figures here")
+    options = parser.parse_args()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+
+    rows: list[Row] = []
+    if not options.no_processes:
+        rows += _processes(options.rounds)
+    rows += virtual_time.rows(options.virtual_seconds)
+    print(table(rows))
+    if options.json:
+        machine = {"python": platform.python_version(), "system": platform.platform()}
+        options.json.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=2))
+
+
+def _processes(rounds: int) -> list[Row]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            programs = build_programs(folder)
+        except NoCompiler as error:
+            print(f"skipped: {error}")
+            return []
+        rows = []
+        for baud in (115_200, 19_200):
+            for result in bus_efficiency.measure(programs, folder, baud, rounds):
+                rows += _efficiency_rows(result)
+        return rows + system_calls.rows(programs[0], folder)
+
+
+def _efficiency_rows(result: Result) -> list[Row]:
+    what = f"{result.baud} baud, {result.subject}"
+    rows = [
+        Row(f"{what}: turn-around, median", result.turnaround_p50_us, "us"),
+        Row(f"{what}: turn-around, 99 %", result.turnaround_p99_us, "us"),
+        Row(f"{what}: processor time for each exchange", result.cpu_us, "us"),
+    ]
+    if result.subject == FLOOR:
+        return [*rows, Row(f"{what}: the line's own lateness, 99 %", result.line_late_p99_us, "us")]
+    loop = result.subject.rpartition(" ")[2]
+    return [
+        *rows,
+        Row(f"{what}: bus efficiency / floor", result.efficiency_ratio, "", EFFICIENCY[result.baud, loop]),
+        Row(f"{what}: the same by the wall clock", result.wall_ratio),
+        Row(f"{what}: processor time / floor", result.cpu_ratio, "", 5.0, at_most=True),
+        Row(f"{what}: processor time for each sample", result.cpu_us_per_sample, "us"),
+    ]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""How much of the line the whole daemon uses, and what it costs, against the floor in interleaved rounds."""
+
+import random
+import signal
+import statistics
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from tests.bench.processes import (
+    SUBJECT_CPU,
+    Subject,
+    config_text,
+    daemon,
+    free_endpoint,
+    paced_line,
+    process,
+    settle,
+    subscriber,
+)
+
+MODULES = 8
+ITEMS = ("position", "velocity", "adc")
+STATUS_ITEMS, REPLY_BYTES = 0x4F, 13
+"""What a poll for these items asks an LS-182AP for, and what comes back."""
+FLOOR = "C floor"
+SETTLE_S = 0.5
+ROUND_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One subject in one round."""
+
+    exchanges_per_s: float
+    efficiency: float
+    wall_efficiency: float
+    turnaround_p50_us: float
+    turnaround_p99_us: float
+    cpu_us: float
+    line_late_p99_us: float
+    samples: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Medians over all rounds; ratios are medians of the ratios within a round."""
+
+    baud: int
+    subject: str
+    exchanges_per_s: float
+    efficiency: float
+    efficiency_ratio: float
+    wall_ratio: float
+    turnaround_p50_us: float
+    turnaround_p99_us: float
+    cpu_us: float
+    cpu_ratio: float
+    cpu_us_per_sample: float
+    line_late_p99_us: float
+
+
+def measure(programs: tuple[Path, Path], folder: Path, baud: int, rounds: int) -> list[Result]:
+    """Run floor, daemon on asyncio and daemon on uvloop side by side."""
+    line_program, floor_program = programs
+    with ExitStack() as stack:
+        line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=baud))
+        command = (floor_program, line.terminal, str(baud), str(MODULES), str(STATUS_ITEMS), str(REPLY_BYTES))
+        running = stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10))
+        subjects = [Subject(FLOOR, running, line)]
+        listeners = {}
+        subjects[0].stop()
+        for name, uvloop in (("ldcnd, asyncio", False), ("ldcnd, uvloop", True)):
+            line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=0))
+            config = folder / f"bench-{baud}-{uvloop}.toml"
+            config.write_text(
+                config_text(line.terminal, modules=MODULES, baud=baud, uvloop=uvloop, hz=2000.0, items=ITEMS)
+            )
+            endpoint = free_endpoint()
+            running = stack.enter_context(daemon(config, endpoint))
+            listeners[name] = stack.enter_context(subscriber(endpoint))
+            subjects.append(Subject(name, running, line))
+            subjects[-1].stop()
+        return _summary(baud, _rounds(subjects, listeners, rounds))
+
+
+def _rounds(subjects, listeners, rounds) -> list[dict[str, Round]]:
+    dice = random.Random(1)
+    done = []
+    for _ in range(rounds):
+        order = subjects[:]
+        dice.shuffle(order)
+        done.append({subject.name: _round(subject, listeners.get(subject.name)) for subject in order})
+    return done
+
+
+def _round(subject: Subject, listener) -> Round:
+    subject.resume()
+    settle(SETTLE_S)
+    before = _received(listener)
+    cpu_s = subject.cpu_s()
+    subject.line.figures()
+    settle(ROUND_S)
+    figures = subject.line.figures()
+    cpu_s = subject.cpu_s() - cpu_s
+    if not figures.exchanges:
+        raise RuntimeError(f"{subject.name} sent nothing for {ROUND_S} s")
+    samples = _received(listener) - before
+    subject.stop()
+    return Round(
+        exchanges_per_s=figures.exchanges / figures.elapsed_s,
+        efficiency=figures.efficiency,
+        wall_efficiency=figures.wall_efficiency,
+        turnaround_p50_us=figures.turnaround_p50_us,
+        turnaround_p99_us=figures.turnaround_p99_us,
+        cpu_us=cpu_s / figures.exchanges * 1e6,
+        line_late_p99_us=figures.late_p99_us,
+        samples=samples / figures.exchanges,
+    )
+
+
+def _received(listener) -> int:
+    if listener is None:
+        return 0
+    listener.send_signal(signal.SIGUSR1)
+    return int(listener.stdout.readline())
+
+
+def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
+    results = []
+    for name in rounds[0]:
+        own = [each[name] for each in rounds]
+        floor = [each[FLOOR] for each in rounds]
+        pairs = list(zip(own, floor, strict=True))
+        results.append(
+            Result(
+                baud=baud,
+                subject=name,
+                exchanges_per_s=_median(each.exchanges_per_s for each in own),
+                efficiency=_median(each.efficiency for each in own),
+                efficiency_ratio=_median(each.efficiency / base.efficiency for each, base in pairs),
+                wall_ratio=_median(each.wall_efficiency / base.wall_efficiency for each, base in pairs),
+                turnaround_p50_us=_median(each.turnaround_p50_us for each in own),
+                turnaround_p99_us=_median(each.turnaround_p99_us for each in own),
+                cpu_us=_median(each.cpu_us for each in own),
+                cpu_ratio=_median(each.cpu_us / base.cpu_us for each, base in pairs),
+                cpu_us_per_sample=_median(each.cpu_us / (each.samples or 1) for each in own),
+                line_late_p99_us=_median(each.line_late_p99_us for each in own),
+            )
+        )
+    return sorted(results, key=lambda result: (result.subject != FLOOR, result.subject))
+
+
+def _median(values) -> float:
+    return statistics.median(values)
+
+
+def as_rows(results: list[Result]) -> list[dict[str, float | str]]:
+    """Return results as plain data."""
+    return [asdict(result) for result in results]

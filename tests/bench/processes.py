@@ -1,0 +1,173 @@
+"""The processes of the bench: paced lines, the floor, daemons and a subscriber, each on its processor."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.bench.sources import build
+
+ROOT = Path(__file__).parents[2]
+LINE_CPU, SUBJECT_CPU = 0, -1
+"""The line spins on one processor, everything that is measured shares another one."""
+START_TIME_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class LineFigures:
+    """What a paced line saw of its host since it was asked before."""
+
+    exchanges: int
+    elapsed_s: float
+    ideal_s: float
+    turnaround_p50_us: float
+    turnaround_p99_us: float
+    late_p99_us: float
+
+    @property
+    def efficiency(self) -> float:
+        """Share of the ideal rate, from the median turn-around: robust against pre-emption by others."""
+        ideal_us = self.ideal_s / self.exchanges * 1e6
+        return ideal_us / (ideal_us + self.turnaround_p50_us)
+
+    @property
+    def wall_efficiency(self) -> float:
+        """Share of the ideal rate in the elapsed time."""
+        return self.ideal_s / self.elapsed_s
+
+
+@contextmanager
+def process(command: Sequence[str | Path], *, cpu: int, nice: int, pipe: bool = False) -> Iterator[subprocess.Popen]:
+    """Run a program on one processor until the context ends."""
+    cpus = sorted(os.sched_getaffinity(0))
+
+    def place() -> None:
+        os.sched_setaffinity(0, {cpus[cpu]})
+        with contextlib.suppress(OSError):
+            os.nice(nice)
+            # where sessions share the processor evenly, nice only counts within one
+            Path("/proc/self/autogroup").write_text(str(nice))
+
+    running = subprocess.Popen(  # noqa: S603
+        command,
+        stdout=subprocess.PIPE if pipe else None,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+        preexec_fn=place,  # noqa: PLW1509 - one thread
+    )
+    try:
+        yield running
+    finally:
+        running.send_signal(signal.SIGCONT)
+        running.terminate()
+        try:
+            running.wait(10)
+        except subprocess.TimeoutExpired:
+            running.kill()
+            running.wait()
+
+
+class PacedLine:
+    """A running paced line."""
+
+    def __init__(self, running: subprocess.Popen) -> None:
+        assert running.stdout
+        self._running = running
+        self._output = running.stdout
+        self.terminal = json.loads(self._output.readline())["terminal"]
+
+    def figures(self) -> LineFigures:
+        """Return what was counted since the call before."""
+        self._running.send_signal(signal.SIGUSR1)
+        return LineFigures(**json.loads(self._output.readline()))
+
+
+@contextmanager
+def paced_line(program: Path, *, modules: int, ready_baud: int, burst: bool = False) -> Iterator[PacedLine]:
+    """Run a paced line; its modules have addresses and a rate already, or are as after power-up (rate 0)."""
+    command = (program, str(modules), "1", str(ready_baud), "1" if burst else "0")
+    with process(command, cpu=LINE_CPU, nice=-20, pipe=True) as running:
+        yield PacedLine(running)
+
+
+class Subject:
+    """A host under measurement; stopped between its rounds."""
+
+    def __init__(self, name: str, running: subprocess.Popen, line: PacedLine) -> None:
+        self.name = name
+        self.pid = running.pid
+        self.line = line
+        self._running = running
+
+    def stop(self) -> None:
+        """Freeze it."""
+        self._running.send_signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        """Let it run."""
+        self._running.send_signal(signal.SIGCONT)
+
+    def cpu_s(self) -> float:
+        """Return the processor time of all its threads."""
+        tasks = Path(f"/proc/{self.pid}/task")
+        return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks.iterdir()) / 1e9
+
+
+def config_text(terminal: str, *, modules: int, baud: int, uvloop: bool, hz: float, items: Sequence[str]) -> str:
+    """Return the configuration of a daemon that polls as often as the line allows."""
+    rates = ", ".join(f"{item} = {hz if item in items else 0}" for item in ("position", "velocity", "adc"))
+    axes = "\n".join(
+        f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\nvelocity = 1\nacceleration = 1\n'
+        f"rates = {{ {rates}, state = 1 }}"
+        for number in range(1, modules + 1)
+    )
+    return (
+        f'rig = "bench"\n[daemon]\nuvloop = {str(uvloop).lower()}\n'
+        f'[[bus]]\nname = "line0"\nport = "{terminal}"\nbaud = {baud}\nmargin_ms = 20\noverload = "skip"\n{axes}\n'
+    )
+
+
+@contextmanager
+def daemon(config: Path, endpoint: str) -> Iterator[subprocess.Popen]:
+    """Run a daemon."""
+    command = (sys.executable, "-m", "ldcnd", "run", "--log-level", "error", "--config", config, "--listen", endpoint)
+    with process(command, cpu=SUBJECT_CPU, nice=-10) as running:
+        yield running
+
+
+@contextmanager
+def subscriber(endpoint: str) -> Iterator[subprocess.Popen]:
+    """Run a remote subscriber of everything; returns once it receives."""
+    command = (sys.executable, "-m", "tests.bench.subscriber", endpoint)
+    with process(command, cpu=SUBJECT_CPU, nice=19, pipe=True) as running:
+        # it stands for another machine: what it does must not hold up the daemon
+        os.sched_setscheduler(running.pid, os.SCHED_IDLE, os.sched_param(0))
+        assert running.stdout
+        assert running.stdout.readline().strip() == "receiving"
+        yield running
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint that nobody uses."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def settle(seconds: float) -> None:
+    """Let time pass on the wall clock."""
+    time.sleep(seconds)
+
+
+def build_programs(folder: Path) -> tuple[Path, Path]:
+    """Build the paced line and the floor."""
+    return build("paced_line", folder), build("reference_master", folder)

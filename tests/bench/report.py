@@ -1,0 +1,39 @@
+"""What the bench prints: one row for each figure, with its target where there is one."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One figure.
+
+    Attributes:
+        at_most: the target is an upper limit; otherwise a lower one.
+    """
+
+    name: str
+    value: float
+    unit: str = ""
+    target: float | None = None
+    at_most: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """Say whether the target is met."""
+        if self.target is None:
+            return ""
+        met = self.value <= self.target if self.at_most else self.value >= self.target
+        return "met" if met else "MISSED"
+
+
+def table(rows: list[Row]) -> str:
+    """Return the rows as a table of Markdown."""
+    lines = ["| figure | value | target | |", "|---|---|---|---|"]
+    for row in rows:
+        target = "" if row.target is None else f"{'≤' if row.at_most else '≥'} {row.target:g}"
+        lines.append(f"| {row.name} | {_shown(row.value)} {row.unit} | {target} | {row.verdict} |")
+    return "\n".join(lines)
+
+
+def _shown(value: float) -> str:
+    return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"

@@ -1,0 +1,149 @@
+"""What the bus does with the line's time, on the jumping clock: exact, the host takes no time at all."""
+
+import asyncio
+import gc
+import random
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from typing import TypeVar
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.wire_log import WireEvent, WireRecord
+from ldcnd.config import RigConfig
+from ldcnd.daemon.process import settle_heap
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from tests.bench.report import Row
+from tests.support.jumping_clock import JumpingLoop
+from tests.support.rig import RunningRig, running_rig
+
+DRIVES = 31
+COMMANDS = 400
+ResultT = TypeVar("ResultT")
+
+
+def rows(seconds: float) -> list[Row]:
+    """Measure for so many virtual seconds each."""
+    full_per_s, busy = _run(DRIVES, lambda rig: _saturated(rig, seconds))
+    alive_per_s, _ = _run(DRIVES, lambda rig: _with_one_dead(rig, seconds))
+    found = [
+        Row(f"jumping clock: line busy, {DRIVES} drives", busy, target=0.9999),
+        Row(f"jumping clock: good polls with 1 of {DRIVES} dead, share", alive_per_s / full_per_s, target=0.98),
+        Row("longest wait of a command / longest exchange", _run(DRIVES, _longest_wait), target=1.0, at_most=True),
+        Row("full collections in steady state", _run(8, lambda rig: _collections(rig, seconds)), "", 0.0, at_most=True),
+    ]
+    for drives in (1, 8, DRIVES):
+        speed = _run(drives, lambda rig: _speed(rig, min(seconds, 10.0)))
+        found.append(Row(f"simulated line and daemon, {drives} drive(s): virtual seconds per second", speed, "x"))
+    return found
+
+
+def saturating(drives: int) -> RigConfig:
+    """Return a rig that wants more polls than its line can carry."""
+    axes = [
+        {
+            "name": f"a{number}",
+            "address": number,
+            "model": "ls-182ap",
+            "velocity": 1.0,
+            "acceleration": 1.0,
+            "rates": {"position": 2000.0, "velocity": 2000.0, "adc": 2000.0, "state": 1.0},
+        }
+        for number in range(1, drives + 1)
+    ]
+    bus = {"name": "line0", "port": "sim:line0", "baud": 115_200, "overload": "skip", "axis": axes}
+    modules = [{"model": "ls182ap"}] * drives
+    return RigConfig.model_validate({"rig": "bench", "bus": [bus], "sim": [{"name": "line0", "module": modules}]})
+
+
+def _run(drives: int, work: Callable[[RunningRig], Awaitable[ResultT]]) -> ResultT:
+    async def within() -> ResultT:
+        async with running_rig(saturating(drives)) as rig:
+            return await work(rig)
+
+    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+        return runner.run(within())
+
+
+def _bus(rig: RunningRig) -> Bus:
+    return rig.daemon.rig.buses[0].bus
+
+
+async def _saturated(rig: RunningRig, seconds: float) -> tuple[float, float]:
+    bus = _bus(rig)
+    await asyncio.sleep(1.0)
+    before = bus.statistics.replies
+    await asyncio.sleep(seconds)
+    return (bus.statistics.replies - before) / seconds, _busy(bus.wire_log.records())
+
+
+async def _with_one_dead(rig: RunningRig, seconds: float) -> tuple[float, float]:
+    chain = _bus(rig)._line._transport._chain
+    chain.modules[-1].power(on=False, at_s=asyncio.get_running_loop().time())
+    return await _saturated(rig, seconds)
+
+
+def _busy(records: list[WireRecord]) -> float:
+    """Return for which share of the recorded time an exchange was under way."""
+    records = [record for record in records if record.event in (WireEvent.SENT, WireEvent.RECEIVED)]
+    gaps_s = sum(
+        later.at_s - earlier.at_s
+        for earlier, later in pairwise(records)
+        if earlier.event is WireEvent.RECEIVED and later.event is WireEvent.SENT
+    )
+    return 1 - gaps_s / (records[-1].at_s - records[0].at_s)
+
+
+async def _longest_wait(rig: RunningRig) -> float:
+    """Queue commands at random instants; return their longest wait for the line over the longest exchange on it."""
+    bus, loop, dice = _bus(rig), asyncio.get_running_loop(), random.Random(1)
+    exchanges = [commands.no_operation(Node(address, PROFILES["ls-182ap"])) for address in range(1, DRIVES + 1)]
+    longest_wait_s = longest_exchange_s = 0.0
+    for _ in range(COMMANDS):
+        await asyncio.sleep(dice.expovariate(200.0))
+        exchange = dice.choice(exchanges)
+        queued_at_s = loop.time()
+        await bus.execute(exchange)
+        recent = bus.wire_log.records()[-12:]
+        sent = [record for record in recent if record.event is WireEvent.SENT and record.data == exchange.request]
+        longest_wait_s = max(longest_wait_s, sent[-1].at_s - queued_at_s)
+        for earlier, later in pairwise(recent):
+            if earlier.event is WireEvent.SENT and later.event is WireEvent.RECEIVED:
+                longest_exchange_s = max(longest_exchange_s, later.at_s - earlier.at_s)
+    return longest_wait_s / longest_exchange_s
+
+
+async def _collections(rig: RunningRig, seconds: float) -> float:
+    del rig
+    await asyncio.sleep(2.0)
+    settle_heap()
+    with _counted() as counted:
+        await asyncio.sleep(seconds)
+    return float(len(counted))
+
+
+@contextmanager
+def _counted() -> Iterator[list[int]]:
+    """Count full collections."""
+    counted: list[int] = []
+
+    def note(phase: str, about: dict[str, int]) -> None:
+        if phase == "stop" and about["generation"] == 2:
+            counted.append(about["collected"])
+
+    gc.callbacks.append(note)
+    try:
+        yield counted
+    finally:
+        gc.callbacks.remove(note)
+        gc.unfreeze()
+
+
+async def _speed(rig: RunningRig, seconds: float) -> float:
+    del rig
+    began_s = time.perf_counter()
+    await asyncio.sleep(seconds)
+    return seconds / (time.perf_counter() - began_s)

@@ -1,0 +1,32 @@
+"""Which clock a test runs on, and what no test may leave behind."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+
+import pytest
+from hypothesis import settings
+
+from tests.support.jumping_clock import JumpingLoop
+
+# one run is like the other; `make soak` looks at what was never tried, and prints how to repeat what it finds
+settings.register_profile("same", derandomize=True, deadline=None, print_blob=True)
+settings.register_profile("new", deadline=None, print_blob=True)
+settings.load_profile("same")
+
+
+def pytest_asyncio_loop_factories(
+    config: pytest.Config, item: pytest.Item
+) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Jump through time, unless the test says that it needs the wall clock."""
+    if item.get_closest_marker("real_time"):
+        return {"real": asyncio.new_event_loop}
+    return {"jumping": JumpingLoop}
+
+
+@pytest.fixture(autouse=True)
+async def no_task_is_left() -> AsyncIterator[None]:
+    """Fail the test that leaves a task running."""
+    yield
+    here = asyncio.current_task()
+    left = [task for task in asyncio.all_tasks() if task is not here and not task.done()]
+    assert not left, f"tasks left running: {[task.get_name() for task in left]}"

@@ -1,0 +1,252 @@
+"""Who may move what, and what happens when someone disappears, on the jumping clock."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.bus_config import GroupConfig
+from ldcnd.client.lease import control
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config import load_config
+from ldcnd.errors import (
+    CommandExpired,
+    CommandIdReused,
+    DuplicateDaemon,
+    LeaseExpired,
+    LeaseHeld,
+    LeaseRequired,
+    PositionLimit,
+    StaleSequence,
+)
+from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply
+from ldcnd.model.axes import AxisState
+from ldcnd.model.events import CommandOutcome, CommandStatus, EventList, EventsRequest, OutcomeRequest
+from ldcnd.model.requests import (
+    HaltRequest,
+    MoveAbsoluteRequest,
+    MoveRelativeRequest,
+    MoveVelocityRequest,
+    PowerRequest,
+    QuickStopRequest,
+    ResetRequest,
+    Verb,
+)
+from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
+
+LEASE_S = 1.0
+ACTED_WITHIN_S = LEASE_S + 0.05 + 0.05
+"""The lease, the period at which leases are looked at, and a margin for the stop on the wire."""
+
+
+def leased():
+    return load_config(SIMULATED).model_copy(update={"authority": "leased"})
+
+
+async def powered(rig: RunningRig, axis: str = "x") -> None:
+    await rig.until(axis, lambda state: state.link == "up")
+    await rig.client.command(axis, Verb.POWER, PowerRequest(on=True))
+
+
+async def test_a_leased_rig_moves_under_a_lease_only():
+    async with running_rig(leased()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        with pytest.raises(LeaseRequired):
+            await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+
+        async with control(rig.client, "ann", "x") as held:
+            await held.command("x", Verb.POWER, PowerRequest(on=True))
+            reply = await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=30.0))
+            state = await rig.client.wait_for_end("x", reply.command_id)
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        holders = await rig.client.rig_command("holders", HaltRequest(), HolderList)
+        assert {holder.client for holder in holders.holders} == {None}
+
+
+async def test_stop_and_halt_never_need_a_lease():
+    async with running_rig(leased()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x") as held:
+            await held.command("x", Verb.POWER, PowerRequest(on=True))
+            await held.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=10.0))
+
+            reply = await rig.client.stop("x")
+
+            assert reply.confirmed == ("x",)
+            await rig.until("x", lambda state: state.state is AxisState.STANDSTILL and state.stop_latched)
+
+
+async def test_an_axis_halts_when_its_client_disappears():
+    async with running_rig(leased()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        lease = await rig.client.rig_command(
+            "acquire", AcquireRequest(client="ann", axes=("x",), lease_s=LEASE_S), LeaseReply
+        )
+        loop = asyncio.get_running_loop()
+        acquired_s = loop.time()
+        under = {"lease": lease.lease}
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True, **under))
+        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=10.0, **under))
+
+        await rig.until("x", lambda state: state.state is AxisState.STOPPING)
+        assert LEASE_S <= loop.time() - acquired_s <= ACTED_WITHIN_S
+        state = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+
+        assert not state.stop_latched
+        for stale in (MoveVelocityRequest(velocity=10.0, **under), MoveVelocityRequest(velocity=-10.0, **under)):
+            with pytest.raises(LeaseExpired):
+                await rig.client.command("x", Verb.MOVE_VELOCITY, stale)
+
+
+async def test_somebody_else_is_refused_and_may_take_over_by_force():
+    async with running_rig() as rig:
+        await powered(rig)
+        bob = RigClient(rig.session, "sim")
+        async with control(rig.client, "ann", "x") as held:
+            with pytest.raises(LeaseHeld, match="ann"):
+                await bob.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1.0))
+            with pytest.raises(LeaseHeld):
+                async with control(bob, "bob", "x"):
+                    pass
+
+            async with control(bob, "bob", "x", force=True) as taken:
+                await taken.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1.0))
+                with pytest.raises(LeaseExpired):
+                    await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=2.0))
+
+
+async def test_a_lease_on_a_group_covers_its_members():
+    config = load_config(SIMULATED)
+    group = GroupConfig(name="gantry", axes=("x", "y"))
+    bus = config.bus[0].model_copy(update={"group": (group,)})
+    async with running_rig(config.model_copy(update={"bus": (bus,)})) as rig:
+        lease = await rig.client.rig_command("acquire", AcquireRequest(client="ann", axes=("gantry", "z")), LeaseReply)
+
+        assert lease.axes == ("x", "y", "z")
+
+
+async def test_commands_under_a_lease_never_go_backwards():
+    async with running_rig() as rig:
+        await powered(rig)
+        async with control(rig.client, "ann", "x") as held:
+            lease = held.lease.lease
+            await rig.client.command("x", Verb.RESET, ResetRequest(lease=lease, sequence=9))
+
+            with pytest.raises(StaleSequence):
+                await rig.client.command("x", Verb.RESET, ResetRequest(lease=lease, sequence=9))
+
+
+async def test_a_repeated_id_moves_once_and_is_answered_alike():
+    async with running_rig() as rig:
+        await powered(rig)
+        step = MoveRelativeRequest(distance=2.0, command_id="step-1")
+
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(rig.client.command("x", Verb.MOVE_RELATIVE, step)) for _ in range(5)]
+        await rig.client.wait_for_end("x", "step-1")
+        again = await rig.client.command("x", Verb.MOVE_RELATIVE, step)
+
+        assert {task.result() for task in tasks} == {again}
+        outcome = await rig.client.rig_command("outcome", OutcomeRequest(command_id="step-1"), CommandOutcome)
+        assert outcome.status is CommandStatus.DONE
+        assert again.position == pytest.approx(2.0)
+        with pytest.raises(CommandIdReused):
+            await rig.client.command("x", Verb.MOVE_RELATIVE, MoveRelativeRequest(distance=3.0, command_id="step-1"))
+
+
+async def test_a_repeated_stop_stops_again():
+    async with running_rig() as rig:
+        await powered(rig)
+        stop = QuickStopRequest(command_id="stop-1")
+        await rig.client.command("x", Verb.QUICK_STOP, stop)
+        await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        await rig.client.command("x", Verb.RESET, ResetRequest())
+        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=10.0))
+
+        await rig.client.command("x", Verb.QUICK_STOP, stop)
+
+        state = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        assert state.stop_latched
+
+
+async def test_a_repeated_refusal_stays_a_refusal():
+    async with running_rig() as rig:
+        await powered(rig)
+        far = MoveAbsoluteRequest(position=500.0, command_id="far")
+
+        for _ in range(2):
+            with pytest.raises(PositionLimit):
+                await rig.client.command("x", Verb.MOVE_ABSOLUTE, far)
+
+
+async def test_a_command_that_comes_too_late_is_not_carried_out():
+    async with running_rig() as rig:
+        await powered(rig)
+        now_ns = EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
+
+        late = MoveAbsoluteRequest(position=5.0, not_after=now_ns - 1)
+        with pytest.raises(CommandExpired):
+            await rig.client.command("x", Verb.MOVE_ABSOLUTE, late)
+        foreign = MoveAbsoluteRequest(position=5.0, instance="another")
+        with pytest.raises(CommandExpired, match="another run"):
+            await rig.client.command("x", Verb.MOVE_ABSOLUTE, foreign)
+
+        assert (await rig.client.state("x")).state is AxisState.STANDSTILL
+
+
+async def test_the_events_tell_who_did_what_with_which_result():
+    async with running_rig() as rig:
+        await powered(rig)
+        async with control(rig.client, "ann", "x") as held:
+            reply = await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90.0))
+            await asyncio.sleep(0.5)
+            await rig.client.stop("x")
+            await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+
+        events = await rig.client.rig_command("events", EventsRequest(axis="x"), EventList)
+        story = [(event.status, event.client) for event in events.events if event.command_id == reply.command_id]
+        assert story == [
+            (CommandStatus.ACCEPTED, "ann"),
+            (CommandStatus.EXECUTING, "ann"),
+            (CommandStatus.ABORTED, "ann"),
+        ]
+        assert events.events[-1].reason == "aborted by stop"
+        assert [event.seq for event in events.events] == list(range(len(events.events)))
+
+
+async def test_two_daemons_on_one_rig_refuse_motion():
+    async with running_rig() as rig:
+        await powered(rig)
+        other = await rig.session.declare_token("ldcn/sim/alive/second")
+
+        with pytest.raises(DuplicateDaemon, match="second"):
+            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1.0))
+        assert (await rig.client.stop("x")).confirmed == ("x",)
+
+        await other.close()
+        await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        await rig.client.command("x", Verb.RESET, ResetRequest())
+
+
+async def test_why_lists_everything_that_is_in_the_way():
+    async with running_rig(leased()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.stop("x")
+
+        reply = await rig.client.why("x")
+
+        assert not reply.can_move
+        assert [cause.code for cause in reply.causes] == ["lease_required", "stop_latched", "wrong_state"]
+        assert [cause.remedy for cause in reply.causes] == [
+            "acquire one first",
+            "send reset",
+            'send power {"on": true}',
+        ]
+
+
+async def test_nothing_is_in_the_way_of_an_axis_that_is_ready():
+    async with running_rig() as rig:
+        await powered(rig)
+        await asyncio.sleep(0.2)
+
+        assert (await rig.client.why("x")).can_move

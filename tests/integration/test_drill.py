@@ -1,0 +1,39 @@
+"""The drills of the command line against a daemon in its own process."""
+
+import json
+from asyncio.subprocess import PIPE, create_subprocess_exec
+
+import pytest
+
+from tests.support.process import LDCND, ROOT, daemon
+
+pytestmark = pytest.mark.real_time
+
+LEASE_S = 0.8
+
+
+async def drill(endpoint: str, kind: str, *options: str) -> dict[str, float]:
+    words = ("drill", kind, "x", "--velocity", "5", "--yes", "--json", "--connect", endpoint, *options)
+    done = await create_subprocess_exec(*LDCND, *words, stdout=PIPE, cwd=ROOT)
+    printed, _ = await done.communicate()
+    assert done.returncode == 0
+    return json.loads(printed)
+
+
+async def reset(endpoint: str) -> None:
+    done = await create_subprocess_exec(*LDCND, "axis", "reset", "x", "--connect", endpoint, stdout=PIPE, cwd=ROOT)
+    await done.communicate()
+    assert done.returncode == 0
+
+
+async def test_each_loss_is_rehearsed_and_measured():
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        client = await drill(endpoint, "client-loss", "--lease", str(LEASE_S))
+        stop = await drill(endpoint, "daemon-stop")
+        bus = await drill(endpoint, "bus-loss")
+        await reset(endpoint)
+
+    assert -0.05 < client["reacted_after_lease_s"] < 0.5
+    assert client["stands_after_lease_s"] < 1.5
+    assert stop["stands_s"] < 1.5
+    assert bus["stands_s"] < 5.0

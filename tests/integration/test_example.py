@@ -1,0 +1,36 @@
+"""What a newcomer runs, against a daemon in its own process over loopback TCP."""
+
+import asyncio
+import sys
+from asyncio.subprocess import PIPE
+
+import pytest
+
+from tests.support.process import ROOT, daemon
+
+pytestmark = pytest.mark.real_time
+
+EXAMPLE = ROOT / "examples" / "move_and_watch.py"
+
+
+async def test_the_example_follows_a_moving_axis_to_its_target():
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        example = await asyncio.create_subprocess_exec(sys.executable, str(EXAMPLE), endpoint, stdout=PIPE)
+        async with asyncio.timeout(30):
+            printed, _ = await example.communicate()
+
+    lines = printed.decode().splitlines()
+    assert example.returncode == 0
+    assert lines[0].startswith("accepted:")
+    positions = [float(line.split()[0]) for line in lines[1:]]
+    assert len(positions) > 5
+    assert positions[-1] == pytest.approx(10.0, abs=0.005)
+    assert any(0.5 < position < 9.5 for position in positions)
+
+
+def test_the_example_is_thirty_lines_and_needs_nothing_of_ours():
+    text = EXAMPLE.read_text()
+
+    code = [line for line in text.splitlines() if line.strip()]
+    assert len(code) <= 32
+    assert "ldcnd" not in text

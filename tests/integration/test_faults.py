@@ -1,0 +1,317 @@
+"""Every fault of the manuals' tables, from the simulated cause to the fault topic and back; on the jumping clock."""
+
+import asyncio
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.drivers.ldcn.faults import FaultCode
+from ldcnd.drivers.ldcn.simulated_power import Condition
+from ldcnd.errors import DriveFault, WrongState
+from ldcnd.model.axes import AxisState
+from ldcnd.model.requests import (
+    MoveAbsoluteRequest,
+    MoveAnalogRequest,
+    PowerRequest,
+    ResetRequest,
+    SetGainsRequest,
+    SetPwmRequest,
+    Verb,
+)
+from tests.support.dialect_rig import (
+    AXIS,
+    DIALECTS,
+    GAINS,
+    LS_173AP,
+    LS_182AP,
+    LS_182AP_22,
+    PLANT,
+    SC,
+    V1,
+    V4,
+    dialect_rig,
+)
+
+LOGOSOL = (LS_173AP, LS_182AP, LS_182AP_22)
+FAR = MoveAbsoluteRequest(position=18.0, velocity=10.0)
+
+
+def named(dialects):
+    return pytest.mark.parametrize("dialect", dialects, ids=lambda dialect: dialect.name)
+
+
+def codes(sample):
+    return [fault.code for fault in sample.active]
+
+
+# -- the table of Logosol drives, Pic_ae = 1: what switched the power driver off ---------------------------------------
+
+
+@named(LOGOSOL)
+@pytest.mark.parametrize(
+    ("condition", "code"),
+    [
+        (Condition.STOP_INPUT, FaultCode.STOP_INPUT),
+        (Condition.MOTOR_SHORT, FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+        (Condition.OVERVOLTAGE, FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+        (Condition.OVERHEAT, FaultCode.OVERHEAT),
+        (Condition.OVERCURRENT, FaultCode.OVERCURRENT),
+        (Condition.ENCODER_LOSS, FaultCode.ENCODER_OR_HALL),
+    ],
+)
+async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(dialect, condition, code):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await asyncio.sleep(0.5)
+
+        rig.condition(condition)
+        sample = await rig.until_fault(lambda faults: faults.active)
+        state = await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
+
+        assert (codes(sample), sample.first.code, sample.first.source) == ([code], code, "drive")
+        assert (sample.first.text, sample.first.stops) == (code.remedy, True)
+        assert (state.enabled, state.command, state.last_error) == (
+            False,
+            None,
+            "move_absolute: the drive reports a fault",
+        )
+        with pytest.raises(WrongState) as refusal:
+            await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        assert code.remedy in refusal.value.message
+
+        rig.condition(condition, present=False)
+        await rig.send(Verb.RESET, ResetRequest())
+        recovered = await rig.until(lambda state: state.state is AxisState.DISABLED)
+        assert (await rig.until_fault(lambda faults: not faults.active)).first is None
+        assert not recovered.enabled
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+
+
+# -- Pic_ae = 0: what is wrong at present ------------------------------------------------------------------------------
+
+
+@named(LOGOSOL)
+@pytest.mark.parametrize(
+    ("condition", "code"),
+    [
+        (Condition.STOP_INPUT, FaultCode.STOP_INPUT),
+        (Condition.OVERVOLTAGE, FaultCode.OVERVOLTAGE),
+        (Condition.OVERHEAT, FaultCode.OVERHEAT),
+    ],
+)
+async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, condition, code):
+    async with dialect_rig(dialect) as rig:
+        await rig.until(lambda state: state.state is AxisState.DISABLED)
+
+        rig.condition(condition)
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert (codes(sample), sample.first.text) == ([code], code.remedy)
+        with pytest.raises(DriveFault) as refusal:
+            await rig.send(Verb.RESET, ResetRequest())
+        assert code.remedy in refusal.value.message
+        rig.condition(condition, present=False)
+        await rig.send(Verb.RESET, ResetRequest())
+        assert (await rig.until(lambda state: state.state is AxisState.DISABLED)).state is AxisState.DISABLED
+
+
+# -- position error and sensor fault -----------------------------------------------------------------------------------
+
+
+@named(DIALECTS)
+async def test_a_jam_ends_in_a_position_error(dialect):
+    async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
+        await rig.power_on()
+        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await asyncio.sleep(0.5)
+
+        rig.condition(Condition.STALLED)
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert (codes(sample), sample.first.text) == (["position_error"], FaultCode.POSITION_ERROR.remedy)
+        assert (await rig.until(lambda state: state.state is AxisState.ERROR_STOP)).enabled is False
+        rig.condition(Condition.STALLED, present=False)
+        await rig.send(Verb.RESET, ResetRequest())
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+
+
+@named(LOGOSOL)
+async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await rig.send(Verb.MOVE_ANALOG, MoveAnalogRequest(target=200, velocity=2.0))
+        await asyncio.sleep(0.5)
+
+        rig.condition(Condition.SENSOR_LOST)
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert (codes(sample), sample.first.text) == (["sensor_fault"], FaultCode.SENSOR_FAULT.remedy)
+        await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
+        rig.condition(Condition.SENSOR_LOST, present=False)
+        await rig.send(Verb.RESET, ResetRequest())
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+
+
+@named(LOGOSOL)
+async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        rig.condition(Condition.SENSOR_LOST)
+
+        state = await rig.done(Verb.MOVE_ABSOLUTE, FAR)
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+
+
+# -- PIC-SERVO ---------------------------------------------------------------------------------------------------------
+
+
+@named((V1, V4, SC))
+async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await asyncio.sleep(0.5)
+
+        rig.condition(Condition.MOTOR_POWER_OFF)
+        sample = await rig.until_fault(lambda faults: faults.active)
+        assert (codes(sample), sample.first.text) == (["power_lost"], FaultCode.POWER_LOST.remedy)
+        await asyncio.sleep(2.0)
+        where = rig.position_mm
+        rig.condition(Condition.MOTOR_POWER_OFF, present=False)
+        await asyncio.sleep(1.0)
+
+        assert rig.position_mm == pytest.approx(where, abs=0.01)
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.ERROR_STOP
+        await rig.send(Verb.RESET, ResetRequest())
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+
+
+@named((V1, V4, SC))
+async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_closed(dialect):
+    hard_stop = replace(PLANT, forward_limit_counts=1000, stop_margin_counts=100)
+    async with dialect_rig(dialect, hard_stop, gains=GAINS | {"cl": 101, "el": 16_000}) as rig:
+        await rig.power_on()
+
+        await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=3.0, velocity=5.0))
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert (codes(sample), sample.first.stops) == (["current_limit"], False)
+        assert (await rig.until(lambda state: state.command is None)).state is AxisState.STANDSTILL
+        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=0.0))
+        await rig.send(Verb.RESET, ResetRequest())
+        assert (await rig.until_fault(lambda faults: not faults.active)).first is None
+        assert rig.drive.loop.servo_on
+
+
+# -- warnings and causes of causes -------------------------------------------------------------------------------------
+
+
+@named(DIALECTS)
+async def test_a_counter_that_wraps_is_a_warning(dialect):
+    async with dialect_rig(dialect, pwm={"duty": 0.1}, acceleration=2000) as rig:
+        await rig.power_on()
+        rig.drive.loop.renumber((1 << 31) - 500)
+
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.1, duration_s=0.3))  # no profile would go there
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert (codes(sample), sample.first.stops) == (["position_wrap"], False)
+        assert sample.first.text == FaultCode.POSITION_WRAP.remedy
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
+
+
+@named(DIALECTS)
+async def test_a_late_servo_cycle_is_a_warning_that_reset_clears(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+
+        rig.condition(Condition.SLOW_PROCESSOR)
+        rig.condition(Condition.SLOW_PROCESSOR, present=False)
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert (codes(sample), sample.first.stops) == (["servo_overrun"], False)
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.STANDSTILL
+        await rig.send(Verb.RESET, ResetRequest())
+        assert (await rig.until_fault(lambda faults: not faults.active)).first is None
+        assert rig.drive.loop.servo_on
+
+
+async def test_the_first_cause_is_kept_while_others_come_and_go():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        rig.condition(Condition.OVERHEAT)
+        await rig.until_fault(lambda faults: faults.active)
+
+        with pytest.raises(DriveFault):
+            await rig.send(Verb.RESET, ResetRequest())
+        rig.condition(Condition.STOP_INPUT)
+        rig.condition(Condition.OVERHEAT, present=False)
+        sample = await rig.until_fault(lambda faults: codes(faults) == ["stop_input"])
+
+        assert sample.first.code == "overheat"
+
+
+async def test_a_latched_cause_outlives_its_condition_until_reset():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        rig.condition(Condition.STOP_INPUT)
+        await rig.until_fault(lambda faults: faults.active)
+
+        rig.condition(Condition.STOP_INPUT, present=False)
+        await asyncio.sleep(1.0)
+
+        sample = await rig.until_fault(lambda _: True)
+        assert codes(sample) == ["stop_input"]
+
+
+async def test_reset_follows_the_printed_order_and_closes_nothing():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        rig.condition(Condition.OVERCURRENT)
+        await rig.until_fault(lambda faults: faults.active)
+        rig.condition(Condition.OVERCURRENT, present=False)
+
+        await rig.send(Verb.RESET, ResetRequest())
+
+        assert (rig.drive.stage.enabled, rig.drive.stage.latched, rig.drive.loop.servo_on) == (False, None, False)
+
+
+async def test_closing_the_loop_over_a_standing_cause_is_refused_with_its_name():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.until(lambda state: state.state is AxisState.DISABLED)
+        rig.condition(Condition.ENCODER_LOSS)  # not shown while the power driver is off
+
+        with pytest.raises(DriveFault, match="encoder or Hall signals are lost"):
+            await rig.send(Verb.POWER, PowerRequest(on=True))
+
+        sample = await rig.until_fault(lambda faults: faults.active)
+        assert codes(sample) == ["encoder_or_hall"]
+
+
+async def test_a_loop_that_opens_without_a_reason_is_a_fault_of_its_own():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        await rig.until(lambda state: state.state is AxisState.STANDSTILL)
+
+        rig.drive.restart()  # somebody else has switched it off
+
+        state = await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
+        assert not state.enabled
+
+
+async def test_a_position_error_limit_of_0_says_so_at_power_on():
+    async with dialect_rig(V4) as rig:
+        await rig.until(lambda state: state.link == "up")
+        await rig.send(Verb.SET_GAINS, SetGainsRequest(el=0))
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert codes(sample) == ["position_error"]

@@ -1,0 +1,272 @@
+"""Axes that start in one servo cycle, stop by one packet and show one instant."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.config import load_config
+from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
+from ldcnd.drivers.ldcn.controls import StopControl
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.drivers.line import GroupSpec, LineSpec, StartPolicy
+from ldcnd.errors import ConfigError, DriveFault, NotSupported, OutcomeUnknown, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.model.axes import AxisState, LinkState
+from ldcnd.model.requests import HomeMethod, MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from tests.support.bare_network import bare_network, specs
+from tests.support.chain_rig import drive, rig_on, simulated_config
+from tests.support.rig import SIMULATED
+
+MODULES = ("ls182ap", "picservo-v4", "picservo-v4", "ls182ap")
+AXES = specs("ls-182ap", "pic-servo-v4", "pic-servo-v4", "ls-182ap")
+PAIR = LineSpec(groups=(GroupSpec("pair", ("a2", "a3")),))
+LED_PAIR = LineSpec(groups=(GroupSpec("pair", ("a2", "a3"), leader="a3"),))
+THERE = Motion(20_000, 20_000.0, 100_000.0)
+BACK = Motion(-20_000, 20_000.0, 100_000.0)
+
+
+def chain_of(*modules, faults=None):
+    return build_chain(
+        ChainSpec(tuple(ModuleSpec(module) for module in modules or MODULES), faults=faults or FaultPlan())
+    )
+
+
+def wanted():
+    """Nothing has overtaken the motion."""
+
+
+async def up(line, *, power=True):
+    await line.network.bring_up()
+    for axis in line.network.axes.values() if power else ():
+        await axis.power(on=True)
+
+
+@pytest.mark.parametrize("line_spec", [PAIR, LED_PAIR])
+async def test_members_start_with_one_packet_and_nobody_else_does(line_spec):
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=line_spec) as line:
+        await up(line)
+        before = len(line.sent())
+
+        await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
+        started = [packet for packet in line.sent(before) if packet.command is Command.START_MOTION]
+        await asyncio.sleep(3)
+
+    assert [packet.address for packet in started] == [0x81]
+    assert [drive(chain, address).loop.position for address in (1, 4)] == [0, 0]
+    assert abs(drive(chain, 2).loop.position - 20_000) <= 1
+    assert abs(drive(chain, 3).loop.position + 20_000) <= 1
+
+
+async def test_the_whole_line_is_a_group_when_none_is_configured():
+    chain = chain_of()
+    async with bare_network(chain, AXES) as line:
+        await up(line)
+
+        await line.network.start_group(dict.fromkeys(line.network.axes, THERE), wanted)
+        await asyncio.sleep(0.3)
+        positions = [drive(chain, address).loop.position for address in (1, 2, 3, 4)]
+
+    assert min(positions) > 1000
+    assert max(positions) - min(positions) < 50
+
+
+async def test_nothing_starts_when_one_load_fails():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=PAIR) as line:
+        await up(line)
+
+        with pytest.raises(ValueOutOfRange):
+            await line.network.start_group({"a2": THERE, "a3": Motion(1 << 40, 1.0, 1.0)}, wanted)
+        await asyncio.sleep(1)
+
+        assert Command.START_MOTION not in {packet.command for packet in line.sent()}
+    assert drive(chain, 2).loop.position == 0
+
+
+async def test_nothing_starts_when_a_loop_is_open():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=PAIR) as line:
+        await up(line, power=False)
+        await line.network.axes["a2"].power(on=True)
+
+        with pytest.raises(DriveFault, match="a3"):
+            await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
+
+        assert Command.START_MOTION not in {packet.command for packet in line.sent()}
+
+
+async def test_a_stop_between_load_and_start_keeps_the_group_at_rest():
+    chain = chain_of()
+
+    def overtaken():
+        raise StopLatched("a stop came")
+
+    async with bare_network(chain, AXES, line=PAIR) as line:
+        await up(line)
+
+        with pytest.raises(StopLatched):
+            await line.network.start_group({"a2": THERE, "a3": BACK}, overtaken)
+
+        assert Command.START_MOTION not in {packet.command for packet in line.sent()}
+
+
+async def test_axes_that_are_no_group_are_refused():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=PAIR) as line:
+        await up(line)
+        before = len(line.sent())
+
+        with pytest.raises(NotSupported, match="not exactly the members"):
+            await line.network.start_group({"a1": THERE, "a2": THERE}, wanted)
+
+        assert line.sent(before) == []
+
+
+async def test_a_group_that_did_not_hear_its_start_is_stopped_and_reported():
+    chain = chain_of(faults=FaultPlan((Fault(FaultKind.REQUEST_LOST, 1.0, from_s=20.0, until_s=20.5),), 1))
+    loop = asyncio.get_running_loop()
+    async with bare_network(chain, AXES, line=PAIR) as line:
+        await up(line)
+        real_start = line.network._groups._start_motion
+
+        async def start_unheard(group):
+            await asyncio.sleep(20.1 - loop.time())
+            await real_start(group)
+            await asyncio.sleep(20.6 - loop.time())
+
+        line.network._groups._start_motion = start_unheard
+        with pytest.raises(OutcomeUnknown, match="did not start"):
+            await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
+        commands = [packet.command for packet in line.sent()]
+
+    assert commands.count(Command.START_MOTION) == 1
+    assert commands.index(Command.STOP_MOTOR, commands.index(Command.START_MOTION)) > 0
+    assert [drive(chain, address).loop.position for address in (2, 3)] == [0, 0]
+
+
+async def test_an_adopted_line_is_regrouped_before_its_groups_are_used():
+    chain = chain_of()
+    async with bare_network(chain, AXES) as line:
+        await up(line)
+    async with bare_network(chain, AXES, line=LineSpec(start=StartPolicy.ADOPT, groups=PAIR.groups)) as line:
+        report = await line.network.bring_up()
+        untouched = [module.group for module in chain.modules]
+
+        await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
+        await asyncio.sleep(3)
+
+    assert not report.reset
+    assert untouched == [0xFF] * 4
+    assert [module.group for module in chain.modules] == [0xFF, 0x81, 0x81, 0xFF]
+    assert [module.address for module in chain.modules] == [1, 2, 3, 4]
+    assert [drive(chain, address).loop.position // 1000 for address in (1, 4)] == [0, 0]
+    assert abs(drive(chain, 2).loop.position - 20_000) <= 1
+
+
+async def test_a_group_of_an_open_loop_is_not_stopped_together():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=PAIR) as line:
+        await up(line, power=False)
+        await line.network.axes["a2"].power(on=True)
+        before = len(line.sent())
+
+        await line.network.stop_together(StopMode.SMOOTH, frozenset({"a2"}))
+
+        assert line.sent(before) == []
+    assert not drive(chain, 3).loop.servo_on
+
+
+async def test_a_snapshot_shows_one_instant_of_moving_axes():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=LineSpec(snapshot=True)) as line:
+        await up(line)
+        await line.network.start_group(dict.fromkeys(line.network.axes, THERE), wanted)
+        await asyncio.sleep(0.5)
+
+        frozen = await line.network.snapshot()
+
+    assert frozen.keys() == {"a1", "a2", "a3", "a4"}
+    assert min(frozen.values()) > 5000
+    # at 20000 counts a second two servo cycles are 20 counts; five packets in between would be hundreds
+    assert max(frozen.values()) - min(frozen.values()) < 40
+
+
+async def test_no_snapshot_unless_configured():
+    chain = chain_of()
+    async with bare_network(chain, AXES) as line:
+        await up(line)
+
+        with pytest.raises(NotSupported, match="not configured"):
+            await line.network.snapshot()
+
+
+async def test_no_snapshot_while_a_homing_runs():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=LineSpec(snapshot=True)) as line:
+        await up(line)
+        await line.network.axes["a2"].load(Motion(None, 100.0, 1000.0), home=HomeCapture(HomeMethod.INDEX))
+
+        with pytest.raises(WrongState, match="a2 is homing"):
+            await line.network.snapshot()
+
+        assert Command.SAVE_CURRENT_POSITION_AS_HOME not in {packet.command for packet in line.sent()}
+
+
+async def test_the_stop_of_a_rig_begins_with_one_packet_for_all_its_drives():
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in ("ls182ap", "ls182ap") + ("picservo-v4",) * 2)))
+    async with rig_on(chain, simulated_config()) as rig:
+        for name in ("x", "y", "z", "c"):
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=50.0))
+        await rig.client.command("c", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=500.0))
+        await asyncio.sleep(0.5)
+        before = len(rig.sent)
+
+        reply = await rig.client.stop()
+        stops = [packet.address for packet in rig.sent[before:] if packet.command is Command.STOP_MOTOR]
+        states = [await rig.until(name, lambda state: state.state is AxisState.STANDSTILL) for name in ("x", "c")]
+
+    assert set(reply.confirmed) == {"x", "y", "z", "c"}
+    assert stops[0] == 0xFF
+    assert sorted(stops[1:]) == [1, 2, 3, 4]
+    assert all(state.stop_latched for state in states)
+
+
+async def test_the_stop_of_a_rig_closes_no_open_loop():
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in ("ls182ap", "ls182ap") + ("picservo-v4",) * 2)))
+    async with rig_on(chain, simulated_config()) as rig:
+        for name in ("x", "z"):
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Verb.POWER, PowerRequest(on=True))
+
+        before = len(rig.sent)
+        await rig.client.stop()
+        stops = [packet for packet in rig.sent[before:] if packet.command is Command.STOP_MOTOR]
+
+    assert {packet.address for packet in stops} == {1, 2, 3, 4}
+    assert [packet.data for packet in stops if packet.address in (2, 4)] == [bytes([StopControl.MOTOR_OFF])] * 2
+    assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("addition", "complaint"),
+    [
+        ('group = [{ name = "g", axes = ["x", "nobody"] }]', "no axis 'nobody' on this bus"),
+        ('group = [{ name = "g", axes = ["x", "y"], leader = "z" }]', "leader 'z' is not one of x, y"),
+        ('group = [{ name = "g", axes = ["x", "y"] }, { name = "h", axes = ["y", "z"] }]', "'y' is given more than"),
+        ("baud = 230400", "ls-182ap at address 1 reaches 115200 at most"),
+        ('module = [{ address = 4, model = "pic-io" }]', "address 4 of a module is given twice"),
+        ('module = [{ address = 5, model = "toaster" }]', "no such module"),
+    ],
+)
+def test_impossible_lines_are_refused_before_anything_is_opened(tmp_path, addition, complaint):
+    rate = "baud = 115200"
+    instead = addition if addition.startswith("baud") else f"{rate}\n{addition}"
+    file = tmp_path / "rig.toml"
+    file.write_text(SIMULATED.read_text().replace(rate, instead, 1))
+
+    with pytest.raises(ConfigError, match=complaint):
+        load_config(file)

@@ -1,0 +1,228 @@
+"""Traces by the host through the whole daemon: an LDCN axis sampled as fast as its line allows."""
+
+import asyncio
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from ldcnd.client.traces import arm_trace, fetch_trace, take_trace, wait_for_trace
+from ldcnd.config import load_config
+from ldcnd.drivers.ldcn.simulator import build_chain
+from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
+from ldcnd.model.requests import (
+    MoveAbsoluteRequest,
+    PowerRequest,
+    TraceAbortRequest,
+    TraceRequest,
+    Verb,
+)
+from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.traces import TracePhase, TraceTrigger, TriggerKind
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from tests.support.rig import SIMULATED, running_rig
+
+
+async def ready(rig):
+    await rig.until("x", lambda state: state.link == "up")
+    await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+
+
+def rising(level, channel="velocity"):
+    return TraceTrigger(channel=channel, kind=TriggerKind.RISING, level=level)
+
+
+async def test_fastest_trace_follows_a_move_with_a_true_time_for_every_sample():
+    async with running_rig() as rig:
+        await ready(rig)
+
+        request = TraceRequest(
+            channels=("position", "velocity", "following_error"), samples=400, pre_trigger=50, trigger=rising(2.0)
+        )
+        reply = await arm_trace(rig.client, "x", request)
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await wait_for_trace(rig.client, "x", reply.trace_id, 60)
+        trace = await fetch_trace(rig.client, "x", reply.trace_id)
+
+    position, velocity, _error = trace.values
+    offsets = trace.offsets_ns
+    assert len(offsets) == len(position) == 400
+    assert (trace.header.trigger_index, offsets[50]) == (50, 0)
+    assert velocity[49] < 2.0 <= velocity[50]
+    assert all(later > earlier for earlier, later in pairwise(offsets))
+    assert len({later - earlier for earlier, later in pairwise(offsets)}) > 5
+    travelled = sum((velocity[k] + velocity[k + 1]) / 2 * (offsets[k + 1] - offsets[k]) * 1e-9 for k in range(50, 399))
+    assert position[399] - position[50] == pytest.approx(travelled, abs=0.05)
+    assert trace.raw[0] == tuple(round(value * 1000) for value in position)
+
+
+async def test_asked_interval_is_kept_on_a_grid():
+    async with running_rig() as rig:
+        await ready(rig)
+
+        trace = await take_trace(
+            rig.client, "x", TraceRequest(channels=("position",), interval_s=0.02, samples=50), within_s=60
+        )
+
+    assert trace.header.interval_s == 0.02
+    assert all(abs(offset - k * 20e6) < 10e6 for k, offset in enumerate(trace.offsets_ns))
+
+
+async def test_other_axes_keep_their_rates_while_one_is_traced_as_fast_as_possible():
+    async def gaps_s(rig, axis):
+        """The pauses between positions, which are due every 50 ms on y and every 100 ms on z."""
+        stamps = []
+        async with rig.client.samples(axis, TelemetryItem.POSITION) as samples:
+            async with asyncio.timeout(5):
+                while len(stamps) < 30:
+                    stamps.append((await anext(samples))[1].t)
+        return [(later - earlier) / 1e9 for earlier, later in pairwise(stamps)]
+
+    async with running_rig() as rig:
+        await ready(rig)
+        bus = rig.daemon.rig.buses[0].bus
+        longest_s = max(
+            bus.longest_s(axis.driver.reading(frozenset(TelemetryItem))) for axis in rig.daemon.rig.buses[0].axes
+        )
+        reply = await arm_trace(rig.client, "x", TraceRequest(channels=("position",), samples=10_000))
+
+        gaps = {axis: await gaps_s(rig, axis) for axis in ("y", "z")}
+        header = await rig.client.trace_header("x")
+
+    assert (header.trace_id, header.phase) == (reply.trace_id, TracePhase.RECORDING)
+    for axis, period_s in (("y", 0.05), ("z", 0.1)):
+        # four polls may be due at once, and one exchange of the trace may be on the wire
+        assert max(gaps[axis]) < period_s + 5 * longest_s
+        assert sum(gaps[axis]) / 29 == pytest.approx(period_s, abs=longest_s)
+
+
+async def test_level_trigger_fires_on_a_signal_that_is_there_already():
+    async with running_rig() as rig:
+        await ready(rig)
+
+        above = TraceTrigger(channel="enabled", kind=TriggerKind.ABOVE)
+        trace = await take_trace(
+            rig.client, "x", TraceRequest(channels=("enabled",), samples=20, pre_trigger=5, trigger=above), within_s=60
+        )
+
+    assert trace.header.trigger_index == 5
+
+
+async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_the_line():
+    async with running_rig() as rig:
+        await ready(rig)
+        request = TraceRequest(channels=("velocity",), trigger=rising(40.0), timeout_s=2.0)
+
+        with pytest.raises(DriveFault, match="the trigger did not come within 2 s"):
+            await take_trace(rig.client, "x", request, within_s=60)
+        header = await rig.client.trace_header("x")
+        before = rig.daemon.rig.buses[0].bus.statistics.exchanges
+        await asyncio.sleep(1)
+        polled = rig.daemon.rig.buses[0].bus.statistics.exchanges - before
+
+    assert (header.phase, header.chunks) == (TracePhase.TIMED_OUT, 0)
+    assert polled < 120
+
+
+async def test_second_trace_is_refused_until_the_first_is_aborted():
+    async with running_rig() as rig:
+        await ready(rig)
+        request = TraceRequest(channels=("velocity",), trigger=rising(40.0))
+        first = await arm_trace(rig.client, "x", request)
+
+        with pytest.raises(BusyTracing, match=first.trace_id):
+            await arm_trace(rig.client, "x", request)
+        aborted = await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+        header = await rig.client.trace_header("x")
+        again = await arm_trace(rig.client, "x", request)
+        await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+        with pytest.raises(WrongState, match="no trace is under way"):
+            await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+
+    assert (aborted.trace_id, header.phase) == (first.trace_id, TracePhase.ABORTED)
+    assert again.trace_id != first.trace_id
+
+
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        (TraceRequest(channels=("torque",)), "cannot trace 'torque'; there are position, velocity"),
+        (TraceRequest(channels=("position", "position")), "named twice"),
+        (TraceRequest(channels=("position",), trigger=rising(1.0)), "which is not recorded"),
+        (TraceRequest(channels=("velocity",), trigger=rising(1.0), pre_trigger=500), "leave none of 500"),
+        (TraceRequest(channels=("position",), interval_s=0.0001), "a poll takes up to"),
+    ],
+)
+async def test_impossible_request_is_refused_with_the_reason(request_, reason):
+    async with running_rig() as rig:
+        await ready(rig)
+
+        with pytest.raises(ValueOutOfRange, match=reason):
+            await arm_trace(rig.client, "x", request_)
+        header = await rig.client.trace_header("x")
+
+    assert header is None
+
+
+async def test_axis_says_what_can_be_traced():
+    async with running_rig() as rig:
+        axes = {axis.axis: axis for axis in await rig.client.axes()}
+
+    assert axes["x"].trace_channels[:3] == ("position", "velocity", "following_error")
+    assert {"trace", "trace_abort"} <= set(axes["x"].capabilities)
+
+
+async def test_every_ldcn_and_nmc_drive_of_the_rig_is_traced_faster_than_it_is_polled():
+    async with running_rig() as rig:
+        rates_hz = {}
+        for axis in ("x", "y", "z", "c"):
+            await rig.until(axis, lambda state: state.link == "up")
+            trace = await take_trace(
+                rig.client, axis, TraceRequest(channels=("position", "velocity", "enabled"), samples=200), within_s=60
+            )
+            rates_hz[axis] = 199 / (trace.offsets_ns[-1] * 1e-9)
+
+    assert all(rate > 100 for rate in rates_hz.values()), rates_hz
+
+
+async def test_a_lost_line_ends_the_trace_at_once_and_the_next_one_works():
+    config = load_config(SIMULATED)
+    line = config.sim[0]
+    unplugged = Fault(FaultKind.UNPLUGGED, from_s=5.0, until_s=5.1, longest_s=0.5)
+    chain = build_chain(replace(line.spec(), faults=FaultPlan((unplugged,))))
+    async with running_rig(config, {line.name: chain}) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        request = TraceRequest(channels=("position",), samples=10_000)
+        reply = await arm_trace(rig.client, "x", request)
+        header = await wait_for_trace(rig.client, "x", reply.trace_id, 60)
+        ended_at_s = asyncio.get_running_loop().time()
+        await rig.until("x", lambda state: state.link == "up")
+        again = await take_trace(rig.client, "x", TraceRequest(channels=("position",), samples=20), within_s=60)
+
+    assert (header.phase, header.chunks) == (TracePhase.FAILED, 0)
+    assert "was lost while it was traced" in header.problem
+    assert ended_at_s < 6.0
+    assert len(again.offsets_ns) == 20
+
+
+async def test_a_stop_on_the_traced_line_waits_for_the_poll_on_the_wire_only():
+    async with running_rig() as rig:
+        await ready(rig)
+        bus, loop = rig.daemon.rig.buses[0].bus, asyncio.get_running_loop()
+        longest_s = bus.longest_s(rig.daemon.rig.axis("x").driver.reading(frozenset(TelemetryItem)))
+        await rig.client.stop("y")
+        began_s = loop.time()
+        await rig.client.stop("y")
+        alone_s = loop.time() - began_s
+        await arm_trace(rig.client, "x", TraceRequest(channels=("position",), samples=10_000))
+
+        waits_s = []
+        for _ in range(50):
+            began_s = loop.time()
+            await rig.client.stop("y")
+            waits_s.append(loop.time() - began_s)
+            await asyncio.sleep(0.0137)
+        header = await rig.client.trace_header("x")
+
+    assert header.phase is TracePhase.RECORDING
+    assert max(waits_s) <= alone_s + longest_s + 0.001

@@ -1,0 +1,64 @@
+"""A daemon process that is killed in mid-move, and the one that takes its place."""
+
+import asyncio
+import contextlib
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ldcnd.model.axes import AxisState, LinkState
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import PositionSample, TelemetryItem
+from tests.support.process import ROOT, START_TIME_S, _all_axes_answer, client, free_port, process, simulated_terminal
+
+pytestmark = pytest.mark.real_time
+
+
+@asynccontextmanager
+async def killable_daemon(config):
+    """Run a daemon; yields its process and its endpoint once every axis answers."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with process("run", "--config", str(config), "--listen", endpoint) as running:
+        async with asyncio.timeout(START_TIME_S):
+            while not await _all_axes_answer(endpoint):
+                assert running.returncode is None, "the daemon has ended"
+                await asyncio.sleep(0.1)  # nothing tells a client that a port has begun to listen
+        yield running, endpoint
+
+
+async def counts_of(rig, axis):
+    async with rig.samples(axis, TelemetryItem.POSITION) as positions, asyncio.timeout(5):
+        _, position = await anext(positions)
+    assert isinstance(position, PositionSample)
+    return position.counts
+
+
+async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
+    link, config = tmp_path / "line0", tmp_path / "adopt.toml"
+    simulated = (ROOT / "config" / "simulated.toml").read_text()
+    simulated = simulated[: simulated.index("[[sim]]")].replace('"sim:line0"', f'"{link}"')
+    config.write_text(simulated.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'))
+
+    async with simulated_terminal(link, "ls182ap", "ls182ap", "picservo-v4", "picservo-v4"):
+        async with killable_daemon(config) as (running, endpoint):
+            async with client(endpoint) as rig:
+                (first,) = await rig.buses()
+                await rig.command("x", Verb.POWER, PowerRequest(on=True))
+                await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90.0, velocity=5.0))
+                await asyncio.sleep(0.5)
+                before = await counts_of(rig, "x")
+                with contextlib.suppress(ProcessLookupError):
+                    running.kill()
+                await running.wait()
+
+        async with killable_daemon(config) as (_, endpoint), client(endpoint) as rig:
+            (second,) = await rig.buses()
+            state = await rig.state("x")
+            after = await counts_of(rig, "x")
+            still = await counts_of(rig, "y")
+
+    assert (first.started_by, second.started_by, second.baud) == ("reset", "adoption", 115_200)
+    assert state is not None
+    assert (state.link, state.state, state.referenced) == (LinkState.UP, AxisState.DISCRETE_MOTION, False)
+    assert 500 < before < after < 90_000
+    assert still == 0

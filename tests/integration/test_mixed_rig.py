@@ -1,0 +1,262 @@
+"""Two families in one daemon, on the jumping clock."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.config import load_config
+from ldcnd.drivers.smartstep.parameters import PN100
+from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
+from ldcnd.drivers.smartstep.simulator import smartstep_chain
+from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.monitors import MonitorName
+from ldcnd.model.parameters import (
+    AlarmReport,
+    CounterName,
+    CounterReply,
+    DriveProfile,
+    Memory,
+    ParameterDump,
+    ParameterList,
+    ParameterReply,
+)
+from ldcnd.model.requests import (
+    ClearCounterRequest,
+    ListParametersRequest,
+    MoveVelocityRequest,
+    PowerRequest,
+    ReadAlarmsRequest,
+    ReadAllParametersRequest,
+    ReadParameterRequest,
+    ReadProfileRequest,
+    ResetRequest,
+    Verb,
+    WriteParameterRequest,
+)
+from ldcnd.model.samples import FaultSample, PositionSample, StateSample, TelemetryItem, VelocitySample
+from tests.support.rig import RunningRig, running_rig
+from tests.support.smartstep_line import simulated
+
+MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
+
+
+@asynccontextmanager
+async def mixed_rig(state_dir: Path, units: list[SimulatedUnit]) -> AsyncIterator[RunningRig]:
+    config = load_config(MIXED).model_copy(update={"state_dir": state_dir})
+    async with running_rig(config, chains={"steps": smartstep_chain(units)}) as rig:
+        yield rig
+
+
+def two_drives() -> list[SimulatedUnit]:
+    units = [simulated(1), simulated(2)]
+    units[0].drive.set_run(0.0, on=True)
+    units[0].drive.set_pulse_rate(200.0, 0.0)
+    return units
+
+
+async def test_a_smartstep_publishes_the_same_shapes_as_the_other_family(tmp_path):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        state = await rig.until("feed", lambda state: state.moving is Moving.YES)
+        await asyncio.sleep(10.0)
+        position = await rig.client.last("feed", TelemetryItem.POSITION)
+        velocity = await rig.client.last("feed", TelemetryItem.VELOCITY)
+        fault = await rig.client.last("feed", TelemetryItem.FAULT)
+        at_rest = await rig.client.state("spool")
+
+    assert (state.state, state.enabled, state.link) == (AxisState.DISCRETE_MOTION, True, LinkState.UP)
+    assert isinstance(position, PositionSample)
+    assert position.value == pytest.approx(position.counts / 8000)
+    assert isinstance(velocity, VelocitySample)
+    assert velocity.value == pytest.approx(0.1, abs=0.01)
+    assert isinstance(fault, FaultSample)
+    assert fault.active == ()
+    assert (at_rest.state, at_rest.moving) == (AxisState.DISABLED, Moving.NO)
+
+
+async def test_monitors_are_published_below_the_axis(tmp_path):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        await asyncio.sleep(12.0)
+        monitors = await rig.client.monitors("feed")
+        infos = {axis.axis: axis for axis in await rig.client.axes()}
+
+    assert monitors[MonitorName.TORQUE_REFERENCE].value == 5
+    assert monitors[MonitorName.TORQUE_REFERENCE].unit == "%"
+    assert monitors[MonitorName.INPUT_SIGNALS].high == ("RESET",)
+    assert monitors[MonitorName.POSITION_DEVIATION].quality is Quality.GOOD
+    assert set(infos["feed"].monitors) == {name.value for name in monitors}
+
+
+async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        await rig.until("feed", lambda state: state.enabled)
+        loop = asyncio.get_running_loop()
+        units[0].drive.provoke(0x0070, loop.time())
+        stopped = await rig.until("feed", lambda state: state.state is AxisState.ERROR_STOP)
+        fault = await rig.client.last("feed", TelemetryItem.FAULT)
+        report = await rig.client.command("feed", Verb.READ_ALARMS, ReadAlarmsRequest())
+        units[0].drive.press_reset(loop.time())
+        again = await rig.until("feed", lambda state: state.state is not AxisState.ERROR_STOP)
+        cleared = await rig.client.last("feed", TelemetryItem.FAULT)
+
+    assert not stopped.enabled
+    assert [entry.code for entry in fault.active] == ["alarm_0070"]
+    assert isinstance(report, AlarmReport)
+    assert (report.present.text, report.history[0].code, len(report.history)) == ("Overload", 0x0070, 10)
+    assert again.enabled
+    assert (cleared.active, cleared.first) == ((), None)
+
+
+@pytest.mark.parametrize(
+    ("verb", "request_"),
+    [
+        (Verb.POWER, PowerRequest(on=True)),
+        (Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=1.0)),
+        (Verb.RESET, ResetRequest()),
+    ],
+)
+async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, verb, request_):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        await rig.until("feed", lambda state: state.enabled)
+        with pytest.raises(NotSupported):
+            await rig.client.command("feed", verb, request_)
+        infos = {axis.axis: axis for axis in await rig.client.axes()}
+
+    assert verb.value not in infos["feed"].capabilities
+    assert "write_parameter" in infos["feed"].capabilities
+    assert "write_parameter" not in infos["x"].capabilities
+
+
+async def test_parameters_are_refused_on_a_drive_without_them(tmp_path):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        with pytest.raises(NotSupported):
+            await rig.client.command("x", Verb.READ_PARAMETER, ReadParameterRequest(parameter="Pn100"))
+
+
+async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        listed = await rig.client.command("feed", Verb.LIST_PARAMETERS, ListParametersRequest())
+        await rig.client.command("feed", Verb.WRITE_PARAMETER, WriteParameterRequest(parameter="Pn100", value=120))
+        saved = await rig.client.command(
+            "feed", Verb.WRITE_PARAMETER, WriteParameterRequest(parameter="Pn102", value=50, memory=Memory.EEPROM)
+        )
+        dump = await rig.client.command("feed", Verb.READ_ALL_PARAMETERS, ReadAllParametersRequest(), timeout_s=60)
+
+    assert isinstance(listed, ParameterList)
+    assert len(listed.parameters) == 22
+    assert isinstance(saved, ParameterReply)
+    assert (saved.value.stored, saved.value.eeprom_writes, saved.written) == (50, 1, True)
+    assert isinstance(dump, ParameterDump)
+    assert {value.parameter for value in dump.values if value.differs} == {"Pn100", "Pn102"}
+    assert units[0].drive.memory.active(PN100) == 120
+    assert units[1].drive.memory.active(PN100) == 80
+    assert (tmp_path / "eeprom-writes.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("write", "error"),
+    [
+        (WriteParameterRequest(parameter="Pn100", value=3000), DataRefused),
+        (WriteParameterRequest(parameter="Pn999", value=1), ValueOutOfRange),
+    ],
+)
+async def test_a_refused_write_comes_back_as_its_own_error(tmp_path, write, error):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        with pytest.raises(LdcndError) as refusal:
+            await rig.client.command("feed", Verb.WRITE_PARAMETER, write)
+
+    assert type(refusal.value) is error
+
+
+async def test_the_same_command_id_never_writes_eeprom_twice(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        for value in (101, 101):
+            request = WriteParameterRequest(parameter="Pn100", value=value, memory=Memory.EEPROM, command_id="save-1")
+            await rig.client.command("feed", Verb.WRITE_PARAMETER, request)
+
+    assert units[0].drive.memory.writes[PN100.number] == 1
+
+
+async def test_the_budget_outlives_the_daemon(tmp_path):
+    (tmp_path / "eeprom-writes.json").write_text('{"feed": {"Pn100": 9000}}')
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        with pytest.raises(EepromBudgetSpent):
+            await rig.client.command(
+                "feed", Verb.WRITE_PARAMETER, WriteParameterRequest(parameter="Pn100", value=1, memory=Memory.EEPROM)
+            )
+
+
+async def test_a_cleared_counter_is_the_new_position(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        await rig.until("feed", lambda state: state.moving is Moving.YES)
+        units[0].drive.set_pulse_rate(0.0, asyncio.get_running_loop().time())
+        await rig.until("feed", lambda state: state.moving is Moving.NO)
+        reply = await rig.client.command("feed", Verb.CLEAR_COUNTER, ClearCounterRequest(counter=CounterName.FEEDBACK))
+        await asyncio.sleep(3.0)
+        position = await rig.client.last("feed", TelemetryItem.POSITION)
+
+    assert isinstance(reply, CounterReply)
+    assert reply.value == 0
+    assert position.counts == 0
+
+
+async def test_the_profile_tells_its_doubts(tmp_path):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        reply = await rig.client.command("feed", Verb.READ_PROFILE, ReadProfileRequest())
+
+    assert isinstance(reply, DriveProfile)
+    doubts = {doubt.key: doubt for doubt in reply.doubts}
+    assert (doubts["run_active_low"].standing, doubts["run_active_low"].setting) == ("assumed", "True")
+
+
+async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):
+    async def longest_stop_s(*, busy: bool) -> float:
+        async with mixed_rig(tmp_path, two_drives()) as rig:
+            await rig.until("x", lambda state: state.link is LinkState.UP)
+            line = rig.daemon.rig.buses[0].bus
+            async with asyncio.TaskGroup() as group:
+                if busy:
+                    for axis in ("feed", "spool"):
+                        dump = rig.client.command(axis, Verb.READ_ALL_PARAMETERS, ReadAllParametersRequest(), 60.0)
+                        group.create_task(dump, name=f"dump {axis}")
+                for _ in range(20):
+                    await asyncio.sleep(0.05)
+                    await rig.client.stop("x")
+            return line.statistics.latency[Lane.STOP].longest_s
+
+    assert await longest_stop_s(busy=True) <= await longest_stop_s(busy=False) + 1e-3
+
+
+async def test_a_rig_wide_stop_says_which_drive_it_could_not_stop(tmp_path):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        await rig.until("feed", lambda state: state.enabled)
+        reply = await rig.client.stop()
+        state = await rig.client.state("feed")
+
+    assert reply.confirmed == ("x",)
+    assert set(reply.axes) == {"x", "feed", "spool"}
+    assert isinstance(state, StateSample)
+    assert not state.stop_latched
+
+
+async def test_a_drive_that_loses_power_is_down_and_comes_back_by_itself(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        await rig.until("feed", lambda state: state.enabled)
+        await rig.until("spool", lambda state: state.link is LinkState.UP)
+        units[0].power_off(asyncio.get_running_loop().time())
+        await rig.until("feed", lambda state: state.link is LinkState.DOWN)
+        neighbour = await rig.client.state("spool")
+        units[0].power_on(asyncio.get_running_loop().time())
+        back = await rig.until("feed", lambda state: state.link is LinkState.UP and state.enabled)
+
+    assert neighbour.link is LinkState.UP
+    assert back.state is AxisState.DISCRETE_MOTION

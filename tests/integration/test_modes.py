@@ -1,0 +1,314 @@
+"""The modes beside profiles: analog positioning and raw duty; on the jumping clock."""
+
+import asyncio
+import contextlib
+
+import pytest
+
+from ldcnd.drivers.ldcn.simulated_power import Condition
+from ldcnd.errors import (
+    DriveFault,
+    LdcndError,
+    NotSupported,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.model.axes import AxisState, Capability
+from ldcnd.model.requests import (
+    HaltRequest,
+    HomeRequest,
+    MoveAbsoluteRequest,
+    MoveAnalogRequest,
+    SetPwmRequest,
+    TrackRequest,
+    Verb,
+)
+from tests.support.dialect_rig import (
+    AXIS,
+    DIALECTS,
+    LS_173AP,
+    LS_182AP,
+    LS_182AP_22,
+    SC,
+    V1,
+    V4,
+    dialect_rig,
+)
+
+PWM = {"duty": 0.3, "duration_s": 5.0}
+
+
+def named(dialects):
+    return pytest.mark.parametrize("dialect", dialects, ids=lambda dialect: dialect.name)
+
+
+@named(DIALECTS)
+async def test_the_capabilities_tell_what_the_model_can_do(dialect):
+    async with dialect_rig(dialect) as rig:
+        (info,) = await rig.rig.client.axes()
+
+    special = {Capability.MOVE_ANALOG, Capability.TRACK, Capability.SET_OUTPUTS, Capability.SET_PWM}
+    expected = {Capability.SET_PWM}
+    if dialect in (LS_173AP, LS_182AP, LS_182AP_22):
+        expected.add(Capability.MOVE_ANALOG)
+    if dialect is not V1:
+        expected.add(Capability.TRACK)
+    if dialect is V4:
+        expected.add(Capability.SET_OUTPUTS)
+    assert special & set(info.capabilities) == expected
+
+
+# -- absolute positioning on the A/D value ---------------------------------------------------------------------------
+
+
+@named((LS_173AP, LS_182AP, LS_182AP_22))
+@pytest.mark.parametrize("share", [0.65, 0.35])
+async def test_an_analog_move_finds_its_direction_and_ends_at_the_value(dialect, share):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        full_scale = 1023 if dialect is not LS_173AP else 255
+        target = round(share * full_scale)
+
+        reply = await rig.send(Verb.MOVE_ANALOG, MoveAnalogRequest(target=target, velocity=5.0))
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.DISCRETE_MOTION
+        state = await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+        assert (state.state, state.last_error, reply.target) == (AxisState.STANDSTILL, None, target)
+        assert rig.position_mm == pytest.approx(share * 50 - 25, abs=0.3)
+
+
+@named((V4, SC))
+async def test_an_analog_move_needs_a_drive_that_knows_it(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+
+        with pytest.raises(NotSupported, match="cannot move_analog"):
+            await rig.send(Verb.MOVE_ANALOG, MoveAnalogRequest(target=100))
+
+
+@pytest.mark.parametrize(("dialect", "target", "nearest"), [(LS_182AP, 7, 8), (LS_182AP, 1016, 1015), (LS_173AP, 1, 2)])
+async def test_an_analog_target_where_the_sensor_counts_as_broken_is_refused(dialect, target, nearest):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+
+        with pytest.raises(ValueOutOfRange, match="takes its sensor for broken") as refusal:
+            await rig.send(Verb.MOVE_ANALOG, MoveAnalogRequest(target=target))
+
+        assert refusal.value.nearest == nearest
+
+
+async def test_an_analog_move_is_refused_while_the_sensor_is_disconnected():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        rig.condition(Condition.SENSOR_LOST)
+
+        with pytest.raises(DriveFault, match="the analog sensor reads 0"):
+            await rig.send(Verb.MOVE_ANALOG, MoveAnalogRequest(target=500))
+
+        state = await rig.rig.client.state(AXIS)
+        assert (state.state, rig.drive.loop.trajectory.velocity) == (AxisState.STANDSTILL, 0)
+
+
+async def test_an_analog_move_stops_beyond_a_software_limit():
+    async with dialect_rig(LS_182AP, limits={"position_max": 3}) as rig:
+        await rig.power_on()
+
+        state = await rig.done(Verb.MOVE_ANALOG, MoveAnalogRequest(target=900, velocity=5.0))
+
+        assert (state.state, state.last_error) == (
+            AxisState.STANDSTILL,
+            "move_analog: stopped beyond a software limit",
+        )
+        assert 3.0 < rig.position_mm < 4.0
+
+
+async def test_a_plain_move_after_an_analog_one_ignores_the_sensor():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        await rig.done(Verb.MOVE_ANALOG, MoveAnalogRequest(target=600, velocity=5.0))
+        rig.condition(Condition.SENSOR_LOST)
+
+        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1.0))
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+
+
+# -- raw duty --------------------------------------------------------------------------------------------------------
+
+
+@named(DIALECTS)
+@pytest.mark.parametrize("duty", [0.1, -0.1])
+async def test_a_duty_turns_the_motor_for_its_time_and_then_the_axis_holds(dialect, duty):
+    async with dialect_rig(dialect, pwm=PWM, acceleration=2000) as rig:
+        await rig.power_on()
+
+        reply = await rig.send(Verb.SET_PWM, SetPwmRequest(duty=duty, duration_s=0.1))
+        running = await rig.rig.client.state(AXIS)
+        await asyncio.sleep(0.09)
+        assert rig.drive.loop.pwm == round(duty * 255)
+        state = await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+        assert (running.state, running.command.verb) == (AxisState.CONTINUOUS_MOTION, "set_pwm")
+        assert reply.duty == pytest.approx(duty, abs=0.002)
+        assert (state.state, state.enabled, state.last_error) == (AxisState.STANDSTILL, True, None)
+        assert rig.position_mm * duty > 0
+        assert (await rig.until_fault(lambda _: True)).first is None
+
+
+async def test_a_duty_on_a_reversed_axis_turns_the_other_way():
+    async with dialect_rig(V4, pwm=PWM, direction="reverse", acceleration=2000) as rig:
+        await rig.power_on()
+
+        await rig.done(Verb.SET_PWM, SetPwmRequest(duty=0.1, duration_s=0.1))
+
+        assert rig.position_mm < 0
+
+
+async def test_polls_between_the_packets_of_a_duty_do_not_end_it():
+    rates = {"position": 1000, "velocity": 1000, "state": 1000}
+    async with dialect_rig(V4, pwm=PWM, acceleration=2000, rates=rates) as rig:
+        await rig.power_on()
+
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.05, duration_s=0.2))
+        await asyncio.sleep(0.18)
+
+        assert rig.drive.loop.pwm == 13
+
+
+async def test_a_stop_ends_a_duty_at_once():
+    async with dialect_rig(LS_182AP, pwm=PWM, acceleration=2000) as rig:
+        await rig.power_on()
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.05, duration_s=5.0))
+        await asyncio.sleep(0.1)
+
+        await rig.rig.client.stop(AXIS)
+        state = await rig.until(lambda state: state.state is AxisState.STANDSTILL)
+
+        assert (state.enabled, state.stop_latched) == (True, True)
+        where = rig.position_mm
+        await asyncio.sleep(6.0)
+        assert rig.position_mm == pytest.approx(where, abs=0.02)
+
+
+@pytest.mark.parametrize("turns", range(1, 20, 2))
+@pytest.mark.parametrize(
+    ("verb", "request_"),
+    [
+        (Verb.SET_PWM, SetPwmRequest(duty=0.05, duration_s=3.0)),
+        (Verb.HOME, HomeRequest(method="forward_limit", velocity=5.0)),
+        (Verb.MOVE_ANALOG, MoveAnalogRequest(target=800, velocity=5.0)),
+        (Verb.TRACK, TrackRequest(position=0.1)),
+    ],
+)
+async def test_whenever_a_stop_comes_nothing_moves_afterwards(verb, request_, turns):
+    async with dialect_rig(LS_182AP, pwm=PWM, tracking={"step": 0.5, "rate": 50.0}, acceleration=2000) as rig:
+        await rig.power_on()
+        axis = rig.rig.daemon.rig.axis(AXIS)
+
+        async with asyncio.TaskGroup() as group:
+            group.create_task(_ignoring_refusals(axis.execute(verb, request_)))
+            await asyncio.sleep(turns * 0.0004)
+            await rig.rig.daemon.rig.stop((AXIS,))
+        await rig.until(lambda state: state.state is AxisState.STANDSTILL)
+        await asyncio.sleep(1.0)
+        where = rig.position_mm
+        await asyncio.sleep(3.0)
+
+        assert rig.position_mm == pytest.approx(where, abs=0.003)
+        assert abs(where) < 0.3
+        assert (rig.drive.loop.servo_on, rig.drive.loop.search) == (True, None)
+
+
+async def _ignoring_refusals(work):
+    with contextlib.suppress(LdcndError):
+        await work
+
+
+async def test_a_duty_may_be_replaced_while_it_runs():
+    async with dialect_rig(V4, pwm=PWM, acceleration=2000) as rig:
+        await rig.power_on()
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.05, duration_s=0.1))
+
+        reply = await rig.send(Verb.SET_PWM, SetPwmRequest(duty=-0.05, duration_s=0.2))
+        await asyncio.sleep(0.15)
+
+        assert rig.drive.loop.pwm == -13
+        assert (await rig.rig.client.wait_for_end(AXIS, reply.command_id)).state is AxisState.STANDSTILL
+
+
+@named((V4, LS_182AP))
+@pytest.mark.parametrize(("duration_s", "unplugged_s"), [(4.0, 0.5), (0.5, 1.5)])
+async def test_a_duty_does_not_survive_the_loss_of_the_line(dialect, duration_s, unplugged_s):
+    async with dialect_rig(dialect, pwm=PWM, acceleration=2000) as rig:
+        await rig.power_on()
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.05, duration_s=duration_s))
+        await asyncio.sleep(0.2)
+
+        rig.chain.unplug(asyncio.get_running_loop().time(), unplugged_s)
+        await asyncio.sleep(unplugged_s - 0.1)
+        assert rig.drive.loop.pwm == 13
+        await asyncio.sleep(3.0)
+
+        assert rig.drive.loop.pwm == 0
+        assert not rig.drive.stage.enabled
+
+
+async def test_halt_ends_a_duty():
+    async with dialect_rig(V4, pwm=PWM, acceleration=2000) as rig:
+        await rig.power_on()
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.05, duration_s=5.0))
+
+        state = await rig.done(Verb.HALT, HaltRequest())
+
+        assert (state.state, state.enabled, state.last_error) == (
+            AxisState.STANDSTILL,
+            True,
+            "set_pwm: aborted by halt",
+        )
+
+
+async def test_a_move_during_a_duty_is_refused():
+    async with dialect_rig(V4, pwm=PWM) as rig:
+        await rig.power_on()
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.0, duration_s=1.0))
+
+        with pytest.raises(WrongState, match="continuous_motion"):
+            await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1.0))
+
+
+async def test_the_end_of_a_duty_does_not_disturb_what_came_after_a_reset():
+    async with dialect_rig(LS_182AP, pwm=PWM) as rig:
+        await rig.power_on()
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.0, duration_s=1.0))
+        await rig.send(Verb.HALT, HaltRequest())
+        await rig.until(lambda state: state.state is AxisState.STANDSTILL)
+
+        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=15.0, velocity=5.0))
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+
+
+@pytest.mark.parametrize(
+    ("request_", "complaint", "nearest"),
+    [
+        (SetPwmRequest(duty=0.31, duration_s=1), "duty 0.31 is above the limit 0.3", 0.3),
+        (SetPwmRequest(duty=-0.5, duration_s=1), "duty -0.5 is above the limit 0.3", -0.3),
+        (SetPwmRequest(duty=0.1, duration_s=6), "6 s of duty is above the limit 5 s", 5.0),
+    ],
+)
+async def test_a_duty_beyond_the_configured_bounds_is_refused(request_, complaint, nearest):
+    async with dialect_rig(V4, pwm=PWM) as rig:
+        await rig.power_on()
+
+        with pytest.raises(ValueOutOfRange, match=complaint) as refusal:
+            await rig.send(Verb.SET_PWM, request_)
+
+        assert (refusal.value.nearest, rig.drive.loop.servo_on) == (nearest, True)
+
+
+async def test_an_axis_takes_no_duty_unless_it_is_configured_for_it():
+    async with dialect_rig(V4) as rig:
+        await rig.power_on()
+
+        with pytest.raises(NotSupported, match="not configured for raw duties"):
+            await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.1, duration_s=1))

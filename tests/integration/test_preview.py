@@ -1,0 +1,68 @@
+"""What a move would do, asked before it is commanded, on the jumping clock."""
+
+import pytest
+
+from ldcnd.bus.wire_log import WireEvent
+from ldcnd.errors import MalformedRequest
+from ldcnd.model.preview import PlanRequest
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from tests.support.rig import RunningRig, running_rig
+
+
+def sent(rig: RunningRig) -> list[str]:
+    records = rig.daemon.rig.buses[0].bus.wire_log.records()
+    return [record.data.hex(" ") for record in records if record.event is WireEvent.SENT]
+
+
+async def test_a_plan_is_what_the_move_then_is():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+
+        plan = await rig.client.plan("x", PlanRequest(position=12.3456, velocity=7.0))
+        before = len(sent(rig))
+        move = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=12.3456, velocity=7.0))
+
+        assert plan.refusal is None
+        assert plan.obstacles == ()
+        assert (plan.position, plan.velocity, plan.acceleration, plan.duration_s) == (
+            move.position,
+            move.velocity,
+            move.acceleration,
+            move.duration_s,
+        )
+        assert plan.position == pytest.approx(12.346)
+        assert plan.velocity_error == pytest.approx(plan.velocity - 7.0)
+        assert abs(plan.velocity_error) < 0.001
+        assert plan.packets == tuple(packet for packet in sent(rig)[before:] if packet in plan.packets)
+        assert 0.001 < plan.bus_s < 0.01
+
+
+async def test_a_plan_sends_nothing():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link == "up")
+
+        plan = await rig.client.plan("x", PlanRequest(distance=1.0))
+
+        assert not set(plan.packets) & set(sent(rig))
+        assert plan.obstacles == ("axis x is disabled",)
+
+
+async def test_a_plan_that_cannot_be_names_the_nearest_that_can():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link == "up")
+
+        far = await rig.client.plan("x", PlanRequest(position=500.0))
+        fast = await rig.client.plan("x", PlanRequest(velocity=-60.0))
+
+        assert (far.refusal.code, far.refusal.nearest) == ("position_limit", 100)
+        assert (fast.refusal.code, fast.refusal.nearest) == ("velocity_limit", -50)
+
+
+async def test_a_plan_says_which_motion_is_meant():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link == "up")
+
+        for vague in (PlanRequest(), PlanRequest(position=1.0, distance=1.0)):
+            with pytest.raises(MalformedRequest):
+                await rig.client.plan("x", vague)

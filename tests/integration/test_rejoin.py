@@ -1,0 +1,267 @@
+"""Drives that lose power and come back, while the others work on."""
+
+import asyncio
+from itertools import pairwise
+
+import pytest
+
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.messaging.keys import Keys
+from ldcnd.model.axes import AxisState, LinkState
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import TelemetryItem
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
+
+MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
+NAMES = ("x", "y", "z", "c")
+MARGINS_MS = (5, 50)
+
+
+def chain_of(*models):
+    return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in models or MODELS)))
+
+
+def set_power(chain, address, *, on):
+    chain.modules[address - 1].power(on=on, at_s=asyncio.get_running_loop().time())
+
+
+async def power_all(rig):
+    for name in NAMES:
+        await rig.until(name, lambda state: state.link is LinkState.UP)
+        await rig.client.command(name, Verb.POWER, PowerRequest(on=True))
+
+
+async def arrivals(rig, axis, item):
+    """Return the instants, in loop time, at which samples arrive from now on."""
+    at_s = []
+    loop = asyncio.get_running_loop()
+    await rig.session.subscribe(Keys("sim").telemetry(axis, item), lambda _sample: at_s.append(loop.time()))
+    return at_s
+
+
+def moved_since(rig, seen):
+    """Return the packets sent since `seen` that are not known to move and reset nothing."""
+    harmless = {Command.READ_STATUS, Command.NO_OPERATION, Command.SET_BAUD_RATE, Command.SET_ADDRESS}
+    return [packet for packet in rig.sent[seen:] if packet.command not in harmless]
+
+
+@pytest.mark.parametrize("margin_ms", MARGINS_MS)
+async def test_a_drive_that_lost_power_is_back_within_3_s_and_the_others_finish_without_a_reset(margin_ms):
+    chain = chain_of()
+    loop = asyncio.get_running_loop()
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END, margin_ms=margin_ms)) as rig:
+        await power_all(rig)
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90.0, velocity=10.0))
+        await rig.client.command("z", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=-40.0, velocity=5.0))
+        await rig.client.command("c", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=900.0))
+        await asyncio.sleep(1)
+        seen = len(rig.sent)
+        polled_at_s = await arrivals(rig, "x", TelemetryItem.POSITION)
+
+        set_power(chain, 2, on=False)
+        await asyncio.sleep(2.5)
+        dark = await rig.client.state("y")
+        seeing = [await rig.client.state(name) for name in ("x", "c")]
+        set_power(chain, 2, on=True)
+        powered_at_s = loop.time()
+        back = await rig.until("y", lambda state: state.link is LinkState.UP)
+        took_s = loop.time() - powered_at_s
+        heard = await rig.until("z", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(12)
+        (bus,) = await rig.client.buses()
+        meanwhile = moved_since(rig, seen)
+
+    assert dark.link is LinkState.DOWN
+    assert [(state.link, state.state) for state in seeing] == [(LinkState.UP, AxisState.DISCRETE_MOTION)] * 2
+    assert took_s < 3.0
+    assert max(later - earlier for earlier, later in pairwise(polled_at_s)) < 0.1 + 8 * margin_ms / 1000
+    assert (back.state, back.referenced) == (AxisState.DISABLED, False)
+    assert not heard.referenced  # cut off by its neighbour: it went on unseen
+    assert meanwhile == []
+    assert bus.baud == 115_200
+    assert [drive(chain, address).baud for address in (1, 2, 3, 4)] == [drive(chain, 1).baud] * 4
+    assert abs(drive(chain, 1).loop.position - 90_000) <= 1
+    assert abs(drive(chain, 3).loop.position + 80_000) <= 1
+    assert abs(drive(chain, 4).loop.position - 90_000) <= 1
+    assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True, False, True, True]
+    assert drive(chain, 2).loop.position == 0
+
+
+async def test_the_axis_works_again_once_it_is_powered():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        set_power(chain, 2, on=False)
+        await rig.until("y", lambda state: state.link is LinkState.DOWN)
+        set_power(chain, 2, on=True)
+        await rig.until("y", lambda state: state.link is LinkState.UP)
+
+        await rig.client.command("y", Verb.POWER, PowerRequest(on=True))
+        state = await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
+
+    assert not state.referenced
+    assert drive(chain, 2).loop.gains.kp == 350
+    assert drive(chain, 2).loop.servo_on
+
+
+async def test_several_neighbours_that_lost_power_come_back_in_order():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        for address in (2, 3):
+            set_power(chain, address, on=False)
+        await asyncio.sleep(2)
+        for address in (3, 2):
+            set_power(chain, address, on=True)
+        for name in NAMES:
+            await rig.until(name, lambda state: state.link is LinkState.UP, 3.0)
+
+    assert [module.address for module in chain.modules] == [1, 2, 3, 4]
+    assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True, False, False, True]
+
+
+async def test_a_whole_chain_that_lost_power_comes_back():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        for address in (1, 2, 3, 4):
+            set_power(chain, address, on=False)
+        await asyncio.sleep(2)
+        for address in (1, 2, 3, 4):
+            set_power(chain, address, on=True)
+        states = [await rig.until(name, lambda state: state.link is LinkState.UP, 3.0) for name in NAMES]
+
+    assert [state.state for state in states] == [AxisState.DISABLED] * 4
+    assert [module.address for module in chain.modules] == [1, 2, 3, 4]
+
+
+async def test_a_module_that_is_no_axis_comes_back_too():
+    chain = chain_of("ls182ap", "ls182ap", "picservo-v4", "picservo-v4", "picio")
+    async with rig_on(chain, simulated_config(module=[{"address": 5, "model": "pic-io"}])) as rig:
+        await power_all(rig)
+        set_power(chain, 5, on=False)
+        await asyncio.sleep(6)
+        (dark,) = await rig.client.buses()
+        set_power(chain, 5, on=True)
+        await asyncio.sleep(3)
+        (bus,) = await rig.client.buses()
+
+    assert (dark.modules[4].status, bus.modules[4].status) == (None, 0)
+    assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True] * 4
+
+
+async def test_a_stop_works_while_a_drive_is_dark():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90.0, velocity=5.0))
+        set_power(chain, 4, on=False)
+        loop = asyncio.get_running_loop()
+        slowest_s = 0.0
+        for _ in range(40):
+            await asyncio.sleep(0.0973)
+            began_s = loop.time()
+            reply = await rig.client.stop("x")
+            slowest_s = max(slowest_s, loop.time() - began_s)
+            assert reply.confirmed == ("x",)
+
+    assert slowest_s < 0.05
+    assert drive(chain, 1).loop.servo_on
+
+
+async def test_stops_of_a_dark_axis_do_not_disturb_the_search_for_it():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        set_power(chain, 2, on=False)
+        await rig.until("y", lambda state: state.link is LinkState.DOWN)
+
+        async with asyncio.TaskGroup() as group:
+            for number in range(300):
+                group.create_task(rig.client.stop("y"), name=f"stop {number}")
+                await asyncio.sleep(0.0137)
+        set_power(chain, 2, on=True)
+        back = await rig.until("y", lambda state: state.link is LinkState.UP, 3.0)
+
+    assert (back.state, back.stop_latched) == (AxisState.DISABLED, True)
+
+
+async def test_a_foreign_module_in_place_of_the_old_one_gets_no_address():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        set_power(chain, 4, on=False)
+        await rig.until("c", lambda state: state.link is LinkState.DOWN)
+        module = chain.modules[3]
+        module.settings = type(module.settings)(version=1)
+        set_power(chain, 4, on=True)
+        await asyncio.sleep(5)
+        state = await rig.client.state("c")
+
+    assert state.link is LinkState.DOWN
+    assert chain.modules[3].address == 0
+
+
+async def test_members_of_a_group_with_a_leader_come_back_to_their_group():
+    chain = chain_of()
+    config = simulated_config(UNSEEN_MOTIONS_END, group=[{"name": "pair", "axes": ["y", "z"], "leader": "z"}])
+    async with rig_on(chain, config) as rig:
+        await power_all(rig)
+        await rig.client.command("z", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=-40.0, velocity=5.0))
+        set_power(chain, 2, on=False)
+        await rig.until("y", lambda state: state.link is LinkState.DOWN)
+        await asyncio.sleep(1)
+        set_power(chain, 2, on=True)
+        for name in NAMES:
+            await rig.until(name, lambda state: state.link is LinkState.UP, 3.0)
+        await asyncio.sleep(10)
+        (bus,) = await rig.client.buses()
+
+    assert [module.group for module in chain.modules] == [0xFF, 0x81, 0x81, 0xFF]
+    assert [module.leader for module in chain.modules] == [False, False, True, False]
+    assert abs(drive(chain, 3).loop.position + 80_000) <= 1
+    assert bus.baud == 115_200
+
+
+NOISE = tuple(
+    Fault(kind, 0.01, from_s=5.0, longest_s=0.01)
+    for kind in (
+        FaultKind.REQUEST_LOST,
+        FaultKind.REQUEST_BIT_FLIPPED,
+        FaultKind.REPLY_LOST,
+        FaultKind.REPLY_BIT_FLIPPED,
+        FaultKind.REPLY_DELAYED,
+    )
+)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 11])
+async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
+    print(f"seed {seed}")
+    chain = build_chain(
+        ChainSpec(tuple(ModuleSpec(model) for model in MODELS), faults=FaultPlan(NOISE, seed), seed=seed)
+    )
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
+        await power_all(rig)
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90.0, velocity=2.0))
+        await asyncio.sleep(5 - asyncio.get_running_loop().time())
+        for _ in range(5):
+            set_power(chain, 3, on=False)
+            await rig.until("z", lambda state: state.link is LinkState.DOWN)
+            await asyncio.sleep(2.0)
+            set_power(chain, 3, on=True)
+            await rig.until("z", lambda state: state.link is LinkState.UP, 10.0)
+        await asyncio.sleep(2.0)
+        await rig.kill()
+    assert [module.address for module in chain.modules] == [1, 2, 3, 4]
+    at = drive(chain, 1).loop.position
+
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END, start="adopt")) as rig:
+        (bus,) = await rig.client.buses()
+        await asyncio.sleep(40)
+
+    assert bus.started_by == "adoption"
+    assert abs(at) > 10_000
+    assert abs(drive(chain, 1).loop.position - 90_000) <= 1

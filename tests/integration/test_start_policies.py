@@ -1,0 +1,189 @@
+"""How a daemon comes to a line that somebody else left behind."""
+
+import asyncio
+
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.model.axes import AxisState, LinkState
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
+
+HARMLESS = {Command.READ_STATUS, Command.NO_OPERATION}
+ADOPTING = simulated_config(start="adopt")
+MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
+
+
+def chain_of(*models):
+    return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in models or MODELS)))
+
+
+def commands_in(packets):
+    return {packet.command for packet in packets}
+
+
+async def leave_x_moving(chain, config, *, to=50.0):
+    """Let a first daemon start a motion of x, with z enabled, and kill it in the middle."""
+    async with rig_on(chain, config) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("z", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=to))
+        await asyncio.sleep(0.5)
+        await rig.kill()
+
+
+async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_adopts():
+    chain = chain_of()
+    await leave_x_moving(chain, simulated_config())
+    await asyncio.sleep(0.2)
+    left_at = drive(chain, 1).loop.position
+    assert 1000 < left_at < 49_000
+
+    async with rig_on(chain, ADOPTING) as rig:
+        adopted_with = commands_in(rig.sent)
+        moving = await rig.until("x", lambda state: state.link is LinkState.UP)
+        ended = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        await asyncio.sleep(0.5)
+        (bus,) = await rig.client.buses()
+        sent = commands_in(rig.sent)
+
+    assert adopted_with <= HARMLESS
+    assert sent <= HARMLESS
+    assert (moving.state, moving.referenced) == (AxisState.DISCRETE_MOTION, False)
+    assert (ended.state, ended.last_error) == (AxisState.STANDSTILL, None)
+    assert (bus.up, bus.started_by, bus.baud) == (True, "adoption", 115_200)
+    assert abs(drive(chain, 1).loop.position - 50_000) <= 1
+    assert [drive(chain, address).loop.position for address in (2, 4)] == [0, 0]
+    assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True, False, True, False]
+
+
+async def test_an_adopted_motion_is_stopped_smoothly():
+    chain = chain_of()
+    await leave_x_moving(chain, simulated_config())
+
+    async with rig_on(chain, ADOPTING) as rig:
+        await rig.until("x", lambda state: state.state is AxisState.DISCRETE_MOTION)
+        reply = await rig.client.stop("x")
+        state = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+
+    assert reply.confirmed == ("x",)
+    assert state.stop_latched
+    assert drive(chain, 1).loop.servo_on
+    assert drive(chain, 1).loop.position < 40_000
+
+
+async def test_a_line_is_found_at_the_rate_where_a_crashed_host_left_it():
+    chain = chain_of()
+    await leave_x_moving(chain, simulated_config(baud=57_600, divisors="alternate"))
+
+    async with rig_on(chain, ADOPTING) as rig:
+        (bus,) = await rig.client.buses()
+        sent = commands_in(rig.sent)
+
+    assert (bus.baud, bus.started_by) == (57_600, "adoption")
+    assert any("57600" in remark for remark in bus.remarks)
+    assert sent <= HARMLESS
+
+
+async def test_what_cannot_be_adopted_stays_down_and_says_why():
+    chain = chain_of()
+
+    async with rig_on(chain, ADOPTING, up=False) as rig:
+        await asyncio.sleep(5)
+        (bus,) = await rig.client.buses()
+        sent = commands_in(rig.sent)
+
+    assert not bus.up
+    assert "address 1 (axis x): expected Logosol LS-182AP, nothing there" in bus.problem
+    assert sent <= HARMLESS
+
+
+async def test_what_cannot_be_adopted_is_reset_if_the_configuration_allows_it():
+    chain = chain_of()
+
+    async with rig_on(chain, simulated_config(start="adopt", adopt_fallback="reset")) as rig:
+        (bus,) = await rig.client.buses()
+
+    assert (bus.up, bus.started_by) == (True, "reset")
+    assert any("not taken over" in remark for remark in bus.remarks)
+
+
+async def test_a_drive_that_moves_is_not_reset_by_the_fallback():
+    chain = chain_of()
+    await leave_x_moving(chain, simulated_config())
+    loop = asyncio.get_running_loop()
+    chain.modules[3].power(on=False, at_s=loop.time())
+
+    async with rig_on(chain, simulated_config(start="adopt", adopt_fallback="reset"), up=False) as rig:
+        await asyncio.sleep(1)
+        (bus,) = await rig.client.buses()
+        still_moving = drive(chain, 1).loop.servo_on
+        chain.modules[3].power(on=True, at_s=loop.time())
+        async with asyncio.timeout(30):
+            await rig.daemon.wait_up()
+        (later,) = await rig.client.buses()
+
+    assert still_moving
+    assert "address 1, Logosol LS-182AP (id 90, version 20), moves" in bus.problem
+    assert (later.up, later.started_by) == (True, "reset")
+
+
+async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=50.0))
+        await asyncio.sleep(0.5)
+
+        chain.unplug(asyncio.get_running_loop().time(), 1.0)
+        lost = await rig.until("x", lambda state: state.link is LinkState.DOWN)
+        await rig.daemon.wait_up()
+        found = await rig.until("x", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(3)
+        (bus,) = await rig.client.buses()
+
+    assert lost.state is AxisState.ERROR_STOP
+    assert not found.referenced
+    assert bus.started_by == "adoption"
+    assert drive(chain, 1).loop.servo_on
+    assert abs(drive(chain, 1).loop.position - 50_000) <= 1
+
+
+async def test_stops_during_a_take_over_delay_it_at_most():
+    chain = chain_of()
+    await leave_x_moving(chain, simulated_config())
+
+    async with rig_on(chain, ADOPTING, up=False) as rig:
+        async with asyncio.TaskGroup() as group:
+            for number in range(100):
+                for axis in ("x", "y", "z", "c"):
+                    group.create_task(rig.client.stop(axis), name=f"stop {axis} {number}")
+                await asyncio.sleep(0.0031)
+        async with asyncio.timeout(5):
+            await rig.daemon.wait_up()
+        (bus,) = await rig.client.buses()
+
+    assert bus.started_by == "adoption"
+
+
+async def test_modules_that_are_no_axes_are_kept_and_published():
+    chain = chain_of("ls182ap", "ls182ap", "picservo-v4", "picservo-v4", "picio", "picstep")
+    config = simulated_config(module=[{"address": 5, "model": "pic-io"}])
+
+    async with rig_on(chain, config) as rig:
+        await asyncio.sleep(2)
+        (bus,) = await rig.client.buses()
+
+    assert [(module.address, module.model, module.axis) for module in bus.modules] == [
+        (1, "ls-182ap", "x"),
+        (2, "ls-182ap", "y"),
+        (3, "pic-servo-v4", "z"),
+        (4, "pic-servo-v4", "c"),
+        (5, "pic-io", None),
+        (6, "pic-step", None),
+    ]
+    assert [module.status for module in bus.modules] == [None, None, None, None, 0, 0]
+    assert bus.remarks == (
+        "address 6: PIC-STEP (id 3, version 1) is not configured; it is kept on the line and never moved",
+    )

@@ -1,0 +1,113 @@
+"""Ten thousand exchanges with real drives' packets under seeded line faults, on the jumping clock."""
+
+import asyncio
+import random
+from collections import Counter
+
+import pytest
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.settings import BusSettings
+from ldcnd.drivers.driver import AxisSpec, Gains, Motion
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.network import LdcnNetwork
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.errors import BusError, OutcomeUnknown, ReplyTimeout
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.line import open_simulated_line
+
+EXCHANGES = 10_000
+FAULTS_FROM_S = 30.0
+SHARES = {
+    FaultKind.REQUEST_LOST: 0.006,
+    FaultKind.REQUEST_BYTE_LOST: 0.006,
+    FaultKind.REQUEST_BIT_FLIPPED: 0.006,
+    FaultKind.REPLY_LOST: 0.008,
+    FaultKind.REPLY_BYTE_LOST: 0.006,
+    FaultKind.REPLY_BIT_FLIPPED: 0.006,
+    FaultKind.REPLY_DELAYED: 0.006,
+    FaultKind.REPLY_DUPLICATED: 0.006,
+}
+"""5 % in all."""
+LONGEST_DELAY_S = 0.015
+MODELS = ("ls-182ap", "pic-servo-v4", "ls-182ap", "pic-servo-v4")
+GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
+MASKS = (
+    StatusItem.POSITION,
+    StatusItem.POSITION | StatusItem.VELOCITY,
+    StatusItem.POSITION | StatusItem.ADC | StatusItem.AUX,
+    StatusItem.POSITION | StatusItem.HOME,
+)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
+    print(f"seed {seed}")
+    dice = random.Random(seed)
+    faults = tuple(
+        Fault(kind, share, from_s=FAULTS_FROM_S, longest_s=LONGEST_DELAY_S) for kind, share in SHARES.items()
+    )
+    chain = build_chain(
+        ChainSpec(
+            tuple(ModuleSpec(model.replace("-", "").replace("picservo", "picservo-")) for model in MODELS),
+            faults=FaultPlan(faults, seed),
+            seed=seed,
+        )
+    )
+    specs = tuple(AxisSpec(f"a{number}", number, model, GAINS) for number, model in enumerate(MODELS, 1))
+    outcomes: Counter[str] = Counter()
+    foreign = []
+
+    async def ask(bus: Bus, number: int) -> None:
+        node = Node(number, PROFILES[MODELS[number - 1]])
+        try:
+            if dice.random() < 0.1:
+                await bus.execute(commands.save_home(node))  # must not be repeated
+            else:
+                status = await bus.execute(commands.read_status(node, dice.choice(MASKS)), dice.choice(list(LANES)))
+                if abs(status.position - 10_000 * number) > 2:
+                    foreign.append((number, status))
+            outcomes["answered"] += 1
+        except BusError as error:
+            outcomes[type(error).__name__] += 1
+
+    async with asyncio.TaskGroup() as group:
+        bus = Bus(BusSettings("a", 19_200), lambda: open_simulated_line(chain))
+        network = LdcnNetwork(bus, specs, 115_200)
+        bus.resync = network.resync
+        running = group.create_task(bus.run(), name="bus")
+        await bus.wait_opened()
+        await network.bring_up()
+        for number, axis in enumerate(network.axes.values(), 1):
+            await axis.power(on=True)
+            await axis.load(Motion(10_000 * number, 20_000.0, 200_000.0))
+            await axis.start()
+        await asyncio.sleep(FAULTS_FROM_S - asyncio.get_running_loop().time())
+
+        callers = asyncio.Semaphore(8)
+
+        async def limited(number: int) -> None:
+            async with callers:
+                await ask(bus, number)
+
+        for start in range(0, EXCHANGES, 500):
+            async with asyncio.TaskGroup() as batch:
+                for at in range(start, start + 500):
+                    batch.create_task(limited(1 + at % len(MODELS)), name=f"caller {at}")
+        running.cancel()
+
+    assert sum(outcomes.values()) == EXCHANGES
+    assert foreign == []
+    assert outcomes["answered"] > 0.97 * EXCHANGES
+    assert set(outcomes) <= {"answered", OutcomeUnknown.__name__, ReplyTimeout.__name__}
+    statistics = bus.statistics
+    assert statistics.timeouts > 100
+    assert statistics.corrupt_replies > 50
+    assert statistics.rejected_packets > 20
+
+
+LANES = (Lane.COMMAND, Lane.BACKGROUND, Lane.STOP)

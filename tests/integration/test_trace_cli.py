@@ -1,0 +1,53 @@
+"""`ldcnd trace` against a daemon in its own process over loopback TCP."""
+
+import asyncio
+from asyncio.subprocess import PIPE
+
+import pytest
+
+from ldcnd.cli.trace_file import load_trace
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from tests.support.process import LDCND, ROOT, client, daemon
+
+pytestmark = pytest.mark.real_time
+
+
+async def ldcnd(*arguments):
+    """Run `ldcnd ARGUMENTS` and return its exit code and what it printed, errors last."""
+    running = await asyncio.create_subprocess_exec(*LDCND, *arguments, stdout=PIPE, stderr=PIPE)
+    async with asyncio.timeout(45):
+        printed, errors = await running.communicate()
+    return running.returncode, printed.decode(), errors.decode()
+
+
+async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    file, picture = tmp_path / "move.csv", tmp_path / "move.png"
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
+        await rig.command("x", Verb.POWER, PowerRequest(on=True))
+        channels = ("-c", "position", "-c", "velocity")
+        trigger = ("--trigger", "velocity:rising:1", "--pre", "10", "--samples", "100")
+        async with asyncio.TaskGroup() as group:
+            taking = group.create_task(
+                ldcnd("trace", "take", "x", "-e", endpoint, *channels, *trigger, "--out", str(file))
+            )
+            async with asyncio.timeout(30):
+                while (await rig.trace_header("x")) is None:
+                    await asyncio.sleep(0.1)
+            await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=10.0))
+        refused = await ldcnd("trace", "take", "x", "-e", endpoint, "-c", "torque")
+        last = await ldcnd("trace", "last", "x", "-e", endpoint)
+    shown = await ldcnd("trace", "show", str(file))
+    drawn = await ldcnd("trace", "plot", str(file), "-o", str(picture))
+
+    code, printed, errors = taking.result()
+    trace = load_trace(file)
+    assert (code, shown[0], drawn[0], last[0]) == (0, 0, 0, 0)
+    assert "as fast as the line allows" in errors
+    assert printed == shown[1] == last[1]
+    assert "trigger at sample 10: velocity rising 1" in printed
+    assert trace.values[1][9] < 1.0 <= trace.values[1][10]
+    assert len(trace.offsets_ns) == 100
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert refused[0] == 1
+    assert "cannot trace 'torque'; there are position" in refused[2]

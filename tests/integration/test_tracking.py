@@ -1,0 +1,147 @@
+"""A stream of set-points that an axis follows, on the jumping clock."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.errors import (
+    NotReferenced,
+    NotSupported,
+    OutcomeUnknown,
+    PositionLimit,
+    TooManyRequests,
+    ValueOutOfRange,
+)
+from ldcnd.model.axes import AxisState
+from ldcnd.model.requests import TrackRequest, Verb
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from tests.support.dialect_rig import (
+    AXIS,
+    LS_173AP,
+    LS_182AP,
+    LS_182AP_22,
+    SC,
+    V1,
+    V2,
+    V3,
+    V4,
+    dialect_rig,
+)
+
+TRACKING = {"step": 0.5, "rate": 50.0}
+
+
+def named(dialects):
+    return pytest.mark.parametrize("dialect", dialects, ids=lambda dialect: dialect.name)
+
+
+@named((V2, V3, V4, SC, LS_173AP, LS_182AP, LS_182AP_22))
+async def test_an_axis_follows_a_stream_of_set_points(dialect):
+    async with dialect_rig(dialect, tracking=TRACKING) as rig:
+        await rig.power_on()
+
+        for step in range(1, 26):
+            await rig.send(Verb.TRACK, TrackRequest(position=step * 0.1))
+            await asyncio.sleep(0.02)
+        following = await rig.rig.client.state(AXIS)
+        state = await rig.until(lambda state: state.command is None)
+
+        assert (following.state, following.command.verb) == (AxisState.CONTINUOUS_MOTION, "track")
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        assert rig.position_mm == pytest.approx(2.5, abs=0.02)
+
+
+async def test_tracking_needs_a_drive_that_knows_it():
+    async with dialect_rig(V1, tracking=TRACKING) as rig:
+        await rig.power_on()
+
+        with pytest.raises(NotSupported, match="cannot track"):
+            await rig.send(Verb.TRACK, TrackRequest(position=0.1))
+
+
+async def test_a_set_point_too_far_from_the_last_one_is_refused():
+    async with dialect_rig(V4, tracking=TRACKING) as rig:
+        await rig.power_on()
+        await rig.send(Verb.TRACK, TrackRequest(position=0.5))
+        await asyncio.sleep(0.02)
+
+        with pytest.raises(ValueOutOfRange, match=r"0\.6 from the last one, the limit is 0\.5") as refusal:
+            await rig.send(Verb.TRACK, TrackRequest(position=1.1))
+
+        assert refusal.value.nearest == pytest.approx(1.0)
+        assert (await rig.rig.client.state(AXIS)).command.verb == "track"
+
+
+async def test_set_points_faster_than_the_rate_are_refused():
+    async with dialect_rig(V4, tracking=TRACKING | {"rate": 5.0}) as rig:
+        await rig.power_on()
+        await rig.send(Verb.TRACK, TrackRequest(position=0.1))
+
+        with pytest.raises(TooManyRequests, match="more than 5 set-points a second"):
+            await rig.send(Verb.TRACK, TrackRequest(position=0.2))
+
+        await asyncio.sleep(0.2)
+        await rig.send(Verb.TRACK, TrackRequest(position=0.2))
+
+
+async def test_the_mean_rate_is_kept_although_single_set_points_may_come_early():
+    async with dialect_rig(V4, tracking=TRACKING | {"rate": 10.0}) as rig:
+        await rig.power_on()
+        taken = 0
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
+
+        while loop.time() < began_s + 3.0:
+            try:
+                await rig.send(Verb.TRACK, TrackRequest(position=(taken + 1) * 0.01))
+                taken += 1
+            except TooManyRequests:
+                pass
+            await asyncio.sleep(0.013)
+
+        assert 28 <= taken <= 32
+
+
+async def test_a_set_point_keeps_to_reference_and_software_limits():
+    async with dialect_rig(V4, tracking=TRACKING, limits={"position_max": 0.3}) as rig:
+        await rig.power_on()
+        with pytest.raises(PositionLimit):
+            await rig.send(Verb.TRACK, TrackRequest(position=0.31))
+    async with dialect_rig(V4, tracking=TRACKING, reference="required") as rig:
+        await rig.power_on()
+        with pytest.raises(NotReferenced):
+            await rig.send(Verb.TRACK, TrackRequest(position=0.1))
+
+
+async def test_a_set_point_is_never_sent_twice_and_the_stream_goes_on():
+    no_replies = FaultPlan((Fault(FaultKind.REPLY_LOST, from_s=10.0, until_s=10.05),))
+    async with dialect_rig(V4, faults=no_replies, tracking=TRACKING) as rig:
+        await rig.power_on()
+        await rig.send(Verb.TRACK, TrackRequest(position=0.1))
+        loop = asyncio.get_running_loop()
+        await asyncio.sleep(9.9 - loop.time())
+        await rig.send(Verb.TRACK, TrackRequest(position=0.2))
+        await asyncio.sleep(10.0001 - loop.time())
+
+        with pytest.raises(OutcomeUnknown):
+            await rig.send(Verb.TRACK, TrackRequest(position=0.3))
+        state = await rig.rig.client.state(AXIS)
+        await asyncio.sleep(0.1)
+        await rig.send(Verb.TRACK, TrackRequest(position=0.4))
+
+        records = rig.rig.daemon.rig.buses[0].bus.wire_log.records()
+        sent = [record.data for record in records if record.data[2:4] == b"\x57\x11"]
+        assert len(sent) == len(set(sent)) == 4
+        assert state.state is AxisState.CONTINUOUS_MOTION
+
+
+async def test_a_stop_ends_a_stream():
+    async with dialect_rig(V4, tracking=TRACKING) as rig:
+        await rig.power_on()
+        await rig.send(Verb.TRACK, TrackRequest(position=0.1))
+
+        await rig.rig.client.stop(AXIS)
+        await asyncio.sleep(0.1)
+
+        with pytest.raises(Exception, match="a stop is latched"):
+            await rig.send(Verb.TRACK, TrackRequest(position=0.2))

@@ -1,0 +1,140 @@
+"""What anyone with Zenoh sees of a daemon in its own process: the public API of eclipse-zenoh only, and JSON Schema."""
+
+import asyncio
+import json
+import re
+import shlex
+import sys
+import time
+from asyncio.subprocess import PIPE, STDOUT, create_subprocess_exec
+from itertools import pairwise
+
+import jsonschema
+import msgpack
+import pytest
+import zenoh
+
+from tests.support.process import LDCND, ROOT, daemon
+
+pytestmark = pytest.mark.real_time
+
+RIG = ROOT / "config" / "simulated.toml"
+
+
+def connect(endpoint: str) -> zenoh.Session:
+    config = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+
+
+def get(session: zenoh.Session, selector: str, payload: object = None) -> dict[str, zenoh.Sample]:
+    """Return the good answers by key."""
+    text = None if payload is None else json.dumps(payload)
+    replies = session.get(selector, payload=text, encoding="application/json", timeout=5)
+    return {str(reply.ok.key_expr): reply.ok for reply in replies if reply.ok is not None}
+
+
+async def test_last_values_and_descriptions_are_readable_by_anyone():
+    async with daemon(RIG) as endpoint:
+        with connect(endpoint) as session:
+            telemetry = get(session, "ldcn/sim/tele/**")
+            schemas = {
+                key.rpartition("/")[2]: json.loads(sample.payload.to_string())
+                for key, sample in get(session, "ldcn/sim/meta/schema/*").items()
+            }
+
+            keys = {key.removeprefix("ldcn/sim/tele/") for key in telemetry}
+            assert keys == {
+                f"{axis}/{item}" for axis in "xyzc" for item in ("position", "velocity", "adc", "fault", "state")
+            }
+            for key, sample in telemetry.items():
+                assert str(sample.encoding) == "application/json"
+                value = json.loads(sample.payload.to_string())
+                jsonschema.validate(value, schemas[f"{key.rpartition('/')[2]}_sample"])
+                assert sample.timestamp is not None
+                assert abs(value["t"] - time.time_ns()) < 30e9
+                assert value["quality"] in ("good", "uncertain", "bad")
+
+            packed = get(session, "ldcn/sim/tele/x/position?enc=msgpack")["ldcn/sim/tele/x/position"]
+            assert str(packed.encoding) == "application/msgpack;position_sample"
+            jsonschema.validate(msgpack.unpackb(packed.payload.to_bytes()), schemas["position_sample"])
+
+            meta = {
+                key.removeprefix("ldcn/sim/meta/"): json.loads(sample.payload.to_string())
+                for key, sample in get(session, "ldcn/sim/meta/**").items()
+            }
+            jsonschema.validate(meta["daemon"], schemas["daemon_info"])
+            jsonschema.validate(meta["axes/x"], schemas["axis_info"])
+            assert meta["axes/x"]["unit"] == "mm"
+            assert meta["daemon"]["axes"] == ["x", "y", "z", "c"]
+            for command in meta["commands"]["commands"]:
+                assert command["request_schema"] in schemas
+                assert command["reply_schema"] in schemas
+            on_disk = {path.stem: json.loads(path.read_text()) for path in (ROOT / "schemas").glob("*.json")}
+            assert schemas == on_disk
+
+            alive = f"ldcn/sim/alive/{meta['daemon']['instance']}"
+            expected = {alive} | {f"{alive}/axis/{axis}" for axis in "xyzc"}
+            # an axis is alive when its line is up, which may be after the daemon has answered
+            async with asyncio.timeout(30):
+                while (tokens := alive_tokens(session)) != expected:
+                    assert tokens < expected
+                    await asyncio.sleep(0.1)
+
+
+def alive_tokens(session):
+    return {str(reply.ok.key_expr) for reply in session.liveliness().get("ldcn/sim/alive/**") if reply.ok}
+
+
+async def test_a_wildcard_moves_nothing_and_a_stop_needs_nothing():
+    async with daemon(RIG) as endpoint:
+        with connect(endpoint) as session:
+            assert not any("@" in key for key in get(session, "**"))
+            assert get(session, "ldcn/sim/@cmd/x/power", {"on": True})
+
+            replies = list(session.get("ldcn/sim/@cmd/*/move_absolute", payload='{"position": 5}', timeout=5))
+            assert [json.loads(reply.err.payload.to_string())["code"] for reply in replies] == ["wildcard_refused"]
+
+            stopped = get(session, "ldcn/sim/@stop")
+            (answer,) = stopped.values()
+            assert json.loads(answer.payload.to_string())["confirmed"] == ["x", "y", "z", "c"]
+            state = get(session, "ldcn/sim/tele/x/state")["ldcn/sim/tele/x/state"]
+            assert json.loads(state.payload.to_string())["stop_latched"] is True
+
+
+async def test_published_samples_count_up_and_bear_the_instant_of_measurement():
+    async with daemon(RIG) as endpoint:
+        with connect(endpoint) as session:
+            received = session.declare_subscriber("ldcn/sim/tele/x/position", zenoh.handlers.FifoChannel(100))
+            samples = [received.recv() for _ in range(20)]
+            received.undeclare()
+
+    values = [msgpack.unpackb(sample.payload.to_bytes()) for sample in samples]
+    assert [value["seq"] for value in values] == list(range(values[0]["seq"], values[0]["seq"] + 20))
+    rates = [(late["t"] - early["t"]) / 1e9 for early, late in pairwise(values)]
+    assert sum(rates) / len(rates) == pytest.approx(1 / 20, rel=0.2)
+    for sample, value in zip(samples, values, strict=True):
+        assert 0 < value["t_error_ns"] < 100e6
+        assert abs(sample.timestamp.get_time().timestamp() - value["t"] / 1e9) < 0.001
+
+
+async def test_the_tour_of_the_readme_runs():
+    text = (ROOT / "README.md").read_text()
+    commands = re.findall(r"^\.venv/bin/(ldcnd axis .*)$", text, re.MULTILINE)
+    assert len(commands) >= 6
+
+    async with daemon(RIG) as endpoint:
+        for command in commands:
+            words = shlex.split(command)[1:]
+            done = await create_subprocess_exec(*LDCND, *words, "--connect", endpoint, stdout=PIPE, stderr=STDOUT)
+            printed, _ = await done.communicate()
+            assert done.returncode == 0, f"{command}: {printed.decode()}"
+
+
+async def test_a_command_without_a_daemon_says_so_and_exits_with_3():
+    done = await create_subprocess_exec(
+        sys.executable, "-m", "ldcnd", "axis", "list", "--connect", "tcp/127.0.0.1:1", stdout=PIPE, stderr=STDOUT
+    )
+    printed, _ = await done.communicate()
+
+    assert done.returncode == 3
+    assert b"tcp/127.0.0.1:1" in printed

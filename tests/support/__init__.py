@@ -1,0 +1,1 @@
+"""What tests share: the jumping clock, the fake far ends, the rig."""

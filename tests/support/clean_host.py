@@ -1,0 +1,44 @@
+"""The daemon's own driver as the host that comes after somebody else."""
+
+import asyncio
+import contextlib
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.settings import BusSettings
+from ldcnd.drivers.driver import AxisSpec, BringUpReport
+from ldcnd.drivers.ldcn.network import LdcnNetwork
+from ldcnd.drivers.ldcn.profiles import Support
+from ldcnd.drivers.ldcn.simulated_module import SimulatedModule
+from ldcnd.drivers.line import LineSpec, ModuleEntry
+from ldcnd.errors import NetworkMismatch
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.line import open_simulated_line
+
+
+async def bring_up(chain: Chain, baud: int = 115_200, attempts: int = 1) -> BringUpReport:
+    """Bring a chain up from whatever state it is in, as the daemon does at start.
+
+    Raises:
+        LdcndError: it is not possible.
+    """
+    modules = [module for module in chain.modules if isinstance(module, SimulatedModule)]
+    drives, others = [], []
+    for address, module in enumerate(modules, 1):
+        name, identity = module.profile.name, (module.profile.device_id, module.settings.version)
+        if module.profile.support is Support.FULL:
+            drives.append(AxisSpec(f"a{address}", address, name, None, identity))
+        else:
+            others.append(ModuleEntry(address, name, identity))
+    bus = Bus(BusSettings("clean", 19_200), lambda: open_simulated_line(chain))
+    network = LdcnNetwork(bus, tuple(drives), baud, LineSpec(modules=tuple(others)))
+    bus.resync = network.resync
+    async with asyncio.TaskGroup() as group:
+        running = group.create_task(bus.run(), name="bus")
+        try:
+            await bus.wait_opened()
+            for _ in range(1, attempts):
+                with contextlib.suppress(NetworkMismatch):
+                    return await network.bring_up()
+            return await network.bring_up()
+        finally:
+            running.cancel()

@@ -1,0 +1,146 @@
+"""A line between plain users and a scripted far end, on the jumping clock."""
+
+import asyncio
+from collections import deque
+
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.line import Line
+from ldcnd.bus.resync import Resync
+from ldcnd.bus.settings import BusSettings
+from ldcnd.bus.statistics import BusStatistics
+from ldcnd.bus.turn import Turn
+from ldcnd.bus.wire_log import WireLog
+from ldcnd.errors import BusError
+from ldcnd.exchange import Exchange, Timing
+from tests.support import toy_family as toy
+from tests.support.scripted_line import Say, ScriptedLine
+
+BYTE_S = 10 / 115_200
+REQUEST_S = toy.REQUEST_BYTES * BYTE_S
+REPLY_S = toy.REPLY_BYTES * BYTE_S
+FENCE_S = toy.RESYNC.quiet_s + len(toy.FLUSH) * BYTE_S + toy.RESYNC.settle_s
+MARGIN_S = 0.005
+
+
+class RecordingTurn(Turn):
+    """A turn that notes in its users' story what it hears."""
+
+    def __init__(
+        self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND, then_baud: int | None = None
+    ):
+        super().__init__(exchange, lane, 0.0, then_baud)
+        self.story = story
+        self.send_again = False
+        self.timing: Timing | None = None
+        self.error: BusError | None = None
+
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        self.timing = timing
+        self.story.append(f"completed {self.exchange.decode(reply)}")
+
+    def lost(self, error: BusError) -> bool:
+        self.error = error
+        self.story.append(f"lost {toy.number_of(self.exchange.request)}")
+        again, self.send_again = self.send_again, False
+        return again
+
+    def rejected(self) -> bool:
+        self.story.append(f"rejected {toy.number_of(self.exchange.request)}")
+        again, self.send_again = self.send_again, False
+        return again
+
+
+class PlainUsers:
+    """First in, first out; tells its story."""
+
+    def __init__(self) -> None:
+        self.story: list[str] = []
+        self.waiting: deque[RecordingTurn] = deque()
+        self.mute: set[int] = set()
+        self.taken_at_s: list[float] = []
+
+    def take(self, now_s: float) -> Turn | None:
+        stops = [turn for turn in self.waiting if turn.lane is Lane.STOP]
+        turn = stops[0] if stops else self.waiting[0] if self.waiting else None
+        if turn:
+            self.waiting.remove(turn)
+            self.taken_at_s.append(now_s)
+        return turn
+
+    def next_due_s(self) -> float:
+        return float("inf")
+
+    def stop_waits(self) -> bool:
+        return any(turn.lane is Lane.STOP for turn in self.waiting)
+
+    def failing(self) -> set[int]:
+        return self.mute
+
+    def answered(self, turn: Turn) -> None:
+        self.story.append(f"answered {turn.exchange.node}")
+
+    def missed(self, turn: Turn, now_s: float) -> None:
+        self.story.append(f"missed {turn.exchange.node}")
+
+    def again(self, turn: Turn) -> None:
+        assert isinstance(turn, RecordingTurn)
+        self.waiting.appendleft(turn)
+
+    def line_lost(self, reason: str) -> None:
+        self.story.append(f"line lost: {reason}")
+
+
+class Bench:
+    """A line between plain users and a scripted far end."""
+
+    def __init__(self, *, echo: bool = False, paced: bool = True, resync: Resync = toy.RESYNC):
+        self.users = PlainUsers()
+        self.wire = ScriptedLine(toy.answer)
+        self.wire.echo = echo
+        self.statistics = BusStatistics()
+        self.log = WireLog()
+        settings = BusSettings("toy", 115_200, margin_s=MARGIN_S, echo=echo, paced=paced)
+        self.line = Line(settings, self.wire, self.users, resync, self.statistics, self.log)
+
+    def add(
+        self,
+        number: int,
+        lane: Lane = Lane.COMMAND,
+        then_baud: int | None = None,
+        *,
+        reply_bytes: int = toy.REPLY_BYTES,
+        response_s: float = toy.RESPONSE_S,
+        repeatable: bool = True,
+    ) -> RecordingTurn:
+        """Queue an exchange of that number."""
+        exchange = toy.exchange(number, reply_bytes=reply_bytes, response_s=response_s, repeatable=repeatable)
+        turn = RecordingTurn(exchange, self.users.story, lane, then_baud)
+        self.users.waiting.append(turn)
+        self.line.kick()
+        return turn
+
+    @property
+    def story(self) -> list[str]:
+        return [line for line in self.users.story if not line.startswith(("answered", "missed"))]
+
+    def sent(self, number: int) -> list[float]:
+        """When a request was written."""
+        return [
+            written.at_s
+            for written in self.wire.writes
+            if written.data != toy.FLUSH and toy.number_of(written.data) == number
+        ]
+
+    def replies(self, says: dict[int, list[Say]]) -> None:
+        """Answer some numbers in a special way, the first time only."""
+
+        def script(packet: bytes) -> list[Say]:
+            special = None if packet == toy.FLUSH else says.pop(toy.number_of(packet), None)
+            return toy.answer(packet) if special is None else special
+
+        self.wire.script = script
+
+
+async def settle(seconds: float = 1.0) -> None:
+    """Let virtual time pass."""
+    await asyncio.sleep(seconds)

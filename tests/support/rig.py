@@ -1,0 +1,70 @@
+"""A whole daemon in this process: simulated line, memory session, jumping clock."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config import RigConfig, load_config
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
+from ldcnd.model.samples import StateSample
+from ldcnd.sim.chain import Chain
+
+EPOCH_NS = 1_700_000_000_000_000_000
+SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class RunningRig:
+    """A daemon that serves, and a client's ways to it."""
+
+    daemon: Daemon
+    client: RigClient
+    session: MemorySession
+    broker: MemoryBroker
+
+    async def until(self, axis: str, wanted: Callable[[StateSample], bool], within_s: float = 60.0) -> StateSample:
+        """Wait for a state of an axis."""
+        async with asyncio.timeout(within_s):
+            async with self.client.samples(axis, "state") as states:
+                sample = await self.client.state(axis)
+                while sample is None or not wanted(sample):
+                    _, latest = await anext(states)
+                    assert isinstance(latest, StateSample)
+                    sample = latest
+                return sample
+
+
+@asynccontextmanager
+async def running_rig(
+    config: RigConfig | None = None, chains: Mapping[str, Chain] = MappingProxyType({})
+) -> AsyncIterator[RunningRig]:
+    """Run a daemon until the context ends; its lines are up when the context begins.
+
+    Args:
+        config: the rig; the simulated one if missing.
+        chains: simulated lines that exist already, by name.
+    """
+    config = config or load_config(SIMULATED)
+    loop = asyncio.get_running_loop()
+    broker = MemoryBroker()
+
+    def now_ns() -> int:
+        return EPOCH_NS + round(loop.time() * 1e9)
+
+    async with broker.session() as session, broker.session() as client_session:
+        daemon = build_daemon(config, session, now_ns, "test", chains)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(daemon.run(), name="daemon")
+            try:
+                async with asyncio.timeout(60):
+                    await daemon.wait_up()
+                yield RunningRig(daemon, RigClient(client_session, config.rig), client_session, broker)
+            finally:
+                daemon.end()
+                await running

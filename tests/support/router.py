@@ -1,0 +1,34 @@
+"""A Zenoh router in a process of its own, which can be killed."""
+
+import asyncio
+import contextlib
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+PROGRAM = """
+import json, sys, zenoh
+off = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+config = {"mode": "router", "listen": {"endpoints": [sys.argv[1]]}, "scouting": off}
+session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+print("ready", flush=True)
+sys.stdin.read()
+session.close()
+"""
+
+
+@asynccontextmanager
+async def router(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a router until the context ends; it listens when the context begins."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", PROGRAM, endpoint, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+    )
+    try:
+        assert process.stdout
+        async with asyncio.timeout(10):
+            assert await process.stdout.readline() == b"ready\n"
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.communicate()

@@ -1,0 +1,116 @@
+"""What every session promises about samples, tokens and its end."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.errors import SessionError
+from ldcnd.messaging.session import UNDELIVERED_SAMPLES, Qos, Sample, SampleKind
+from tests.support.session_pair import JSON, KEYS, POSITION, Pair, subscribed
+
+
+class SampleFacts:
+    """Facts about samples; the module that inherits them has a fixture `pair`."""
+
+    async def test_a_sample_arrives_with_its_key_encoding_and_instant(self, pair: Pair) -> None:
+        samples = await subscribed(pair.server, pair.client)
+        encoding, at_ns = "application/msgpack;position_sample", 1_700_000_000_123_456_789
+
+        pair.server.publish(POSITION, b"\x81", encoding=encoding, qos=Qos.TELEMETRY, measured_at_ns=at_ns)
+
+        async with asyncio.timeout(2):
+            sample = await samples.get()
+        assert sample == Sample(POSITION, b"\x81", encoding, SampleKind.PUT, at_ns)
+
+    async def test_samples_of_a_key_arrive_in_order_and_the_deletion_last(self, pair: Pair) -> None:
+        samples = await subscribed(pair.server, pair.client)
+
+        for number in range(30):
+            pair.server.publish(POSITION, b"%d" % number, encoding=JSON, qos=Qos.TELEMETRY)
+        pair.server.delete(POSITION)
+
+        async with asyncio.timeout(2):
+            arrived = [await samples.get() for _ in range(31)]
+        assert [sample.payload for sample in arrived[:30]] == [b"%d" % number for number in range(30)]
+        assert (arrived[30].kind, arrived[30].payload) == (SampleKind.DELETE, b"")
+
+    async def test_a_flooded_subscription_ends_with_the_newest_samples(self, pair: Pair) -> None:
+        samples = await subscribed(pair.server, pair.server)
+        published = 10 * UNDELIVERED_SAMPLES
+
+        # nothing is delivered in between: the loop is busy publishing to its own session
+        for number in range(published):
+            pair.server.publish(POSITION, b"%d" % number, encoding=JSON, qos=Qos.TELEMETRY)
+
+        async with asyncio.timeout(2):
+            arrived = [int((await samples.get()).payload) for _ in range(UNDELIVERED_SAMPLES)]
+        assert arrived == list(range(published - UNDELIVERED_SAMPLES, published))
+        assert samples.empty()
+
+    async def test_a_closed_subscription_takes_nothing_more(self, pair: Pair) -> None:
+        kept = await subscribed(pair.server, pair.client)
+        dropped: list[Sample] = []
+        declaration = await pair.client.subscribe("ldcn/**", dropped.append)
+
+        await declaration.close()
+        await declaration.close()
+        dropped.clear()
+        pair.server.publish(POSITION, b"1", encoding=JSON, qos=Qos.EVENT)
+
+        async with asyncio.timeout(2):
+            await kept.get()
+        assert dropped == []
+
+
+class TokenFacts:
+    """Facts about liveliness tokens and the end of a session."""
+
+    async def test_a_token_appears_and_vanishes_with_its_declaration(self, pair: Pair) -> None:
+        changes: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
+        token = KEYS.alive("i1")
+        await pair.client.watch_tokens(KEYS.all_alive, lambda key, alive: changes.put_nowait((key, alive)))
+
+        async with asyncio.timeout(3):
+            declaration = await pair.server.declare_token(token)
+            appeared = await changes.get()
+            await declaration.close()
+            vanished = await changes.get()
+
+        assert (appeared, vanished) == ((token, True), (token, False))
+
+    async def test_a_watch_begins_with_the_tokens_that_are_there(self, pair: Pair) -> None:
+        changes: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
+        other, own = KEYS.alive("i1"), KEYS.alive("i2")
+        await pair.server.declare_token(other)
+        await pair.client.declare_token(own)
+
+        async with asyncio.timeout(3):
+            await pair.client.watch_tokens(KEYS.all_alive, lambda key, alive: changes.put_nowait((key, alive)))
+            seen = {await changes.get(), await changes.get()}
+
+        assert seen == {(other, True), (own, True)}
+
+    async def test_tokens_vanish_with_their_session(self, pair: Pair) -> None:
+        changes: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
+        await pair.client.watch_tokens(KEYS.all_alive, lambda key, alive: changes.put_nowait((key, alive)))
+        await pair.server.declare_token(KEYS.alive("i1"))
+
+        async with asyncio.timeout(5):
+            appeared = await changes.get()
+            await pair.server.close()
+            vanished = await changes.get()
+
+        assert (appeared[1], vanished[1]) == (True, False)
+
+    async def test_a_closed_session_says_so(self, pair: Pair) -> None:
+        await pair.client.close()
+        await pair.client.close()
+
+        with pytest.raises(SessionError, match="closed"):
+            pair.client.publish(POSITION, b"", encoding=JSON, qos=Qos.EVENT)
+        with pytest.raises(SessionError, match="closed"):
+            pair.client.delete(POSITION)
+        with pytest.raises(SessionError, match="closed"):
+            await pair.client.query(POSITION)
+        with pytest.raises(SessionError, match="closed"):
+            await pair.client.subscribe(POSITION, print)

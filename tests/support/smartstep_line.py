@@ -1,0 +1,94 @@
+"""A simulated SmartStep line under the real bus, without a daemon."""
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.settings import BusSettings
+from ldcnd.drivers.driver import AxisSpec
+from ldcnd.drivers.smartstep.axis import SmartStepAxis, UnitSpec
+from ldcnd.drivers.smartstep.ledger import EepromLedger
+from ldcnd.drivers.smartstep.network import SmartStepNetwork
+from ldcnd.drivers.smartstep.parameter_store import EepromRules
+from ldcnd.drivers.smartstep.parameters import PN000, Parameter
+from ldcnd.drivers.smartstep.port import BAUD, smartstep_opener
+from ldcnd.drivers.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile, Wiring
+from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
+from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
+from ldcnd.drivers.smartstep.simulator import smartstep_chain
+from ldcnd.sim.faults import FaultPlan
+from ldcnd.sim.line import open_simulated_line
+
+
+def simulated(
+    number: int, variant: SimulatedVariant | None = None, stored: Mapping[Parameter, int] | None = None
+) -> SimulatedUnit:
+    """Return a drive with this unit number."""
+    return SimulatedUnit(variant, {PN000: number << 8, **(stored or {})})
+
+
+@dataclass(frozen=True, slots=True)
+class SmartStepLine:
+    """An open line.
+
+    Attributes:
+        bus: its owner.
+        network: the configured units, not brought up yet.
+    """
+
+    bus: Bus
+    network: SmartStepNetwork
+
+    def axis(self, name: str) -> SmartStepAxis:
+        """Return a configured unit."""
+        axis = self.network.axes[name]
+        assert isinstance(axis, SmartStepAxis)
+        return axis
+
+
+@asynccontextmanager
+async def smartstep_line(
+    units: Sequence[SimulatedUnit],
+    *,
+    numbers: Sequence[int] | None = None,
+    profile: SmartStepProfile = SMARTSTEP,
+    ledger: Path | None = None,
+    budget: int = 9000,
+    faults: FaultPlan | None = None,
+    wiring: Wiring = Wiring.FOUR_WIRE,
+    framing: Framing = Framing.SEVEN_EVEN,
+) -> AsyncIterator[SmartStepLine]:
+    """Open a line with these drives; axis `u1` is unit 1, and so on.
+
+    Args:
+        units: the simulated drives.
+        numbers: the configured units; those of the drives unless said otherwise.
+        profile: of all of them.
+        ledger: file of the EEPROM ledger; None for a line without one.
+        budget: EEPROM writes of one parameter.
+        faults: of the line.
+        wiring: of the simulated cable.
+        framing: of the simulated port.
+    """
+    chain = smartstep_chain(units, wiring, framing, faults=faults)
+    bus = Bus(
+        BusSettings("steps", BAUD, margin_s=0.01),
+        smartstep_opener(lambda: open_simulated_line(chain), profile),
+    )
+    rules = EepromRules(EepromLedger(ledger) if ledger else None, budget)
+    specs = tuple(
+        UnitSpec(AxisSpec(f"u{number}", number, "smartstep", None), profile, eeprom=rules)
+        for number in (numbers if numbers is not None else [unit.drive.unit for unit in units])
+    )
+    network = SmartStepNetwork(bus, specs)
+    bus.resync = network.resync
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name="bus")
+        try:
+            await bus.wait_opened()
+            yield SmartStepLine(bus, network)
+        finally:
+            owner.cancel()

@@ -1,0 +1,75 @@
+"""Which items travel with which poll."""
+
+from collections import Counter
+from types import SimpleNamespace
+
+import pytest
+
+from ldcnd.axis_config import RatesConfig
+from ldcnd.daemon.axis_poller import AxisPoller, wanted_rates_hz
+from ldcnd.model.samples import TelemetryItem
+
+POSITION, VELOCITY, ADC, STATE = (
+    TelemetryItem.POSITION,
+    TelemetryItem.VELOCITY,
+    TelemetryItem.ADC,
+    TelemetryItem.STATE,
+)
+
+
+def poller(rates_hz: dict[TelemetryItem, float], start_at_s: float = 0.0) -> AxisPoller:
+    """A poller whose exchanges are the items that they ask for."""
+    driver = SimpleNamespace(spec=SimpleNamespace(address=1), reading=lambda items: items)
+    return AxisPoller(driver, rates_hz, start_at_s, lambda *_: None, lambda _: None)
+
+
+def polls(axis: AxisPoller, until_s: float, late_s: float = 0.0) -> list[tuple[float, frozenset[TelemetryItem]]]:
+    """Give the poller its turns, each so much later than it was due."""
+    taken = []
+    while axis.due_at_s < until_s:
+        now_s = axis.due_at_s + late_s
+        taken.append((now_s, axis.next_exchange(now_s)))
+    return taken
+
+
+def test_an_axis_is_polled_as_often_as_its_fastest_item():
+    taken = polls(poller({POSITION: 20.0, STATE: 5.0, ADC: 7.0}), 10.0)
+
+    assert len(taken) == pytest.approx(200, abs=1)
+    assert all(POSITION in items for _, items in taken)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 3.3, 5.0, 7.0, 13.0, 19.9])
+def test_slower_items_keep_their_rate_and_stay_within_half_a_poll_of_their_grid(rate_hz):
+    taken = polls(poller({POSITION: 20.0, ADC: rate_hz}), 100.0)
+
+    at_s = [now_s for now_s, items in taken if ADC in items]
+
+    assert len(at_s) == pytest.approx(100 * rate_hz, abs=2)
+    assert all(abs(now_s - number / rate_hz) <= 0.025 + 1e-6 for number, now_s in enumerate(at_s))
+
+
+def test_a_late_poll_does_not_shift_the_next_one():
+    axis = poller({POSITION: 10.0})
+
+    axis.next_exchange(0.03)
+
+    assert axis.due_at_s == pytest.approx(0.1)
+    assert axis.deadline_at_s == pytest.approx(0.2)
+
+
+def test_missed_turns_are_skipped_and_not_made_up_for():
+    axis = poller({POSITION: 10.0, ADC: 5.0})
+
+    axis.next_exchange(0.57)
+
+    assert axis.due_at_s == pytest.approx(0.6)
+    asked = Counter(item for _, items in polls(axis, 1.55) for item in items)
+    assert asked == {POSITION: 10, ADC: 5}
+
+
+def test_items_that_are_switched_off_and_converters_that_do_not_exist_are_not_polled():
+    rates = RatesConfig(position=10, velocity=0, adc=2, state=5)
+
+    assert wanted_rates_hz(rates, adc=False) == {POSITION: 10, STATE: 5}
+    assert wanted_rates_hz(rates, adc=True) == {POSITION: 10, ADC: 2, STATE: 5}

@@ -1,0 +1,181 @@
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.daemon.axis_tracker import MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
+from ldcnd.drivers.driver import AxisReading, Fault
+from ldcnd.exchange import Timing
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.requests import Verb
+
+OFF = AxisReading(
+    position_counts=0,
+    following_error_counts=None,
+    velocity_counts_per_s=0.0,
+    velocity_resolution_counts_per_s=1953.0,
+    adc_counts=None,
+    enabled=False,
+    profile_done=True,
+    homing=False,
+    faults=(),
+)
+ON = replace(OFF, enabled=True)
+RUNNING = replace(ON, profile_done=False, velocity_counts_per_s=20_000.0)
+OVERHEAT = Fault("overheat", "let it cool down")
+
+
+def at(sent_at_s: float) -> Timing:
+    return Timing(sent_at_s, sent_at_s, sent_at_s, sent_at_s)
+
+
+def command(verb=Verb.MOVE_ABSOLUTE, state=AxisState.DISCRETE_MOTION, completion=Completion.PROFILE) -> ActiveCommand:
+    return ActiveCommand(f"c-{verb}", verb, 0, state, completion)
+
+
+@pytest.fixture
+def moving() -> AxisTracker:
+    tracker = AxisTracker("x", "mm")
+    tracker.observed(ON, at(1.0), 0)
+    tracker.begin(command(), float("inf"))
+    tracker.started(2.0)
+    return tracker
+
+
+def test_before_the_first_reading_nothing_is_known():
+    tracker = AxisTracker("x", "mm")
+
+    assert (tracker.link, tracker.moving, tracker.quality) == (LinkState.DOWN, Moving.UNKNOWN, Quality.BAD)
+
+
+def test_an_open_loop_is_disabled_and_a_closed_one_stands():
+    tracker = AxisTracker("x", "mm")
+
+    tracker.observed(OFF, at(1.0), 0)
+    assert (tracker.state, tracker.moving) == (AxisState.DISABLED, Moving.NO)
+
+    tracker.powered(on=True, now_s=2.0)
+    tracker.observed(ON, at(3.0), 0)
+    assert (tracker.state, tracker.moving) == (AxisState.STANDSTILL, Moving.NO)
+
+
+def test_a_shaft_turned_by_hand_moves():
+    tracker = AxisTracker("x", "mm")
+
+    tracker.observed(replace(OFF, velocity_counts_per_s=-50_000.0), at(1.0), 0)
+
+    assert tracker.moving is Moving.YES
+
+
+def test_a_move_is_done_when_a_later_reading_says_so(moving):
+    moving.observed(RUNNING, at(2.1), 0)
+    assert moving.state is AxisState.DISCRETE_MOTION
+
+    moving.observed(ON, at(2.2), 0)
+    assert (moving.state, moving.command, moving.last_error) == (AxisState.STANDSTILL, None, None)
+
+
+def test_a_reading_asked_for_before_the_start_ends_nothing(moving):
+    moving.observed(ON, at(1.9), 0)
+
+    assert (moving.state, moving.moving) == (AxisState.DISCRETE_MOTION, Moving.YES)
+
+
+def test_reaching_the_commanded_velocity_is_not_standstill(moving):
+    moving.begin(command(Verb.STOP, AxisState.STOPPING, Completion.REST), float("inf"))
+    moving.started(3.0)
+
+    moving.observed(replace(RUNNING, profile_done=True), at(3.1), 0)
+    assert moving.state is AxisState.STOPPING
+
+    moving.observed(ON, at(3.2), 0)
+    assert moving.state is AxisState.STANDSTILL
+
+
+def test_a_move_that_a_stop_ended_was_not_done(moving):
+    moving.begin(command(Verb.STOP, AxisState.STOPPING, Completion.REST), float("inf"))
+
+    assert moving.last_error == "move_absolute: aborted by stop"
+
+
+def test_a_drive_fault_ends_the_move_and_keeps_the_first_cause(moving):
+    moving.observed(replace(OFF, faults=(OVERHEAT,)), at(2.5), 111)
+    moving.observed(replace(OFF, faults=(Fault("position_error", "stuck"),)), at(2.6), 222)
+
+    assert (moving.state, moving.command) == (AxisState.ERROR_STOP, None)
+    assert [fault.code for fault in moving.active_faults] == ["position_error"]
+    assert (moving.first_fault.code, moving.first_fault.since) == ("overheat", 111)
+
+
+def test_a_loop_that_opens_by_itself_is_a_fault(moving):
+    moving.observed(OFF, at(2.5), 0)
+
+    assert moving.state is AxisState.ERROR_STOP
+    assert moving.first_fault.code == "loop_opened"
+
+
+def test_a_warning_stops_nothing(moving):
+    moving.observed(replace(RUNNING, faults=(Fault("position_wrap", "wrapped", stops=False),)), at(2.5), 0)
+
+    assert moving.state is AxisState.DISCRETE_MOTION
+    assert [fault.code for fault in moving.active_faults] == ["position_wrap"]
+
+
+def test_a_silent_drive_moves_unknown_not_no(moving):
+    moving.missed(0)
+    assert (moving.link, moving.moving, moving.quality) == (LinkState.DEGRADED, Moving.UNKNOWN, Quality.UNCERTAIN)
+
+    for _ in range(MISSES_UNTIL_DOWN - 1):
+        moving.missed(0)
+    assert (moving.link, moving.moving, moving.quality) == (LinkState.DOWN, Moving.UNKNOWN, Quality.BAD)
+
+
+def test_after_a_gap_the_axis_is_in_error_stop_and_not_referenced(moving):
+    moving.referenced = True
+    moving.disconnected(0)
+    moving.observed(ON, at(9.0), 0)
+
+    assert (moving.state, moving.referenced, moving.link) == (AxisState.ERROR_STOP, False, LinkState.UP)
+    assert moving.first_fault.code == "link_lost"
+
+
+def test_reset_forgets_the_cause_and_the_latch(moving):
+    moving.latch_stop()
+    moving.observed(replace(OFF, faults=(OVERHEAT,)), at(2.5), 0)
+
+    moving.cleared(3.0)
+    moving.observed(OFF, at(3.1), 0)
+
+    assert (moving.state, moving.stop_latched, moving.first_fault) == (AxisState.DISABLED, False, None)
+
+
+def test_an_adopted_drive_that_runs_is_in_motion():
+    tracker = AxisTracker("x", "mm")
+
+    tracker.observed(RUNNING, at(1.0), 0)
+    assert (tracker.state, tracker.moving) == (AxisState.DISCRETE_MOTION, Moving.YES)
+
+    tracker.observed(ON, at(1.1), 0)
+    assert tracker.state is AxisState.STANDSTILL
+
+
+def test_a_procedure_alone_says_when_its_command_is_over(moving):
+    moving.begin(command(Verb.HOME, AxisState.HOMING, Completion.PROCEDURE), float("inf"))
+    moving.started(3.0)
+
+    moving.observed(ON, at(3.1), 0)
+
+    assert (moving.state, moving.command.verb) == (AxisState.HOMING, Verb.HOME)
+
+
+def test_an_open_loop_fails_a_command_unless_it_is_meant_to_open_it(moving):
+    moving.begin(command(Verb.MOVE_ABSOLUTE), float("inf"))
+    moving.begin(replace(command(Verb.SET_PWM, completion=Completion.PROCEDURE), opens_loop=True), float("inf"))
+    moving.started(3.0)
+
+    moving.observed(replace(OFF, profile_done=False), at(3.1), 0)
+    assert (moving.state, moving.energised, moving.enabled) == (AxisState.DISCRETE_MOTION, True, False)
+
+    moving.begin(command(Verb.MOVE_ABSOLUTE), float("inf"))
+    moving.started(4.0)
+    moving.observed(OFF, at(4.1), 0)
+    assert (moving.state, moving.energised) == (AxisState.ERROR_STOP, False)

@@ -1,0 +1,187 @@
+import asyncio
+from collections.abc import Coroutine
+from typing import Any
+
+import pytest
+
+from ldcnd.bus.exchange_queue import LANE_LIMITS, Lane
+from ldcnd.errors import (
+    BusBusy,
+    NotSupported,
+    WrongState,
+)
+from tests.support import toy_family as toy
+from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
+from tests.support.toy_family import ToyPoller
+
+
+async def test_a_caller_gets_its_decoded_reply():
+    rig = Rig()
+
+    async with running(rig):
+        reply = await rig.bus.execute(toy.exchange(7))
+
+    assert reply == 7
+    assert rig.bus.statistics.replies == 1
+
+
+async def test_stop_overtakes_queued_commands_and_polls():
+    rig = Rig()
+    poller = ToyPoller(5, 0.01)
+
+    async with running(rig) as callers:
+        for number in (1, 2, 3):
+            callers.create_task(rig.bus.execute(toy.exchange(number)), name=f"command {number}")
+        await asyncio.sleep(0)
+        rig.bus.add_poller(poller)
+        await rig.bus.execute(toy.exchange(9), Lane.STOP)
+        rig.bus.remove_poller(poller)
+
+    assert rig.sent()[:2] == [1, 9]
+
+
+async def test_background_gives_way_to_commands():
+    rig = Rig()
+
+    async with running(rig) as callers:
+        callers.create_task(rig.bus.execute(toy.exchange(1)), name="first")
+        callers.create_task(rig.bus.execute(toy.exchange(2), Lane.BACKGROUND), name="background")
+        callers.create_task(rig.bus.execute(toy.exchange(3)), name="command")
+
+    assert rig.sent() == [1, 3, 2]
+
+
+async def test_a_caller_cancelled_in_the_queue_sends_nothing():
+    rig = Rig()
+
+    async with running(rig) as callers:
+        tasks = [
+            callers.create_task(rig.bus.execute(toy.exchange(number)), name=f"caller {number}") for number in (1, 2, 3)
+        ]
+        await asyncio.sleep(0)
+        tasks[1].cancel()
+
+    assert rig.sent() == [1, 3]
+    assert tasks[1].cancelled()
+
+
+@pytest.mark.parametrize("repeatable", [True, False])
+async def test_a_caller_cancelled_on_the_wire_leaves_the_line_in_step(*, repeatable: bool):
+    rig = Rig()
+
+    async with running(rig) as callers:
+        first = callers.create_task(rig.bus.execute(toy.exchange(1, repeatable=repeatable)), name="first")
+        second = callers.create_task(rig.bus.execute(toy.exchange(2)), name="second")
+        await asyncio.sleep(0.0003)
+        first.cancel()
+
+    assert first.cancelled()
+    assert second.result() == 2
+    assert rig.sent() == [1, 2]
+    assert rig.bus.statistics.resynchronisations == 0
+
+
+async def test_nothing_is_sent_again_for_a_caller_that_has_gone():
+    rig = Rig(toy.all_but(1))
+
+    async with running(rig):
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.001):
+                await rig.bus.execute(toy.exchange(1))
+        await rig.bus.execute(toy.exchange(2, node=2))
+
+    assert rig.sent() == [1, 2]
+
+
+async def test_withdrawing_fails_the_nodes_waiting_commands_only():
+    rig = Rig()
+    latched = WrongState("stopped")
+
+    async def caught(call: Coroutine[Any, Any, int]) -> int | WrongState:
+        try:
+            return await call
+        except WrongState as error:
+            return error
+
+    async with running(rig) as callers:
+        calls = {
+            "on the wire": rig.bus.execute(toy.exchange(1)),
+            "waiting": rig.bus.execute(toy.exchange(2)),
+            "other node": rig.bus.execute(toy.exchange(3, node=2)),
+            "stop": rig.bus.execute(toy.exchange(4), Lane.STOP),
+        }
+        tasks = {name: callers.create_task(caught(call), name=name) for name, call in calls.items()}
+        await asyncio.sleep(0)
+        rig.bus.withdraw(1, latched)
+
+    assert {name: task.result() for name, task in tasks.items()} == {
+        "on the wire": 1,
+        "waiting": latched,
+        "other node": 3,
+        "stop": 4,
+    }
+    assert rig.sent() == [1, 4, 3]
+
+
+async def test_a_full_lane_sends_nothing_and_says_so():
+    rig = Rig()
+    room = LANE_LIMITS[Lane.COMMAND]
+
+    async with running(rig) as callers:
+        for number in range(room + 1):
+            callers.create_task(rig.bus.execute(toy.exchange(number)), name=f"caller {number}")
+        await asyncio.sleep(0)
+        with pytest.raises(BusBusy):
+            await rig.bus.execute(toy.exchange(1000))
+        stopped = await rig.bus.execute(toy.exchange(2000), Lane.STOP)
+
+    assert stopped == 2000
+    assert 1000 not in rig.sent()
+    assert len(rig.sent()) == room + 2
+
+
+async def test_the_rate_changes_between_the_reply_and_the_next_request():
+    rig = Rig()
+
+    async with running(rig) as callers:
+        change = callers.create_task(rig.bus.change_baud(toy.exchange(1), 19_200), name="change")
+        after = callers.create_task(rig.bus.execute(toy.exchange(2)), name="after")
+
+    assert (change.result(), after.result()) == (1, 2)
+    assert rig.line.history[:3] == [
+        f"write {toy.request(1, 1).hex()}",
+        "baud 19200",
+        f"write {toy.request(1, 2).hex()}",
+    ]
+    assert rig.bus.baud == SETTINGS.baud  # closed again: the rate of the next opening
+
+
+async def test_a_reopened_line_starts_at_the_configured_rate():
+    rig = Rig()
+
+    async with running(rig):
+        await rig.bus.change_baud(toy.exchange(1, reply_bytes=0, response_s=0.001), 19_200)
+        changed = rig.bus.baud
+        rig.line.lose()
+        await rig.bus.wait_opened()
+
+        assert changed == 19_200
+        assert rig.bus.baud == 115_200
+
+
+async def test_a_far_end_with_its_own_rate_refuses_before_anything_is_sent():
+    rig = Rig()
+    rig.opener.fixed_baud = True
+
+    async with running(rig):
+        with pytest.raises(NotSupported, match="cannot change its rate"):
+            await rig.bus.change_baud(toy.exchange(1), 19_200)
+
+    assert rig.sent() == []
+
+
+async def test_the_longest_time_of_an_exchange_follows_the_rate():
+    rig = Rig()
+
+    async with running(rig):
+        assert rig.bus.longest_s(toy.exchange(1)) == pytest.approx(14 * BYTE_S + toy.RESPONSE_S)

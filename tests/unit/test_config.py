@@ -1,0 +1,104 @@
+from pathlib import Path
+
+import pytest
+
+from ldcnd.config import load_config
+from ldcnd.errors import ConfigError
+
+GOOD = """
+rig = "bench"
+[[bus]]
+name = "a"
+port = "/dev/ttyUSB0"
+[[bus.axis]]
+name = "x"
+address = 1
+model = "ls-182ap"
+unit = "mm"
+counts_per_unit = 1000
+velocity = 10
+acceleration = 100
+"""
+
+
+def load(tmp_path: Path, text: str):
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    return load_config(path)
+
+
+def test_the_shipped_rigs_are_valid():
+    for path in Path("config").glob("*.toml"):
+        assert load_config(path).bus
+
+
+def test_a_good_file_loads(tmp_path):
+    rig = load(tmp_path, GOOD)
+
+    assert rig.bus[0].axis[0].counts_per_unit == 1000
+    assert rig.bus[0].baud == 19_200
+
+
+def test_an_axis_without_a_scale_works_in_counts(tmp_path):
+    rig = load(tmp_path, GOOD.replace('unit = "mm"\ncounts_per_unit = 1000\n', ""))
+
+    assert rig.bus[0].axis[0].unit == "count"
+    assert rig.bus[0].axis[0].counts_per_unit is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("address = 1", "address = 200"), ["bus[0].axis[0].address", "127", "200"]),
+        (('model = "ls-182ap"', 'model = "ls-999"'), ["bus[0].axis[0].model", "ls-999", "pic-servo-v4"]),
+        (('port = "/dev/ttyUSB0"', 'port = "COM3"'), ["bus[0].port", "COM3", "socket://"]),
+        (('port = "/dev/ttyUSB0"', 'port = "sim:z"'), ["sim:z", "[[sim]]"]),
+        (("counts_per_unit = 1000", ""), ["bus[0].axis[0]", "counts_per_unit"]),
+        (("counts_per_unit = 1000", "counts_per_unit = 0"), ["counts_per_unit", "greater than 0"]),
+        (("velocity = 10", "velocity = inf"), ["velocity", "finite"]),
+        (("velocity = 10", "velocity = nan"), ["velocity"]),
+        (('rig = "bench"', 'rig = "Bench 1"'), ["rig", "Bench 1"]),
+        (('rig = "bench"', 'rigg = "bench"'), ["rigg", "rig"]),
+        (('port = "/dev/ttyUSB0"', 'port = "/dev/ttyUSB0"\nbaud = 4800'), ["bus[0].baud", "4800", "19200"]),
+        (
+            ("acceleration = 100", "acceleration = 100\nlimits = { position_min = 5, position_max = 5 }"),
+            ["bus[0].axis[0]", "position_min 5"],
+        ),
+        (("acceleration = 100", "acceleration = 100\nlimits = { velocity = 1 }"), ["velocity 10.0", "1.0"]),
+    ],
+)
+def test_a_wrong_value_names_file_key_value_and_what_is_allowed(tmp_path, change, words):
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, GOOD.replace(*change))
+
+    assert "rig.toml" in error.value.message
+    for word in words:
+        assert word in error.value.message
+
+
+def test_two_axes_of_one_name_are_refused(tmp_path):
+    axis = GOOD[GOOD.index("[[bus.axis]]") :]
+
+    with pytest.raises(ConfigError, match="'x' is given more than once"):
+        load(tmp_path, GOOD + axis.replace("address = 1", "address = 2"))
+
+
+def test_two_axes_on_one_address_are_refused(tmp_path):
+    axis = GOOD[GOOD.index("[[bus.axis]]") :]
+
+    with pytest.raises(ConfigError, match="address 1"):
+        load(tmp_path, GOOD + axis.replace('"x"', '"y"'))
+
+
+def test_a_file_that_is_not_toml_or_not_there_says_so(tmp_path):
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        load(tmp_path, "rig = ")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path / "nothing.toml")
+
+
+def test_all_complaints_come_at_once(tmp_path):
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, GOOD.replace("address = 1", "address = 0").replace("acceleration = 100", "acceleration = -1"))
+
+    assert len(error.value.message.splitlines()) == 2

@@ -1,0 +1,16 @@
+from pathlib import Path
+
+from ldcnd.config_reference import config_reference
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
+
+
+def test_the_page_is_what_the_models_say():
+    assert PAGE.read_text() == config_reference(), "run `make fix`"
+
+
+def test_every_key_says_what_it_means():
+    page = config_reference()
+
+    silent = [line for line in page.splitlines() if line.startswith("| `") and line.endswith("|  |")]
+    assert silent == []

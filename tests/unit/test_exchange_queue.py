@@ -1,0 +1,196 @@
+from dataclasses import dataclass
+
+import pytest
+
+from ldcnd.bus.exchange_queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
+from ldcnd.bus.poller import Poller
+from ldcnd.errors import BusBusy
+from tests.support.toy_family import ToyPoller
+
+
+@dataclass(eq=False)
+class Ticket:
+    name: str
+    abandoned: bool = False
+
+
+def filled(**lanes: int) -> ExchangeQueue[Ticket]:
+    """A queue with so many jobs in each lane, named after the lane and their order."""
+    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    for name, count in lanes.items():
+        for number in range(count):
+            queue.push(Ticket(f"{name}{number}"), Lane[name.upper()])
+    return queue
+
+
+def always_due(queue: ExchangeQueue[Ticket], node: int = 1) -> Poller[int]:
+    poller = ToyPoller(node, 1.0)
+    queue.schedule(poller, 0.0)
+    return poller
+
+
+def order(queue: ExchangeQueue[Ticket], turns: int, now_s: float = 0.0) -> list[str]:
+    """Take so many turns; a poller is due again at once."""
+    names = []
+    for _ in range(turns):
+        taken = queue.take(now_s)
+        if isinstance(taken, Poller):
+            names.append(f"poll{taken.node}")
+            queue.schedule(taken, now_s)
+        else:
+            names.append(taken.name if taken else "-")
+    return names
+
+
+def test_stop_overtakes_queued_commands_and_polls():
+    queue = filled(command=2, background=1)
+    always_due(queue)
+
+    queue.push(Ticket("stop"), Lane.STOP)
+
+    assert queue.stop_waits()
+    assert order(queue, 1) == ["stop"]
+    assert not queue.stop_waits()
+
+
+def test_a_lane_is_first_in_first_out():
+    queue = filled(command=3)
+
+    assert order(queue, 4) == ["command0", "command1", "command2", "-"]
+
+
+def test_a_due_poll_waits_for_four_commands_at_most():
+    queue = filled(command=10)
+    always_due(queue)
+
+    taken = order(queue, 10)
+
+    assert COMMANDS_PER_POLL == 4
+    assert [turn for turn, name in enumerate(taken) if name == "poll1"] == [4, 9]
+
+
+def test_commands_go_before_due_polls():
+    queue = filled(command=2)
+    always_due(queue)
+
+    assert order(queue, 3) == ["command0", "command1", "poll1"]
+
+
+def test_a_poll_that_is_not_due_delays_no_command():
+    queue = filled(command=10)
+    queue.schedule(ToyPoller(1, 1.0), 5.0)
+
+    assert order(queue, 11, now_s=4.9) == [f"command{number}" for number in range(10)] + ["-"]
+
+
+def test_background_waits_for_eight_polls_at_most():
+    queue = filled(background=2)
+    always_due(queue)
+
+    taken = order(queue, 18)
+
+    assert POLLS_PER_BACKGROUND == 8
+    assert [turn for turn, name in enumerate(taken) if name.startswith("background")] == [8, 17]
+
+
+def test_background_goes_when_no_poll_is_due():
+    queue = filled(background=1)
+    queue.schedule(ToyPoller(1, 1.0), 5.0)
+
+    assert order(queue, 2, now_s=1.0) == ["background0", "-"]
+
+
+def test_commands_go_before_background():
+    queue = filled(background=1, command=6)
+
+    assert order(queue, 7)[-1] == "background0"
+
+
+def test_polls_go_in_the_order_of_their_due_times():
+    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    for node, at_s in ((1, 3.0), (2, 1.0), (3, 2.0)):
+        queue.schedule(ToyPoller(node, 1.0), at_s)
+
+    taken = [queue.take(10.0) for _ in range(3)]
+
+    assert [poller.node for poller in taken if isinstance(poller, Poller)] == [2, 3, 1]
+
+
+def test_polls_due_at_once_take_turns():
+    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    for node in (1, 2, 3):
+        always_due(queue, node)
+
+    assert order(queue, 6) == ["poll1", "poll2", "poll3", "poll1", "poll2", "poll3"]
+
+
+def test_scheduling_again_replaces_the_turn():
+    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    poller = always_due(queue)
+
+    queue.schedule(poller, 7.0)
+
+    assert queue.next_due_s() == 7.0
+    assert queue.take(6.9) is None
+    assert queue.take(7.0) is poller
+    assert queue.take(8.0) is None
+
+
+def test_an_unscheduled_poller_is_forgotten():
+    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    poller = always_due(queue)
+
+    queue.unschedule(poller)
+    queue.unschedule(poller)
+
+    assert queue.next_due_s() == float("inf")
+    assert queue.take(1.0) is None
+
+
+def test_abandoned_jobs_are_passed_over():
+    queue = filled(command=2, stop=1)
+    for lane in (Lane.STOP, Lane.COMMAND):
+        queue.waiting(lane)[0].abandoned = True
+
+    assert not queue.stop_waits()
+    assert order(queue, 2) == ["command1", "-"]
+
+
+@pytest.mark.parametrize("lane", LANE_LIMITS)
+def test_a_full_lane_refuses_and_says_so(lane: Lane):
+    queue = filled(**{lane.name.lower(): LANE_LIMITS[lane]})
+
+    with pytest.raises(BusBusy, match=lane.name.lower()) as refused:
+        queue.push(Ticket("one more"), lane)
+
+    assert refused.value.limit == LANE_LIMITS[lane]
+    assert len(queue.waiting(lane)) == LANE_LIMITS[lane]
+
+
+def test_a_lane_full_of_abandoned_jobs_has_room():
+    queue = filled(command=LANE_LIMITS[Lane.COMMAND])
+    for ticket in queue.waiting(Lane.COMMAND)[1:]:
+        ticket.abandoned = True
+
+    queue.push(Ticket("one more"), Lane.COMMAND)
+
+    assert order(queue, 3) == ["command0", "one more", "-"]
+
+
+def test_a_job_that_is_sent_again_goes_first_and_always_finds_room():
+    queue = filled(command=LANE_LIMITS[Lane.COMMAND])
+
+    queue.push_front(Ticket("again"), Lane.COMMAND)
+
+    assert order(queue, 2) == ["again", "command0"]
+
+
+def test_draining_returns_every_job_and_forgets_the_pollers():
+    queue = filled(background=1, command=2, stop=1)
+    always_due(queue)
+
+    drained = queue.drain()
+
+    assert [ticket.name for ticket in drained] == ["stop0", "command0", "command1", "background0"]
+    assert queue.take(10.0) is None
+    assert queue.next_due_s() == float("inf")

@@ -1,0 +1,102 @@
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.daemon import guards
+from ldcnd.daemon.guards import AxisView
+from ldcnd.errors import (
+    AccelerationLimit,
+    AxisUnreachable,
+    NotReferenced,
+    PositionLimit,
+    StopLatched,
+    VelocityLimit,
+    WrongState,
+)
+from ldcnd.model.axes import AxisLimits, AxisState, LinkState
+
+READY = AxisView(
+    name="x",
+    unit="mm",
+    state=AxisState.STANDSTILL,
+    enabled=True,
+    referenced=True,
+    stop_latched=False,
+    link=LinkState.UP,
+    faults=(),
+)
+LIMITS = AxisLimits(position_min=-10, position_max=10, velocity=5, acceleration=50)
+
+
+def test_an_axis_that_stands_and_is_powered_may_move():
+    guards.check_may_move(READY)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "remedy"),
+    [
+        ({"link": LinkState.DOWN}, AxisUnreachable, "power"),
+        ({"stop_latched": True}, StopLatched, "reset"),
+        ({"state": AxisState.ERROR_STOP, "faults": ("overheat",)}, WrongState, "reset"),
+        ({"state": AxisState.DISABLED, "enabled": False}, WrongState, "power"),
+        ({"state": AxisState.DISCRETE_MOTION}, WrongState, "halt"),
+        ({"state": AxisState.CONTINUOUS_MOTION}, WrongState, "halt"),
+        ({"state": AxisState.HOMING}, WrongState, "halt"),
+        ({"state": AxisState.STOPPING}, WrongState, "halt"),
+    ],
+)
+def test_a_refusal_names_the_axis_and_the_way_out(change, error, remedy):
+    with pytest.raises(error) as refusal:
+        guards.check_may_move(replace(READY, **change))
+
+    assert "axis x" in refusal.value.message
+    assert refusal.value.axis == "x"
+    assert remedy in refusal.value.remedy
+
+
+def test_a_faulted_axis_says_what_its_fault_is():
+    with pytest.raises(WrongState, match="overheat"):
+        guards.check_may_move(replace(READY, state=AxisState.ERROR_STOP, faults=("overheat",)))
+
+
+def test_an_unreferenced_axis_takes_no_absolute_target():
+    with pytest.raises(NotReferenced) as refusal:
+        guards.check_referenced(replace(READY, referenced=False))
+
+    assert "home" in refusal.value.remedy
+
+
+@pytest.mark.parametrize(("target", "nearest"), [(10.001, 10), (-11, -10)])
+def test_a_target_outside_the_limits_names_the_nearest_inside(target, nearest):
+    with pytest.raises(PositionLimit) as refusal:
+        guards.check_position(READY, LIMITS, target)
+
+    assert (refusal.value.value, refusal.value.limit, refusal.value.nearest) == (target, nearest, nearest)
+    assert "mm" in refusal.value.message
+
+
+def test_the_limits_themselves_are_allowed():
+    guards.check_position(READY, LIMITS, 10)
+    guards.check_position(READY, LIMITS, -10)
+    guards.check_velocity(READY, LIMITS, -5)
+    guards.check_acceleration(READY, LIMITS, 50)
+
+
+def test_without_limits_everything_is_allowed():
+    guards.check_position(READY, AxisLimits(), 1e9)
+    guards.check_velocity(READY, AxisLimits(), 1e9)
+    guards.check_acceleration(READY, AxisLimits(), 1e9)
+
+
+def test_a_velocity_above_the_limit_keeps_its_sign_in_the_nearest():
+    with pytest.raises(VelocityLimit) as refusal:
+        guards.check_velocity(READY, LIMITS, -6)
+
+    assert refusal.value.nearest == -5
+
+
+def test_an_acceleration_above_the_limit_is_refused():
+    with pytest.raises(AccelerationLimit) as refusal:
+        guards.check_acceleration(READY, LIMITS, 51)
+
+    assert refusal.value.limit == 50

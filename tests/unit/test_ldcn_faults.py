@@ -1,0 +1,151 @@
+"""Diagnostics: LS-182AP manual, "Diagnostic bits", row by row; PIC-SERVO manual, 4.5 and 5.3."""
+
+import pytest
+
+from ldcnd.drivers.ldcn.faults import WARNINGS, Fault, FaultCode, diagnose
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
+
+LS_182AP = PROFILES["ls-182ap"]
+LS_173AP = PROFILES["ls-173ap"]
+V4 = PROFILES["pic-servo-v4"]
+
+
+def logosol(row, *, adc=None):
+    """Build a status from the first six columns of the table."""
+    limit2, limit1, pos_error, power_on, servo_on, index = (bit == "1" for bit in row.split())
+    flags = (
+        StatusFlag.LIMIT2 * limit2
+        | StatusFlag.LIMIT1 * limit1
+        | StatusFlag.POSITION_ERROR * pos_error
+        | StatusFlag.POWER_ON * power_on
+    )
+    return Status(StatusFlag(flags), adc=adc, aux=AuxFlag(AuxFlag.SERVO_ON * servo_on | AuxFlag.INDEX * index))
+
+
+def found(profile, status, *, pic_ae, absolute_mode=False):
+    return diagnose(profile, status, pic_ae=pic_ae, absolute_mode=absolute_mode)
+
+
+@pytest.mark.parametrize("pos_error", "01")
+def test_switched_off_and_healthy_is_no_fault(pos_error):
+    assert found(LS_182AP, logosol(f"1 1 {pos_error} 1 0 1"), pic_ae=False) == ()
+
+
+@pytest.mark.parametrize("row", ["0 0 0 1 1 0", "1 0 0 1 1 1", "0 1 0 1 0 1", "1 1 0 1 0 0"])
+def test_switched_on_the_limit_bits_are_limit_switches(row):
+    assert found(LS_182AP, logosol(row), pic_ae=True) == ()
+
+
+@pytest.mark.parametrize(
+    ("row", "codes"),
+    [
+        ("0 1 0 1 0 1", [FaultCode.OVERHEAT]),
+        ("0 1 1 1 0 1", [FaultCode.OVERHEAT]),
+        ("1 0 0 1 0 1", [FaultCode.STOP_INPUT]),
+        ("1 0 1 1 0 1", [FaultCode.STOP_INPUT]),
+        ("0 0 1 1 0 1", [FaultCode.STOP_INPUT, FaultCode.OVERHEAT]),
+        ("1 1 0 0 0 1", [FaultCode.OVERVOLTAGE]),
+        ("0 0 1 0 0 1", [FaultCode.OVERVOLTAGE]),
+    ],
+)
+def test_switched_off_the_bits_say_what_is_wrong_at_present(row, codes):
+    assert found(LS_182AP, logosol(row), pic_ae=False) == tuple(Fault(code, latched=False) for code in codes)
+
+
+@pytest.mark.parametrize(
+    ("row", "code"),
+    [
+        ("1 0 1 0 0 1", FaultCode.STOP_INPUT),
+        ("0 1 1 0 0 1", FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+        ("1 1 1 0 0 1", FaultCode.OVERHEAT),
+        ("0 0 1 0 0 1", FaultCode.OVERCURRENT),
+        ("1 0 1 0 0 0", FaultCode.ENCODER_OR_HALL),
+        ("1 1 1 1 0 0", FaultCode.POSITION_ERROR),
+        ("0 0 1 1 0 1", FaultCode.POSITION_ERROR),
+    ],
+)
+def test_switched_on_the_bits_say_what_switched_the_driver_off(row, code):
+    assert found(LS_182AP, logosol(row), pic_ae=True) == (Fault(code, latched=True),)
+
+
+@pytest.mark.parametrize("adc", [0, 7, 1016, 1023])
+def test_a_lost_sensor_is_reported_in_absolute_positioning_mode_only(adc):
+    status = logosol("1 1 1 1 0 1", adc=adc)
+
+    assert found(LS_182AP, status, pic_ae=True, absolute_mode=True) == (Fault(FaultCode.SENSOR_FAULT, latched=True),)
+    assert found(LS_182AP, status, pic_ae=True) == (Fault(FaultCode.POSITION_ERROR, latched=True),)
+
+
+@pytest.mark.parametrize("adc", [None, 8, 500, 1015])
+def test_a_connected_sensor_is_not_blamed(adc):
+    status = logosol("1 1 1 1 0 1", adc=adc)
+
+    (fault,) = found(LS_182AP, status, pic_ae=True, absolute_mode=True)
+
+    assert fault.code is FaultCode.POSITION_ERROR
+
+
+@pytest.mark.parametrize(("adc", "code"), [(1, "sensor_fault"), (2, "position_error"), (254, "sensor_fault")])
+def test_the_sensor_range_scales_with_the_converter(adc, code):
+    status = logosol("1 1 1 1 0 1", adc=adc)
+
+    assert [fault.code for fault in found(LS_173AP, status, pic_ae=True, absolute_mode=True)] == [code]
+
+
+def test_an_old_position_error_in_a_closed_loop_is_no_fault():
+    assert found(LS_182AP, logosol("1 1 1 1 1 1"), pic_ae=True) == ()
+
+
+def test_without_the_auxiliary_byte_both_readings_are_reported():
+    status = Status(StatusFlag.LIMIT2 | StatusFlag.POSITION_ERROR)
+
+    codes = [fault.code for fault in found(LS_182AP, status, pic_ae=True)]
+
+    assert codes == [FaultCode.STOP_INPUT, FaultCode.ENCODER_OR_HALL]
+
+
+def test_pic_servo_at_rest_with_everything_off_is_healthy():
+    status = Status(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+
+    assert found(V4, status, pic_ae=False) == ()
+
+
+def test_pic_servo_tells_a_position_error_from_lost_power():
+    tripped = Status(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+    unpowered = Status(StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+
+    assert found(V4, tripped, pic_ae=True) == (Fault(FaultCode.POSITION_ERROR, latched=True),)
+    assert found(V4, unpowered, pic_ae=True) == (Fault(FaultCode.POWER_LOST, latched=False),)
+
+
+def test_pic_servo_limit_switches_are_no_faults():
+    status = Status(StatusFlag.POWER_ON, aux=AuxFlag.SERVO_ON)
+
+    assert found(V4, status, pic_ae=True) == ()
+
+
+def test_current_limiting_is_known_on_pic_servo_only():
+    flags = StatusFlag.POWER_ON | StatusFlag.OVERCURRENT | StatusFlag.LIMIT1 | StatusFlag.LIMIT2
+    status = Status(flags, aux=AuxFlag.SERVO_ON)
+
+    assert found(V4, status, pic_ae=True) == (Fault(FaultCode.CURRENT_LIMIT, latched=True),)
+    assert found(LS_182AP, status, pic_ae=True) == ()
+
+
+@pytest.mark.parametrize("profile", [LS_182AP, V4])
+def test_warnings_come_from_the_auxiliary_byte(profile):
+    aux = AuxFlag.SERVO_ON | AuxFlag.POSITION_WRAP | AuxFlag.SERVO_OVERRUN
+    status = Status(StatusFlag.POWER_ON | StatusFlag.LIMIT1 | StatusFlag.LIMIT2, aux=aux)
+
+    codes = [fault.code for fault in found(profile, status, pic_ae=True)]
+
+    assert codes == [FaultCode.POSITION_WRAP, FaultCode.SERVO_OVERRUN]
+    assert WARNINGS.issuperset(codes)
+
+
+def test_every_fault_says_what_to_do():
+    remedies = {code.remedy for code in FaultCode}
+
+    assert len(remedies) == len(FaultCode)
+    assert all(": " in remedy for remedy in remedies)

@@ -1,0 +1,275 @@
+"""A line from whatever state to drives that can be polled."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
+from ldcnd.drivers.ldcn.identities import Expected, Identity, differences
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
+from ldcnd.drivers.ldcn.registers import actual_baud
+from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
+from ldcnd.drivers.ldcn.simulated_module import ModuleSettings
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.drivers.line import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
+from ldcnd.errors import NetworkMismatch, NotSupported, StopLatched
+from ldcnd.model.requests import HomeMethod
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.plant import MotorPlant
+from tests.support.bare_network import bare_network, specs
+
+ADOPT = LineSpec(start=StartPolicy.ADOPT)
+PAIR = specs("ls-182ap", "pic-servo-v4")
+
+
+def chain_of(*models):
+    return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in models)))
+
+
+class StuckRate(SimulatedDrive):
+    """A drive that ignores Set Baud Rate, as behind a bad crystal."""
+
+    baud = property(lambda _self: actual_baud(0x3F), lambda _self, _value: None)
+
+
+@pytest.mark.parametrize(
+    ("baud", "alternate", "code"),
+    [
+        (9600, False, 0x81),
+        (9600, True, 127),
+        (57_600, False, 0x14),
+        (57_600, True, 21),
+        (115_200, False, 0x0A),
+        (115_200, True, 0x0A),
+    ],
+)
+async def test_both_families_of_divisors_reach_the_working_rate(baud, alternate, code):
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR, baud, LineSpec(alternate_divisors=alternate)) as line:
+        report = await line.network.bring_up()
+        codes = [packet.data for packet in line.sent() if packet.command is Command.SET_BAUD_RATE]
+
+    assert (report.baud, report.reset) == (baud, True)
+    assert codes[-1] == bytes([code])  # those before call stray modules to the rate of a reset
+    assert [module.baud for module in chain.modules] == [actual_baud(code)] * 2
+
+
+async def test_the_highest_rate_is_reached_where_every_module_has_it():
+    chain = build_chain(ChainSpec((ModuleSpec("picservo-sc"), ModuleSpec("picservo-sc")), baud_check=False))
+    async with bare_network(chain, specs("pic-servo-sc", "pic-servo-sc"), 230_400) as line:
+        report = await line.network.bring_up()
+
+    assert (report.baud, report.remarks) == (230_400, ())
+
+
+async def test_modules_whose_highest_rate_is_off_are_found_again():
+    chain = chain_of("picservo-sc", "picservo-sc")
+    async with bare_network(chain, specs("pic-servo-sc", "pic-servo-sc"), 230_400) as line:
+        report = await line.network.bring_up()
+
+    assert report.baud == 19_200
+    assert report.remarks == ("address 1 does not answer at 230400 baud; the line stays at 19200",)
+
+
+async def test_a_module_that_does_not_follow_takes_everybody_back_by_reset():
+    follower = SimulatedDrive(LS_182AP, ModuleSettings(20, always_obeys_global_reset=True), MotorPlant())
+    chain = Chain([follower, StuckRate(PIC_SERVO_V4, ModuleSettings(4), MotorPlant())])
+    async with bare_network(chain, PAIR) as line:
+        report = await line.network.bring_up()
+
+    assert report.baud == 19_200
+    assert report.remarks == ("address 2 does not answer at 115200 baud; the line stays at 19200",)
+    assert [module.address for module in chain.modules] == [1, 2]
+    assert follower.baud == actual_baud(0x3F)
+
+
+@pytest.mark.parametrize("left_at", [9600, 57_600, 115_200])
+async def test_a_reset_reaches_drives_that_were_left_at_any_rate(left_at):
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR, left_at) as line:
+        await line.network.bring_up()
+    async with bare_network(chain, PAIR, 19_200) as line:
+        report = await line.network.bring_up()
+
+    assert (report.baud, report.reset) == (19_200, True)
+
+
+async def test_a_reset_reaches_drives_that_were_left_in_a_group():
+    chain = chain_of("picservo-v4", "picservo-v4")
+    spec = LineSpec(groups=(GroupSpec("both", ("a1", "a2"), leader="a2"),))
+    for _ in range(2):
+        async with bare_network(chain, specs("pic-servo-v4", "pic-servo-v4"), line=spec) as line:
+            report = await line.network.bring_up()
+
+    assert report.reset
+    assert [(module.group, module.leader) for module in chain.modules] == [(0x81, False), (0x81, True)]
+
+
+async def test_a_configured_identity_overrides_the_table():
+    odd = ModuleSpec("picservo-v4", settings=ModuleSettings(version=77))
+    chain = build_chain(ChainSpec((odd,)))
+    (known,) = specs("pic-servo-v4")
+    overridden = type(known)(known.name, known.address, known.model, known.gains, (0, 77))
+
+    async with bare_network(chain, (overridden,)) as line:
+        report = await line.network.bring_up()
+        await line.network.axes["a1"].power(on=True)
+
+    assert report.identities == {"a1": "Logosol LS-173/LS-174 family (id 0, version 77)"}
+    async with bare_network(chain, (known,)) as line:
+        with pytest.raises(NetworkMismatch, match=r"expected PIC-SERVO version 4, .* \(id 0, version 77\)"):
+            await line.network.bring_up()
+
+
+async def test_an_unknown_device_is_enumerated_and_never_moved():
+    chain = build_chain(ChainSpec((ModuleSpec("picservo-v4"), ModuleSpec("picio", settings=ModuleSettings(version=9)))))
+    chain.modules[1].profile = type(chain.modules[1].profile)("toaster", "Toaster", 123, range(256), "identify")
+    async with bare_network(chain, specs("pic-servo-v4")) as line:
+        await line.network.bring_up()
+        (_, unknown) = line.network.modules
+        before = len(line.sent())
+
+        with pytest.raises(NotSupported):
+            await line.network.start_group({"a1": Motion(100, 100.0, 100.0)}, lambda: None)
+
+        assert line.sent(before) == []
+    assert (unknown.address, unknown.model, unknown.device_id, unknown.version) == (2, None, 123, 9)
+    assert unknown.title == "an unknown device (id 123, version 9)"
+
+
+async def test_a_missing_module_is_named():
+    chain = chain_of("ls182ap", "picservo-v4")
+    expecting_io = LineSpec(modules=(ModuleEntry(3, "pic-io"),))
+    async with bare_network(chain, PAIR, line=expecting_io) as line:
+        with pytest.raises(NetworkMismatch, match=r"address 3 \(module\): expected PIC-I/O.*nothing there"):
+            await line.network.bring_up()
+
+
+async def test_an_adopted_homing_is_disarmed_by_a_stop():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        axis = line.network.axes["a2"]
+        await axis.power(on=True)
+        await axis.load(Motion(None, 50.0, 5000.0), home=HomeCapture(HomeMethod.FORWARD_LIMIT))
+        await axis.start()
+    async with bare_network(chain, PAIR, line=ADOPT) as line:
+        await line.network.bring_up()
+        armed = chain.modules[1].loop.search
+
+        await line.network.axes["a2"].stop(StopMode.SMOOTH)
+
+    assert armed is not None
+    assert chain.modules[1].loop.search is None
+
+
+async def test_powering_an_adopted_closed_loop_starts_nothing():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        await line.network.axes["a1"].power(on=True)
+    async with bare_network(chain, PAIR, line=ADOPT) as line:
+        await line.network.bring_up()
+        await line.network.axes["a1"].power(on=True)
+        commands = {packet.command for packet in line.sent()}
+
+    assert Command.LOAD_TRAJECTORY not in commands
+    assert chain.modules[0].loop.servo_on
+
+
+async def test_a_question_that_a_stop_took_off_the_queue_is_asked_again():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(line.network._rate.who_is(1), name="first on the wire")
+            asked = group.create_task(line.network._rate.who_is(2), name="behind it")
+            await asyncio.sleep(0)
+            line.bus.withdraw(2, StopLatched("a stop came"))
+
+    assert asked.result() == Identity(0, 4)
+
+
+async def test_adoption_refuses_a_drive_that_another_host_has_set_up():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+    chain.modules[1].items = StatusItem.POSITION
+    async with bare_network(chain, PAIR, line=ADOPT) as line:
+        with pytest.raises(NetworkMismatch, match=r"address 2 \(axis a2\) does not answer No Operation"):
+            await line.network.bring_up()
+
+
+async def test_adoption_refuses_drives_at_different_rates():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+    chain.modules[0].baud = actual_baud(0x3F)
+    async with bare_network(chain, PAIR, line=ADOPT) as line:
+        with pytest.raises(NetworkMismatch, match="address 1 is at 19200 baud; address 2 is at 115200 baud"):
+            await line.network.bring_up()
+
+        assert {packet.command for packet in line.sent()} <= {Command.READ_STATUS, Command.NO_OPERATION}
+
+
+async def test_a_drive_that_may_move_keeps_the_fallback_from_resetting():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        axis = line.network.axes["a1"]
+        await axis.power(on=True)
+        await axis.load(Motion(None, 5000.0, 50_000.0))
+        await axis.start()
+    chain.modules[1].power(on=False, at_s=asyncio.get_running_loop().time())
+    spec = LineSpec(start=StartPolicy.ADOPT, adopt_fallback=AdoptFallback.RESET)
+    async with bare_network(chain, PAIR, line=spec) as line:
+        with pytest.raises(NetworkMismatch, match=r"not reset either: address 1, .* moves"):
+            await line.network.bring_up()
+
+        assert Command.HARD_RESET not in {packet.command for packet in line.sent()}
+
+
+async def test_a_port_that_cannot_change_its_rate_takes_over_what_is_at_that_rate():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+    async with bare_network(chain, PAIR, line=ADOPT, fixed_baud=115_200) as line:
+        report = await line.network.bring_up()
+
+    assert (report.baud, report.reset) == (115_200, False)
+
+
+async def test_a_port_that_cannot_change_its_rate_never_loses_drives_by_a_reset():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+    async with bare_network(chain, PAIR, fixed_baud=115_200) as line:
+        with pytest.raises(NetworkMismatch, match="would restart at 19200"):
+            await line.network.bring_up()
+
+        assert line.sent() == []
+
+
+async def test_a_port_fixed_at_the_rate_of_power_up_serves_at_that_rate():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR, fixed_baud=19_200) as line:
+        report = await line.network.bring_up()
+
+    assert (report.baud, report.reset) == (19_200, True)
+
+
+def test_differences_are_told_by_address():
+    expected = (
+        Expected(1, "axis x", LS_182AP),
+        Expected(2, "axis y", PIC_SERVO_V4),
+        Expected(3, "axis z", PIC_SERVO_SC, Identity(0, 11)),
+    )
+
+    told = differences(expected, {1: Identity(90, 1), 3: Identity(0, 11)})
+
+    assert told == (
+        "address 1 (axis x): expected Logosol LS-182AP, Logosol LS-173AP (id 90, version 1)",
+        "address 2 (axis y): expected PIC-SERVO version 4, nothing there",
+    )

@@ -1,0 +1,138 @@
+"""Commands as a module takes them: it believes the count in the command byte (PIC-SERVO manual, section 3 and 5.2)."""
+
+import pytest
+
+from ldcnd.drivers.ldcn.controls import StopControl
+from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.received import (
+    HardReset,
+    Interpretation,
+    IoControl,
+    LoadTrajectory,
+    PlainCommand,
+    ResetPosition,
+    SetAddress,
+    SetGain,
+    StopMotor,
+    UndefinedCommand,
+    decode_command,
+    interpret,
+    interpret_bytes,
+)
+from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.errors import BadReply
+
+LS_182AP = PROFILES["ls-182ap"]
+V3, V4 = PROFILES["pic-servo-v3"], PROFILES["pic-servo-v4"]
+SC = PROFILES["pic-servo-sc"]
+THIRTEEN = bytes.fromhex("64 00 00 04 00 00 00 00 ff 00 00 08 01")
+
+
+def taken(profile, command, data):
+    return interpret(profile, Packet(1, command, bytes.fromhex(data)))
+
+
+def test_surplus_data_bytes_are_ignored_and_reported():
+    interpretation = taken(V4, Command.START_MOTION, "01 02")
+
+    assert interpretation.command == PlainCommand(Command.START_MOTION)
+    assert interpretation.oddities == ("2 data bytes, START_MOTION takes 0: the surplus is ignored",)
+
+
+def test_missing_data_bytes_count_as_zero_and_are_reported():
+    interpretation = taken(V4, Command.LOAD_TRAJECTORY, "37 25 06 01 00 58 01 00 00")
+
+    trajectory = Trajectory(position=67_109, velocity=344, acceleration=0, mode=ProfileMode.VELOCITY)
+    assert interpretation.command == LoadTrajectory(trajectory)
+    assert interpretation.oddities == ("9 data bytes, control byte 37 implies 13: 4 count as 0",)
+
+
+def test_a_half_present_field_keeps_its_low_bytes():
+    interpretation = taken(LS_182AP, Command.LOAD_TRAJECTORY, "08 07")
+
+    assert interpretation.command.trajectory.pwm_or_target == 7
+
+
+def test_version_4_takes_thirteen_gain_bytes_without_deadband_compensation():
+    interpretation = interpret(V4, Packet(1, Command.SET_GAIN, THIRTEEN))
+
+    assert interpretation.command == SetGain(Gains(100, 1024, 0, 0, 255, 0, 2048, 1, deadband=0))
+    assert interpretation.oddities
+
+
+def test_version_3_ignores_the_fourteenth_gain_byte():
+    interpretation = interpret(V3, Packet(1, Command.SET_GAIN, THIRTEEN + b"\x05"))
+
+    assert interpretation.command.gains.deadband == 0
+
+
+def test_a_missing_step_multiplier_is_one():
+    interpretation = interpret(SC, Packet(1, Command.SET_GAIN, THIRTEEN + b"\x05"))
+
+    assert (interpretation.command.gains.deadband, interpretation.command.gains.step_multiplier) == (5, 1)
+
+
+def test_gains_out_of_range_are_taken_as_they_are():
+    interpretation = taken(V4, Command.SET_GAIN, "ff " * 12 + "00 00")
+
+    assert (interpretation.command.gains.kp, interpretation.command.gains.sr) == (0xFFFF, 0)
+
+
+def test_undefined_commands_are_kept_with_their_data():
+    assert taken(LS_182AP, Command.IO_CONTROL, "05").command == UndefinedCommand(Command.IO_CONTROL, b"\x05")
+    assert taken(V4, Command.ADD_PATH_POINTS, "").command == UndefinedCommand(Command.ADD_PATH_POINTS, b"")
+    assert taken(V4, Command.IO_CONTROL, "05").command == IoControl(5)
+
+
+def test_reset_position_means_more_on_sc():
+    assert taken(SC, Command.RESET_POSITION, "02 fe ff ff ff").command == ResetPosition(position=-2)
+    assert taken(SC, Command.RESET_POSITION, "01").command == ResetPosition(relative_to_home=True)
+    assert taken(V4, Command.RESET_POSITION, "01").command == ResetPosition()
+
+
+def test_hard_reset_takes_a_control_byte_on_sc_only():
+    assert taken(SC, Command.HARD_RESET, "5f").command == HardReset(0x5F)
+    assert taken(V4, Command.HARD_RESET, "5f").command == HardReset()
+
+
+def test_the_leader_bit_is_not_part_of_the_group_address():
+    assert taken(V4, Command.SET_ADDRESS, "05 01").command == SetAddress(5, 0x81, leader=True)
+    assert taken(V4, Command.SET_ADDRESS, "05 81").command == SetAddress(5, 0x81, leader=False)
+
+
+def test_a_stop_position_counts_only_with_its_bit():
+    assert taken(V4, Command.STOP_MOTOR, "11 64 00 00 00").command == StopMotor(StopControl(0x11), 100)
+    assert taken(V4, Command.STOP_MOTOR, "09 64 00 00 00").command == StopMotor(StopControl(0x09), None)
+
+
+def test_bytes_of_a_line_are_explained_with_their_wrong_checksum():
+    interpretation = interpret_bytes(LS_182AP, bytes.fromhex("00 00 aa 01 21 07 ff 21"))
+
+    assert interpretation == Interpretation(
+        1,
+        SetAddress(7, 0xFF, leader=False),
+        ("packet checksum 21, computed 28: not executed",),
+        checksum_ok=False,
+    )
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00\x55", b"\xaa\x01\x13\x01"])
+def test_bytes_without_a_packet_cannot_be_explained(data):
+    with pytest.raises(BadReply, match="no complete packet"):
+        interpret_bytes(LS_182AP, data)
+
+
+@pytest.mark.parametrize(
+    ("profile", "packet", "reason"),
+    [
+        (V4, Packet(1, Command.START_MOTION, b"\x00"), "surplus"),
+        (V4, Packet(1, Command.SET_GAIN, THIRTEEN), "1 count as 0"),
+        (LS_182AP, Packet(1, Command.IO_CONTROL, b"\x00"), "does not define command 8"),
+        (SC, Packet(1, Command.ADD_PATH_POINTS, b"\x00"), "surplus"),
+    ],
+)
+def test_strict_decoding_refuses_what_a_module_would_tolerate(profile, packet, reason):
+    with pytest.raises(BadReply, match=reason):
+        decode_command(profile, encode_packet(packet))

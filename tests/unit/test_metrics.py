@@ -1,0 +1,97 @@
+"""Health reports as metrics, and the files that name them."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+
+from ldcnd.metrics.exposition import FRESH_S, HealthCollector
+from ldcnd.model.axes import LinkState
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth
+
+GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
+DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=0)
+BUS = BusHealth(
+    t=1, seq=0, bus="line0", up=True, utilisation=0.25, exchanges=1000, timeouts=3, corrupt_replies=2,
+    rejected_packets=0, resent=4, resynchronisations=5, stray_bytes=6, losses=1,
+    lanes=(LaneHealth(lane="poll", waiting=0, exchanges=900, p50_s=0.002, p99_s=0.008, longest_s=0.02),),
+    axes=(
+        AxisHealth(axis="x", link=LinkState.UP, sample_age_s=0.04, rate_wanted_hz=20.0, rate_hz=19.5, faults=2),
+        AxisHealth(axis="y", link=LinkState.DOWN, sample_age_s=None, rate_wanted_hz=20.0, rate_hz=0.0, faults=0),
+    ),
+)  # fmt: skip
+
+
+class Clock:
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def registry(clock) -> CollectorRegistry:
+    collector = HealthCollector("sim", clock)
+    collector.take(DAEMON)
+    collector.take(BUS)
+    registry = CollectorRegistry()
+    registry.register(collector)
+    return registry
+
+
+@pytest.mark.parametrize(
+    ("name", "labels", "value"),
+    [
+        ("ldcnd_daemon_up", {}, 1.0),
+        ("ldcnd_loop_lag_seconds", {}, 0.002),
+        ("ldcnd_published_total", {}, 700.0),
+        ("ldcnd_bus_up", {"bus": "line0"}, 1.0),
+        ("ldcnd_bus_utilisation_ratio", {"bus": "line0"}, 0.25),
+        ("ldcnd_bus_resent_total", {"bus": "line0"}, 4.0),
+        ("ldcnd_bus_errors_total", {"bus": "line0", "kind": "timeouts"}, 3.0),
+        ("ldcnd_bus_errors_total", {"bus": "line0", "kind": "stray_bytes"}, 6.0),
+        ("ldcnd_lane_latency_seconds", {"bus": "line0", "lane": "poll", "quantile": "0.99"}, 0.008),
+        ("ldcnd_axis_up", {"bus": "line0", "axis": "x"}, 1.0),
+        ("ldcnd_axis_up", {"bus": "line0", "axis": "y"}, 0.0),
+        ("ldcnd_axis_sample_age_seconds", {"bus": "line0", "axis": "x"}, 0.04),
+        ("ldcnd_axis_sample_age_seconds", {"bus": "line0", "axis": "y"}, None),
+        ("ldcnd_axis_rate_hertz", {"bus": "line0", "axis": "x"}, 19.5),
+        ("ldcnd_axis_faults", {"bus": "line0", "axis": "x"}, 2.0),
+    ],
+)
+def test_a_report_is_read_back_from_the_metrics(registry, name, labels, value):
+    assert registry.get_sample_value(name, {"rig": "sim", **labels}) == value
+
+
+def test_reports_that_stop_coming_are_not_shown_as_if_they_were_true(registry, clock):
+    clock.now_s += FRESH_S + 1.0
+
+    samples = [line for line in generate_latest(registry).decode().splitlines() if not line.startswith("#")]
+
+    assert samples == ['ldcnd_daemon_up{rig="sim"} 0.0']
+
+
+@pytest.mark.parametrize("name", ["alerts.yml", "dashboard.json"])
+def test_every_metric_that_a_file_names_exists(registry, name):
+    text = (GRAFANA / name).read_text()
+    exists = {sample.name for metric in registry.collect() for sample in metric.samples}
+
+    named = set(re.findall(r"\bldcnd_\w+", text))
+
+    assert len(named) > 5
+    assert named <= exists
+
+
+def test_the_dashboard_is_a_document_whose_panels_do_not_overlap():
+    panels = json.loads((GRAFANA / "dashboard.json").read_text())["panels"]
+
+    cells = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in panels]
+    assert len(set(cells)) == len(panels) > 8
+    assert all(target["expr"] for panel in panels for target in panel["targets"])

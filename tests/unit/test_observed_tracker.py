@@ -1,0 +1,61 @@
+from ldcnd.daemon.observed_tracker import ObservedTracker
+from ldcnd.drivers.driver import AxisReading, Fault
+from ldcnd.exchange import Timing
+from ldcnd.model.axes import AxisState, LinkState, Moving
+
+ALARM = Fault("alarm_0010", "Overcurrent")
+
+
+def reading(*, enabled: bool = True, velocity: float = 0.0, faults: tuple[Fault, ...] = ()) -> AxisReading:
+    return AxisReading(
+        position_counts=0,
+        following_error_counts=None,
+        velocity_counts_per_s=velocity,
+        velocity_resolution_counts_per_s=60.0,
+        adc_counts=None,
+        enabled=enabled,
+        profile_done=velocity == 0.0,
+        homing=False,
+        faults=faults,
+    )
+
+
+def observed(*readings: AxisReading) -> ObservedTracker:
+    tracker = ObservedTracker("feed", "rev")
+    for at_s, each in enumerate(readings):
+        tracker.observed(each, Timing(at_s, at_s, at_s, at_s), at_s)
+    return tracker
+
+
+def test_states_follow_what_the_drive_shows():
+    assert observed(reading(enabled=False)).state is AxisState.DISABLED
+    assert observed(reading()).state is AxisState.STANDSTILL
+    assert observed(reading(velocity=800.0)).state is AxisState.DISCRETE_MOTION
+    assert observed(reading(faults=(ALARM,))).state is AxisState.ERROR_STOP
+
+
+def test_run_switched_off_by_others_is_no_fault():
+    tracker = observed(reading(velocity=800.0), reading(enabled=False))
+
+    assert (tracker.state, tracker.active_faults) == (AxisState.DISABLED, ())
+
+
+def test_a_coasting_motor_moves_though_it_is_disabled():
+    assert observed(reading(enabled=False, velocity=800.0)).moving is Moving.YES
+
+
+def test_an_alarm_that_is_gone_leaves_nothing_to_reset():
+    tracker = observed(reading(faults=(ALARM,)), reading())
+
+    assert (tracker.state, tracker.first_fault) == (AxisState.STANDSTILL, None)
+
+
+def test_a_drive_that_answers_again_needs_no_reset():
+    tracker = observed(reading())
+    tracker.disconnected(5)
+
+    assert (tracker.link, tracker.state) == (LinkState.DOWN, AxisState.ERROR_STOP)
+
+    tracker.observed(reading(), Timing(9, 9, 9, 9), 9)
+
+    assert (tracker.link, tracker.state, tracker.active_faults) == (LinkState.UP, AxisState.STANDSTILL, ())

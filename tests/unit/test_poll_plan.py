@@ -1,0 +1,184 @@
+"""Response times and plans, against arithmetic by hand and against the real queue run at random."""
+
+import math
+import random
+
+import pytest
+
+from ldcnd.bus.cost import Cost
+from ldcnd.bus.exchange_queue import ExchangeQueue
+from ldcnd.bus.poll_plan import Poll, Urgent, largest, plan_line
+from ldcnd.bus.poller import Poller
+from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s
+
+MS = 0.001
+URGENT = Urgent(command_s=2 * MS, stop_s=1 * MS, recovery_s=3 * MS, margin_s=5 * MS)
+
+
+class Turns(Poller[None]):
+    """A task as the queue sees it."""
+
+    def __init__(self, task: PeriodicTask, start_s: float) -> None:
+        self.node = 1
+        self.task = task
+        self.due_at_s = start_s
+        self.deadline_at_s = start_s + task.period_s
+
+    def next_exchange(self, now_s):
+        self.due_at_s += self.task.period_s
+        self.deadline_at_s = self.due_at_s + self.task.period_s
+
+    def deliver(self, reply, timing):
+        raise NotImplementedError
+
+    missed = deliver
+
+
+def observed_s(tasks: list[PeriodicTask], starts_s: list[float], until_s: float) -> list[float]:
+    """Let the real queue order the tasks; return the longest time of each from being due to being over."""
+    queue: ExchangeQueue = ExchangeQueue()
+    turns = [Turns(task, start) for task, start in zip(tasks, starts_s, strict=True)]
+    longest = dict.fromkeys(turns, 0.0)
+    for each in turns:
+        queue.schedule(each, each.due_at_s)
+    now_s = 0.0
+    while now_s < until_s:
+        taken = queue.take(now_s)
+        if taken is None:
+            now_s = queue.next_due_s()
+            continue
+        due_s = taken.due_at_s
+        taken.next_exchange(now_s)
+        now_s += taken.task.cost_s
+        longest[taken] = max(longest[taken], now_s - due_s)
+        queue.schedule(taken, taken.due_at_s)
+    return [longest[each] for each in turns]
+
+
+def test_equal_rates_wait_for_one_round():
+    tasks = [PeriodicTask(0.1, 3 * MS)] * 4
+
+    assert response_times_s(tasks) == [pytest.approx(12 * MS)] * 4
+
+
+def test_a_fast_poll_waits_for_the_slow_one_that_has_just_begun_and_for_no_other():
+    fast, slow = PeriodicTask(0.02, 2 * MS), PeriodicTask(1.0, 5 * MS)
+
+    fast_s, *_ = response_times_s([fast, slow, slow, slow])
+
+    assert fast_s == pytest.approx(7 * MS)
+
+
+def test_a_full_line_promises_nothing():
+    assert response_times_s([PeriodicTask(0.01, 6 * MS)] * 2) == [math.inf] * 2
+
+
+def test_blocking_delays_everybody():
+    tasks = [PeriodicTask(0.1, 3 * MS)] * 2
+
+    assert response_times_s(tasks, blocking_s=4 * MS) == [pytest.approx(10 * MS)] * 2
+
+
+def test_commands_take_the_room_of_polls():
+    polls = [PeriodicTask(0.01, 3 * MS), PeriodicTask(0.1, 4 * MS)]
+
+    assert meets_deadlines(polls, PeriodicTask(0.01, 1 * MS))
+    assert not meets_deadlines(polls, PeriodicTask(0.01, 4 * MS))
+    assert not meets_deadlines(polls, PeriodicTask(0.002, 1.5 * MS))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_demand_and_response_times_agree_on_what_fits(seed):
+    dice = random.Random(seed)
+    tasks = [
+        PeriodicTask(dice.choice([0.01, 0.02, 0.03, 0.05, 0.14]), dice.uniform(0.8, 3.0) * MS)
+        for _ in range(dice.randint(2, 9))
+    ]
+
+    late = any(response_s > task.period_s for response_s, task in zip(response_times_s(tasks), tasks, strict=True))
+
+    assert meets_deadlines(tasks) is not late
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_poll_is_ever_later_than_its_bound(seed):
+    dice = random.Random(seed)
+    tasks = []
+    while load_of(tasks) < 0.85:
+        tasks.append(PeriodicTask(dice.choice([0.02, 0.03, 0.05, 0.1, 0.14, 0.5]), dice.uniform(0.8, 4.0) * MS))
+    bounds_s = response_times_s(tasks)
+
+    for _ in range(10):
+        starts_s = [dice.choice([0.0, dice.uniform(0.0, task.period_s)]) for task in tasks]
+        for seen_s, bound_s in zip(observed_s(tasks, starts_s, 4.0), bounds_s, strict=True):
+            assert seen_s <= bound_s + 1e-9
+
+
+def test_the_bound_is_reached():
+    tasks = [PeriodicTask(0.02, 2 * MS), PeriodicTask(0.05, 4 * MS), PeriodicTask(1.0, 6 * MS)]
+    bounds_s = response_times_s(tasks)
+
+    just_after = [1e-7, 1e-7, 0.0]
+
+    assert observed_s(tasks, just_after, 3.0)[0] == pytest.approx(bounds_s[0], abs=1e-6)
+
+
+def test_the_earliest_deadline_goes_first_among_the_polls_that_are_due():
+    queue: ExchangeQueue = ExchangeQueue()
+    slow, fast = Turns(PeriodicTask(1.0, MS), 0.0), Turns(PeriodicTask(0.1, MS), 0.01)
+    for each in (slow, fast):
+        queue.schedule(each, each.due_at_s)
+
+    assert [queue.take(0.02), queue.take(0.02), queue.take(0.02)] == [fast, slow, None]
+
+
+def test_a_plan_counts_the_room_that_is_left_for_commands():
+    plan = plan_line([poll("x", 50.0, 4 * MS), poll("y", 50.0, 4 * MS)], URGENT)
+
+    assert plan.holds
+    assert plan.load == pytest.approx(0.4)
+    assert plan.mean_load == pytest.approx(0.2)
+    interval_s = 1 / plan.commands_per_s
+    tasks = [each.task for each in plan.polls]
+    assert meets_deadlines(tasks, PeriodicTask(interval_s * 1.0001, URGENT.command_s))
+    assert plan.commands_per_s <= (0.98 - plan.load) / URGENT.command_s
+
+
+def test_a_stop_waits_for_the_longest_exchange_and_no_more():
+    plan = plan_line([poll("x", 10.0, 7 * MS), poll("y", 10.0, 4 * MS)], URGENT)
+
+    assert plan.stop_wait_s == pytest.approx(7 * MS)
+    assert plan.stop_s == pytest.approx(8 * MS)
+    assert plan.stop_after_loss_s == pytest.approx(16 * MS)
+
+
+def test_a_plan_names_the_polls_that_can_come_too_late():
+    plan = plan_line([poll("fast", 100.0, 3 * MS), poll("slow", 1.0, 9 * MS)], URGENT)
+
+    assert not plan.holds
+    assert [late.axis for late in plan.late] == ["fast"]
+
+
+def test_a_full_line_has_no_room_for_commands():
+    assert plan_line([poll("x", 500.0, 2 * MS)], URGENT).commands_per_s == 0.0
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(3.7, 3.7), (20.0, 10.0), (0.5, None)])
+def test_the_largest_value_that_fits_is_found(limit, expected):
+    found = largest(lambda value: value <= limit, 1.0, 10.0)
+
+    assert found is expected if expected is None else found == pytest.approx(expected, abs=1e-3)
+
+
+def poll(axis: str, rate_hz: float, longest_s: float) -> Poll:
+    return Poll(axis, ("position",), rate_hz, Cost(longest_s, 0.0, 0.0, 0.0), longest_s / 2)
+
+
+def test_deadlines_break_ties_by_due_time():
+    queue: ExchangeQueue = ExchangeQueue()
+    late, early = Turns(PeriodicTask(1.0, MS), 0.0), Turns(PeriodicTask(1.0, MS), 0.0)
+    late.deadline_at_s = early.deadline_at_s = 5.0
+    queue.schedule(late, 0.2)
+    queue.schedule(early, 0.1)
+
+    assert [queue.take(1.0), queue.take(1.0)] == [early, late]

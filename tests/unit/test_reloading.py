@@ -1,0 +1,140 @@
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ldcnd.config import RigConfig, load_config
+from ldcnd.daemon.reloading import plan_reload
+from ldcnd.errors import ConfigError
+
+SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
+RUNNING = load_config(SIMULATED)
+
+
+def document() -> dict[str, Any]:
+    return tomllib.loads(SIMULATED.read_text(encoding="utf-8"))
+
+
+def axis(of: dict[str, Any], name: str) -> dict[str, Any]:
+    found: dict[str, Any] = next(axis for axis in of["bus"][0]["axis"] if axis["name"] == name)
+    return found
+
+
+def validated(changed: dict[str, Any]) -> RigConfig:
+    return RigConfig.model_validate(changed)
+
+
+def test_same_configuration_changes_nothing():
+    reload = plan_reload(RUNNING, validated(document()))
+
+    assert reload.config == RUNNING
+    assert reload.changed == reload.refused == ()
+
+
+def test_limits_speeds_and_rates_apply():
+    wanted = document()
+    axis(wanted, "x")["limits"]["velocity"] = 40
+    axis(wanted, "x")["velocity"] = 25
+    axis(wanted, "y")["acceleration"] = 300
+    axis(wanted, "y")["rates"]["adc"] = 1
+
+    reload = plan_reload(RUNNING, validated(wanted))
+
+    assert reload.config == validated(wanted)
+    assert set(reload.changed) == {
+        "bus.line0.axis.x.limits.velocity",
+        "bus.line0.axis.x.velocity",
+        "bus.line0.axis.y.acceleration",
+        "bus.line0.axis.y.rates.adc",
+    }
+    assert reload.refused == ()
+
+
+@pytest.mark.parametrize(
+    ("path", "key", "value"),
+    [
+        ([], "rig", "other"),
+        (["zenoh"], "listen", ["tcp/127.0.0.1:7448"]),
+        (["bus", 0], "port", "/dev/ttyUSB0"),
+        (["bus", 0], "baud", 57_600),
+        (["bus", 0, "axis", 0], "address", 9),
+        (["bus", 0, "axis", 0], "model", "pic-servo-v4"),
+        (["bus", 0, "axis", 0], "reference", "required"),
+        (["bus", 0, "axis", 0, "gains"], "kp", 351),
+        (["bus", 0, "axis", 0, "home"], "velocity", 2),
+    ],
+)
+def test_what_was_built_in_is_refused_by_name(path: list[str | int], key: str, value: object):
+    wanted = document()
+    part: Any = wanted
+    for step in path:
+        part = part[step]
+    part[key] = value
+    names = {"bus": "bus.line0", "axis": "axis.x"}
+    shown = ".".join([names.get(step, step) for step in path if isinstance(step, str)] + [key])
+
+    reload = plan_reload(RUNNING, validated(wanted))
+
+    assert reload.refused == (shown,)
+    assert reload.config == RUNNING
+
+
+def test_other_scale_leaves_everything_of_that_axis_alone():
+    wanted = document()
+    axis(wanted, "x")["counts_per_unit"] = 500
+    axis(wanted, "x")["limits"]["velocity"] = 40
+    axis(wanted, "y")["velocity"] = 21
+
+    reload = plan_reload(RUNNING, validated(wanted))
+
+    assert reload.changed == ("bus.line0.axis.y.velocity",)
+    assert set(reload.refused) == {"bus.line0.axis.x.counts_per_unit", "bus.line0.axis.x.limits.velocity"}
+
+
+def test_added_and_removed_axes_are_refused_and_the_others_change():
+    wanted = document()
+    wanted["bus"][0]["axis"][3]["name"] = "d"
+    axis(wanted, "x")["velocity"] = 21
+
+    reload = plan_reload(RUNNING, validated(wanted))
+
+    assert reload.changed == ("bus.line0.axis.x.velocity",)
+    assert set(reload.refused) == {"bus.line0.axis.c", "bus.line0.axis.d"}
+
+
+def test_axes_in_another_order_are_refused():
+    wanted = document()
+    wanted["bus"][0]["axis"].reverse()
+
+    assert plan_reload(RUNNING, validated(wanted)).refused == ("bus.line0.axis",)
+
+
+def test_parts_without_a_name_are_refused_whole():
+    wanted = document()
+    wanted["sim"][0]["module"][0]["travel_counts"] = [-1000, 1000]
+
+    assert plan_reload(RUNNING, validated(wanted)).refused == ("sim.line0.module",)
+
+
+def test_change_that_contradicts_what_stays_is_an_error():
+    running = document()
+    axis(running, "x")["tracking"] = {"step": 1, "rate": 40}
+    wanted = document()
+    axis(wanted, "x")["limits"]["velocity"] = 30
+
+    with pytest.raises(ConfigError, match=r"tracking\.step x rate is 40, above limits\.velocity 30"):
+        plan_reload(validated(running), validated(wanted))
+
+
+def test_rates_of_a_line_that_paces_itself_are_refused():
+    running = load_config(SIMULATED.with_name("mixed.toml"))
+    wanted = tomllib.loads(SIMULATED.with_name("mixed.toml").read_text(encoding="utf-8"))
+    bus = next(bus for bus in wanted["bus"] if bus.get("family") == "smartstep")
+    unit = bus["axis"][0]
+    unit["rates"] = unit.get("rates", {}) | {"position": 0.7}
+
+    reload = plan_reload(running, validated(wanted))
+
+    assert reload.refused == (f"bus.{bus['name']}.axis.{unit['name']}.rates.position",)
+    assert reload.config == running

@@ -1,0 +1,95 @@
+"""What a client makes of a newer daemon, and of silence."""
+
+import json
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+
+import pytest
+
+from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
+from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
+from ldcnd.messaging.session import Declaration, Qos, Query
+from ldcnd.model.requests import PowerRequest, Verb
+from ldcnd.model.samples import PositionSample
+from tests.support.session_pair import JSON, KEYS, POSITION
+
+POWER = PowerRequest(on=True)
+DAEMON = {
+    "rig": "bench1", "version": "9", "api": 1, "instance": "i1", "started": 1, "encoding": "json", "axes": ["x"],
+    "buses": [], "moon_phase": "full",
+}  # fmt: skip
+SAMPLE = {
+    "t": 1, "t_error_ns": 0, "seq": 0, "quality": "good", "value": 1.5, "unit": "mm", "counts": 1500,
+    "following_error": None, "temperature": 21.5,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Newer:
+    """A daemon of tomorrow, and a client of today."""
+
+    session: MemorySession
+    client_session: MemorySession
+    client: RigClient
+
+    async def answers(self, key: str, answer: Callable[[Query], None]) -> Declaration:
+        return await self.session.serve(key, answer, complete=True)
+
+
+def text(document: object) -> bytes:
+    return json.dumps(document).encode()
+
+
+def present(query: Query) -> None:
+    query.reply(text(DAEMON), JSON)
+
+
+@pytest.fixture
+async def newer() -> AsyncIterator[Newer]:
+    broker = MemoryBroker()
+    async with broker.session() as server, broker.session() as client:
+        yield Newer(server, client, RigClient(client, "bench1"))
+
+
+async def test_a_description_with_fields_that_are_news_is_understood(newer: Newer) -> None:
+    await newer.answers(KEYS.daemon, present)
+
+    assert (await newer.client.daemon()).instance == "i1"
+    assert [rig.rig for rig in await find_rigs(newer.client_session)] == ["bench1"]
+
+
+async def test_a_sample_with_fields_that_are_news_is_understood(newer: Newer) -> None:
+    async with newer.client.samples() as samples:
+        newer.session.publish(POSITION, text(SAMPLE), encoding=JSON, qos=Qos.TELEMETRY)
+        axis, sample = await anext(samples)
+
+    assert axis == "x"
+    assert isinstance(sample, PositionSample)
+    assert sample.value == 1.5
+
+
+async def test_an_error_that_is_news_is_raised_in_words(newer: Newer) -> None:
+    refusal = text({"code": "moon_is_full", "message": "wait for the new moon", "retryable": True})
+    await newer.answers(KEYS.daemon, present)
+    await newer.answers(KEYS.all_commands, lambda query: query.reply_error(refusal, JSON))
+
+    with pytest.raises(LdcndError, match=r"wait for the new moon \(moon_is_full"):
+        await newer.client.command("x", Verb.POWER, POWER)
+
+
+async def test_a_command_that_nobody_answers_although_the_daemon_is_there_is_not_permitted(newer: Newer) -> None:
+    await newer.answers(KEYS.daemon, present)
+
+    with pytest.raises(SessionError, match="not permitted to command"):
+        await newer.client.command("x", Verb.POWER, POWER)
+
+
+async def test_a_command_whose_daemon_has_disappeared_has_an_unknown_outcome(newer: Newer) -> None:
+    declared = await newer.answers(KEYS.daemon, present)
+    with pytest.raises(SessionError):
+        await newer.client.command("x", Verb.POWER, POWER)  # now it knows the daemon
+    await declared.close()
+
+    with pytest.raises(OutcomeUnknown, match="no daemon serves rig bench1"):
+        await newer.client.command("x", Verb.POWER, POWER)

@@ -1,0 +1,113 @@
+import random
+
+import pytest
+
+from ldcnd.drivers.smartstep.counters import Counter, CounterQuality, CounterReading, CounterValue
+from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+
+
+def read(counter: Counter, raw_at_read, last_at_rest: int | None = None) -> tuple[CounterValue | None, int]:
+    """Feed a reading from a function of the read's number to the raw value at that instant."""
+    reading = CounterReading(counter, last_at_rest)
+    reads = 0
+    while reading.wanted:
+        raw = raw_at_read(reads) & 0xFFFF_FFFF
+        reading.take(raw >> 16 if reading.wanted is counter.high else raw & 0xFFFF)
+        reads += 1
+    return reading.value, reads
+
+
+def test_standing_counter_takes_three_reads():
+    value, reads = read(Counter.COMMAND, lambda _: 0x1234_5678)
+
+    assert value == CounterValue(0x1234_5678)
+    assert reads == 3
+
+
+def test_counter_moved_back_from_zero_is_negative():
+    value, _ = read(Counter.FEEDBACK, lambda _: -500)
+
+    assert value is not None
+    assert (value.raw, value.signed) == (0xFFFF_FE0C, -500)
+    assert not value.latched
+
+
+@pytest.mark.parametrize("step", [30_000, -30_000, 8_000, -8_000, 100])
+def test_moving_counter_is_read_at_some_instant_of_the_reading(step):
+    rng = random.Random(1)
+    for _ in range(300):
+        start = rng.randrange(2**32)
+
+        value, reads = read(Counter.COMMAND, lambda number, start=start: start + number * step)
+
+        assert value is not None
+        assert value.raw in {(start + number * step) & 0xFFFF_FFFF for number in range(reads)}
+
+
+def test_trembling_on_a_boundary_is_never_off_by_65536():
+    rng = random.Random(2)
+    for _ in range(500):
+        boundary = rng.randrange(1, 2**16) << 16
+
+        value, _ = read(Counter.COMMAND, lambda number, at=boundary: at - (number % 2))
+
+        assert value is not None
+        assert value.raw in (boundary, boundary - 1)
+
+
+def test_random_trembling_is_hardly_ever_off_by_65536():
+    rng = random.Random(3)
+    wrong = 0
+    for _ in range(2000):
+        value, _ = read(Counter.COMMAND, lambda _: 0x0005_0000 - rng.randrange(2))
+        wrong += value is None or value.raw not in (0x0005_0000, 0x0004_FFFF)
+
+    assert wrong <= 10
+
+
+def test_counter_too_fast_to_tell_gives_no_value():
+    value, reads = read(Counter.COMMAND, lambda number: number * 0x0002_0000)
+
+    assert value is None
+    assert reads == 15
+
+
+def test_one_jump_between_halves_is_read_again():
+    value, reads = read(Counter.COMMAND, lambda number: 0 if number < 2 else 0x0007_1234)
+
+    assert value == CounterValue(0x0007_1234)
+    assert reads == 6
+
+
+def test_high_halves_meet_across_zero():
+    value, _ = read(Counter.COMMAND, lambda number: -300 + 200 * number)
+
+    assert value is not None
+    assert value.signed == -100
+
+
+def test_value_from_standstill_corrects_a_whole_65536():
+    value, _ = read(Counter.COMMAND, lambda _: 0x0006_0001, last_at_rest=0x0005_0000)
+
+    assert value == CounterValue(0x0005_0001, CounterQuality.RESOLVED)
+
+
+def test_value_from_standstill_leaves_other_differences_alone():
+    value, _ = read(Counter.COMMAND, lambda _: 0x0009_4321, last_at_rest=0x0005_0000)
+
+    assert value == CounterValue(0x0009_4321, CounterQuality.AGREED)
+
+
+def test_each_counter_is_cleared_by_its_own_mode():
+    assert Counter.COMMAND.clear_mode is OperatingMode.COMMAND_COUNTER_CLEAR
+    assert Counter.FEEDBACK.clear_mode is OperatingMode.FEEDBACK_COUNTER_CLEAR
+
+
+def test_words_after_the_end_are_ignored():
+    reading = CounterReading(Counter.COMMAND)
+    for word in (1, 0x8000, 1):
+        reading.take(word)
+
+    reading.take(99)
+
+    assert reading.value == CounterValue(0x0001_8000)

@@ -1,0 +1,70 @@
+import json
+
+import pytest
+
+from ldcnd.drivers.smartstep.ledger import EepromLedger
+from ldcnd.errors import ConfigError, EepromBudgetSpent
+
+
+async def test_counts_outlive_the_daemon(tmp_path):
+    path = tmp_path / "deep" / "ledger.json"
+    ledger = EepromLedger(path)
+
+    await ledger.enter("feed", "Pn100", budget=10)
+    await ledger.enter("feed", "Pn100", budget=10)
+    await ledger.enter("feed", "Pn102", budget=10)
+
+    again = EepromLedger(path)
+    assert (again.writes("feed", "Pn100"), again.total("feed"), again.total("spool")) == (2, 3, 0)
+
+
+async def test_a_write_that_was_not_carried_out_is_taken_back(tmp_path):
+    ledger = EepromLedger(tmp_path / "ledger.json")
+    await ledger.enter("feed", "Pn100", budget=10)
+
+    await ledger.take_back("feed", "Pn100")
+
+    assert EepromLedger(tmp_path / "ledger.json").writes("feed", "Pn100") == 0
+
+
+async def test_the_budget_refuses_before_anything_is_counted(tmp_path):
+    ledger = EepromLedger(tmp_path / "ledger.json")
+    await ledger.enter("feed", "Pn100", budget=1)
+
+    with pytest.raises(EepromBudgetSpent):
+        await ledger.enter("feed", "Pn100", budget=1)
+
+    assert ledger.writes("feed", "Pn100") == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", '{"feed": 3}', '{"feed": {"Pn100": -1}}', '{"feed": {"Pn100": "2"}}', '{"feed": {"Pn100": true}}'],
+)
+def test_a_damaged_ledger_is_refused_and_not_replaced(tmp_path, text):
+    path = tmp_path / "ledger.json"
+    path.write_text(text)
+
+    with pytest.raises(ConfigError, match="ledger"):
+        EepromLedger(path)
+
+    assert path.read_text() == text
+
+
+async def test_a_ledger_that_cannot_be_written_stops_the_write(tmp_path):
+    (tmp_path / "taken").write_text("a file where a folder is needed")
+    ledger = EepromLedger(tmp_path / "taken" / "ledger.json")
+
+    with pytest.raises(ConfigError, match="cannot be written"):
+        await ledger.enter("feed", "Pn100", budget=10)
+
+    assert ledger.writes("feed", "Pn100") == 0
+
+
+async def test_the_file_is_for_people_too(tmp_path):
+    ledger = EepromLedger(tmp_path / "ledger.json")
+
+    await ledger.enter("feed", "Pn100", budget=10)
+
+    assert json.loads((tmp_path / "ledger.json").read_text()) == {"feed": {"Pn100": 1}}
+    assert list(tmp_path.iterdir()) == [tmp_path / "ledger.json"]

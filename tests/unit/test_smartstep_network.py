@@ -1,0 +1,221 @@
+"""Bring-up and polling of a SmartStep line: nobody is written to, nobody starves."""
+
+import asyncio
+import itertools
+
+import pytest
+
+from ldcnd.bus.wire_log import WireEvent
+from ldcnd.drivers.driver import AxisReading, ReadingListeners
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.packet import decode_command
+from ldcnd.drivers.smartstep.profiles import Wiring
+from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
+from ldcnd.drivers.smartstep.unit_poller import Basic, Listeners, UnitPoller
+from ldcnd.errors import NetworkMismatch, NotSupported, WrongState
+from ldcnd.exchange import Timing
+from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import TelemetryItem
+from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line
+
+
+class Heard:
+    """What a poller has told."""
+
+    def __init__(self) -> None:
+        self.readings: list[tuple[AxisReading, TelemetryItem, Timing]] = []
+        self.monitors: list[MonitorValue] = []
+        self.missed = 0
+
+    def listen(self, line: SmartStepLine, name: str) -> None:
+        def observed(reading: AxisReading, items: frozenset[TelemetryItem], timing: Timing) -> None:
+            (item,) = items
+            self.readings.append((reading, item, timing))
+
+        def miss(_error: object) -> None:
+            self.missed += 1
+
+        now_s = asyncio.get_running_loop().time()
+        listeners = ReadingListeners(observed, lambda value, _: self.monitors.append(value), miss)
+        line.bus.add_poller(line.axis(name).own_poller(now_s, listeners))
+
+    def last(self) -> AxisReading:
+        return self.readings[-1][0]
+
+
+def sent(line: SmartStepLine) -> list[bytes]:
+    return [record.data for record in line.bus.wire_log.records() if record.event is WireEvent.SENT]
+
+
+async def test_bring_up_only_reads():
+    async with smartstep_line([simulated(1), simulated(2)]) as line:
+        report = await line.network.bring_up()
+
+    functions = {command.function for data in sent(line) if (command := decode_command(data))}
+    assert functions == {0}
+    assert report.reset is False
+    assert report.identities["u2"] == "SmartStep R7D-APL or R7D-APH (version 0001H)"
+    assert report.remarks == ()
+
+
+async def test_a_silent_unit_is_remarked_upon_and_the_others_are_served():
+    async with smartstep_line([simulated(1)], numbers=[1, 5]) as line:
+        report = await line.network.bring_up()
+
+    assert report.remarks == ("unit 5 (axis u5) does not answer",)
+    assert set(report.identities) == {"u1"}
+
+
+async def test_a_line_where_nobody_answers_is_not_up():
+    async with smartstep_line([simulated(1)], numbers=[3]) as line:
+        with pytest.raises(NetworkMismatch, match="none of"):
+            await line.network.bring_up()
+
+
+async def test_a_trace_that_was_left_armed_is_remarked_upon():
+    drive = simulated(1)
+    drive.drive.mode = OperatingMode.DATA_TRACE
+    async with smartstep_line([drive]) as line:
+        report = await line.network.bring_up()
+
+    assert "2000H" in report.remarks[0]
+
+
+async def test_a_line_on_which_a_drive_hears_itself_stays_down_and_nothing_more_is_asked():
+    drive = simulated(1, SimulatedVariant(hears_itself=True))
+    async with smartstep_line([drive], wiring=Wiring.TWO_WIRE) as line:
+        with pytest.raises(NetworkMismatch, match="its own replies"):
+            await line.network.bring_up()
+        with pytest.raises(WrongState, match="its own replies"):
+            await line.axis("u1").parameters.read("Pn109")
+
+        assert line.axis("u1").parameters.self_hearing
+    assert not any(data.startswith((b"W1020", b"W11")) for data in sent(line))
+
+
+async def test_state_follows_run_alarm_and_speed():
+    drive = simulated(1)
+    heard = Heard()
+    async with smartstep_line([drive]) as line:
+        heard.listen(line, "u1")
+        await asyncio.sleep(2.0)
+        disabled = heard.last()
+        drive.drive.set_run(asyncio.get_running_loop().time(), on=True)
+        drive.drive.set_pulse_rate(500.0, asyncio.get_running_loop().time())
+        await asyncio.sleep(3.0)
+        moving = heard.last()
+        drive.drive.provoke(0x0010, asyncio.get_running_loop().time())
+        await asyncio.sleep(3.0)
+        alarmed = heard.last()
+
+    assert (disabled.enabled, disabled.faults) == (False, ())
+    assert (moving.enabled, moving.profile_done) == (True, False)
+    assert moving.velocity_counts_per_s == pytest.approx(2000.0, rel=0.1)
+    assert moving.position_counts > 1000
+    assert not alarmed.enabled
+    assert [(fault.code, fault.stops) for fault in alarmed.faults] == [("alarm_0010", True)]
+
+
+async def test_a_warning_does_not_disable():
+    drive = simulated(1)
+    drive.drive.set_run(0.0, on=True)
+    drive.drive.provoke(0x0091, 0.0)
+    heard = Heard()
+    async with smartstep_line([drive]) as line:
+        heard.listen(line, "u1")
+        await asyncio.sleep(2.0)
+
+    assert heard.last().enabled
+    assert [fault.stops for fault in heard.last().faults] == [False]
+
+
+async def test_position_is_right_while_the_counter_runs_through_a_boundary():
+    drive = simulated(1)
+    drive.drive.set_run(0.0, on=True)
+    drive.drive.set_pulse_rate(40_000.0, 0.0)
+    heard = Heard()
+    async with smartstep_line([drive]) as line:
+        heard.listen(line, "u1")
+        await asyncio.sleep(20.0)
+
+    positions = [
+        (timing.received_at_s, reading.position_counts)
+        for reading, item, timing in heard.readings
+        if item is TelemetryItem.POSITION
+    ]
+    speed = 40_000 * 4
+    assert len(positions) >= 19
+    for (earlier_s, earlier), (later_s, later) in itertools.pairwise(positions):
+        assert later - earlier == pytest.approx(speed * (later_s - earlier_s), abs=0.05 * speed)
+
+
+async def test_a_mute_unit_is_asked_seldom_and_does_not_starve_the_others():
+    heard, mute = Heard(), Heard()
+    async with smartstep_line([simulated(1)], numbers=[1, 5]) as line:
+        heard.listen(line, "u1")
+        mute.listen(line, "u5")
+        await asyncio.sleep(60.0)
+        asked = sum(data.startswith(b"W5") for data in sent(line))
+
+    states = [item for _, item, _ in heard.readings if item is TelemetryItem.STATE]
+    assert mute.missed == asked < 15
+    assert len(states) >= 55
+
+
+async def test_a_unit_that_comes_back_is_identified_and_polled_again():
+    drive = simulated(1)
+    heard = Heard()
+    async with smartstep_line([drive]) as line:
+        heard.listen(line, "u1")
+        await asyncio.sleep(2.0)
+        loop = asyncio.get_running_loop()
+        drive.power_off(loop.time())
+        await asyncio.sleep(20.0)
+        line.axis("u1").identity = None
+        readings = len(heard.readings)
+        drive.power_on(loop.time())
+        await asyncio.sleep(15.0)
+
+    assert len(heard.readings) > readings + 8
+    assert line.axis("u1").identity is not None
+
+
+async def test_monitors_come_at_their_rates():
+    told: list[MonitorValue] = []
+    async with smartstep_line([simulated(1)]) as line:
+        axis = line.axis("u1")
+        rates = {
+            Basic.STATE: 1.0,
+            MonitorName.TORQUE_REFERENCE: 2.0,
+            MonitorName.INPUT_COUNTER: 0.5,
+            MonitorName.INPUT_SIGNALS: 0.1,
+        }
+        listeners = Listeners(lambda *_: None, lambda value, _: told.append(value), lambda *_: None, lambda _: None)
+        line.bus.add_poller(UnitPoller(line.bus, 1, axis.profile, rates, 0.0, listeners))
+        await asyncio.sleep(20.0)
+
+    counts = {name: sum(value.name is name for value in told) for name in MonitorName}
+    assert counts[MonitorName.TORQUE_REFERENCE] in range(39, 42)
+    assert counts[MonitorName.INPUT_COUNTER] in range(10, 12)
+    assert {value.high for value in told if value.name is MonitorName.INPUT_SIGNALS} == {("RUN", "RESET")}
+
+
+async def test_polling_for_long_leaves_nothing_behind_in_the_queue():
+    heard = Heard()
+    async with smartstep_line([simulated(1)]) as line:
+        heard.listen(line, "u1")
+        await asyncio.sleep(300.0)
+        kept = len(line.bus._queue._later) + len(line.bus._queue._due)
+
+    assert len(heard.readings) > 800
+    assert kept < 50
+
+
+async def test_motion_is_refused_whatever_it_is():
+    async with smartstep_line([simulated(1)]) as line:
+        axis = line.axis("u1")
+
+        for refused in (axis.power(on=True), axis.start(), axis.reset(), axis.captured_home()):
+            with pytest.raises(NotSupported, match="over its line"):
+                await refused

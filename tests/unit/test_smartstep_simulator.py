@@ -1,0 +1,146 @@
+"""Simulated drives behind the simulated line, alone and under the real bus."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import pytest
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.resync import Resync
+from ldcnd.bus.settings import BusSettings
+from ldcnd.drivers.smartstep.commands import FLUSH, probe, reference, write_eeprom, write_ram
+from ldcnd.drivers.smartstep.packet import ResponseStatus
+from ldcnd.drivers.smartstep.parameters import PN000, PN100
+from ldcnd.drivers.smartstep.parity import add_parity, strip_parity
+from ldcnd.drivers.smartstep.profiles import Framing, Wiring
+from ldcnd.drivers.smartstep.refusals import Refusal
+from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
+from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
+from ldcnd.drivers.smartstep.simulator import smartstep_chain
+from ldcnd.drivers.smartstep.strings import string_reference
+from ldcnd.errors import OutcomeUnknown, ReplyTimeout
+from ldcnd.sim.chain import Chain, Delivery
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.line import open_simulated_line
+
+
+def unit(number: int, variant: SimulatedVariant | None = None) -> SimulatedUnit:
+    return SimulatedUnit(variant, {PN000: number << 8, PN100: 40 + number})
+
+
+def received(chain: Chain, request: bytes, at_s: float = 1.0) -> list[tuple[float, bytes]]:
+    chain.write(at_s, request)
+    return chain.advance(at_s + 2.0)
+
+
+@asynccontextmanager
+async def bus_on(chain: Chain, *, echo: bool = False) -> AsyncIterator[Bus]:
+    bus = Bus(BusSettings("steps", 9600, echo=echo), lambda: open_simulated_line(chain))
+    bus.resync = Resync(flush=FLUSH, quiet_s=0.02, probe=lambda _: probe(1))
+    with suppress(asyncio.CancelledError):
+        async with asyncio.TaskGroup() as tasks:
+            running = tasks.create_task(bus.run(), name="bus")
+            await bus.wait_opened()
+            yield bus
+            running.cancel()
+
+
+def test_reply_arrives_whole_when_its_last_character_has_come():
+    ((at_s, data),) = received(smartstep_chain([unit(1)]), reference(1, PN100.eeprom_address).request)
+
+    assert data == b"W1001000029C6\r"
+    assert at_s == pytest.approx(1.0 + 28 * 10 / 9600 + 0.01)
+
+
+def test_reply_arrives_bytewise_where_the_port_delivers_so():
+    pieces = received(smartstep_chain([unit(1)], delivery=Delivery.BYTEWISE), reference(1, 0x0100).request)
+
+    assert b"".join(data for _, data in pieces) == b"W1001000029C6\r"
+    assert len(pieces) == 14
+
+
+def test_soft_parity_is_seven_bits_and_even_on_the_line():
+    chain = smartstep_chain([unit(1)], framing=Framing.SOFT_PARITY)
+    exchange = reference(1, PN100.eeprom_address)
+
+    ((_, data),) = received(chain, add_parity(exchange.request))
+
+    assert exchange.decode(strip_parity(data)) == 41
+    assert received(chain, exchange.request, 5.0) == []
+
+
+def test_echo_comes_before_the_reply_on_two_wires():
+    chain = smartstep_chain([unit(1)], Wiring.TWO_WIRE, echo=True)
+    request = probe(1).request
+
+    heard = b"".join(data for _, data in received(chain, request))
+
+    assert heard[:14] == request
+    probe(1).decode(heard[14:])
+
+
+def test_eight_bit_noise_makes_a_drive_deaf_until_a_flush():
+    chain = smartstep_chain([unit(1)])
+    request = reference(1, 0x8000).request
+
+    assert received(chain, b"\xaa\x55" + request, 1.0) == []
+    assert len(received(chain, FLUSH + request, 5.0)) == 1
+
+
+async def test_bus_reads_and_writes():
+    async with bus_on(smartstep_chain([unit(1), unit(2)])) as bus:
+        assert await bus.execute(reference(2, PN100.eeprom_address)) == 42
+        assert await bus.execute(write_ram(2, PN100, 60)) == 60
+        assert await bus.execute(reference(2, PN100.ram_address)) == 60
+        assert await bus.execute(reference(1, 0xC000)) == Refusal(1, ResponseStatus.REFERENCE_ADDRESS_ERROR, 0xC000, 0)
+
+
+async def test_bus_reads_a_trace_memory_from_a_slow_drive():
+    slow = unit(1, SimulatedVariant(response_s=0.2))
+    slow.drive.recorder.rings[0][:2] = [0x1234, 0xABCD]
+    async with bus_on(smartstep_chain([slow])) as bus:
+        reply = await bus.execute(string_reference(1, 0x3000, 1000))
+
+    assert reply.data[:4] == bytes.fromhex("1234ABCD")
+    assert len(reply.data) == 1000
+
+
+async def test_bus_drops_its_echo_by_count():
+    chain = smartstep_chain([unit(1)], Wiring.TWO_WIRE, echo=True)
+    async with bus_on(chain, echo=True) as bus:
+        assert await bus.execute(write_ram(1, PN100, 60)) == 60
+
+
+async def test_lost_replies_are_read_again():
+    faults = FaultPlan((Fault(FaultKind.REPLY_LOST, 0.3), Fault(FaultKind.REPLY_BYTE_LOST, 0.1)), seed=4)
+    async with bus_on(smartstep_chain([unit(1)], faults=faults)) as bus:
+        values = []
+        for _ in range(30):
+            with suppress(ReplyTimeout):
+                values.append(await bus.execute(reference(1, PN100.eeprom_address)))
+
+    assert len(values) > 20
+    assert set(values) == {41}
+    assert bus.statistics.timeouts > 0
+
+
+async def test_lost_reply_to_an_eeprom_write_is_never_repeated():
+    faults = FaultPlan((Fault(FaultKind.REPLY_LOST),))
+    drive = unit(1)
+    async with bus_on(smartstep_chain([drive], faults=faults)) as bus:
+        with pytest.raises(OutcomeUnknown):
+            await bus.execute(write_eeprom(1, PN100, 60))
+
+    assert drive.drive.memory.writes[PN100.number] == 1
+
+
+def test_host_that_sends_into_a_reply_on_four_wires_does_not_cut_it():
+    chain = smartstep_chain([unit(1)])
+    exchange = reference(1, PN100.eeprom_address)
+    chain.write(1.0, exchange.request)
+    chain.advance(1.03)
+
+    chain.write(1.03, FLUSH)
+
+    assert [data for _, data in chain.advance(2.0)] == [b"W1001000029C6\r"]

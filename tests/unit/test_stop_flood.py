@@ -1,0 +1,148 @@
+"""In a flood, stops join one that is under way, unless something may have begun to move since."""
+
+import asyncio
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+
+from ldcnd.daemon.requests import STOPS_AT_ONCE, Requests
+from ldcnd.errors import InternalError
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Answer, Query
+from tests.support.session_pair import error_of
+
+KEYS = Keys("bench1")
+
+
+@dataclass
+class Tracker:
+    """Remembers the latch."""
+
+    stop_latched: bool = False
+
+    def latch_stop(self) -> None:
+        self.stop_latched = True
+
+
+@dataclass
+class SlowRig:
+    """A rig whose stops are confirmed when the test says so."""
+
+    name: str = "bench1"
+    confirmed: asyncio.Event = field(default_factory=asyncio.Event)
+    stops: int = 0
+    fails: bool = False
+
+    def __post_init__(self) -> None:
+        self.axes = {"x": SimpleNamespace(tracker=Tracker(), stoppable=True, config=SimpleNamespace(name="x"))}
+
+    def axis(self, name: str) -> SimpleNamespace:
+        return self.axes[name]
+
+    def reset(self) -> None:
+        self.axes["x"].tracker.stop_latched = False
+
+    async def stop(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        self.stops += 1
+        await asyncio.sleep(0)
+        await self.confirmed.wait()
+        if self.fails:
+            raise ValueError("a bug")
+        return names
+
+
+class Flood:
+    """Sends stops to one daemon's requests and keeps the answers."""
+
+    def __init__(self, rig: SlowRig, group: asyncio.TaskGroup) -> None:
+        self.answers: list[Answer] = []
+        self._requests = Requests(rig, KEYS, group, None, None)
+
+    def stop(self, times: int = 1) -> None:
+        for _ in range(times):
+            self._requests.on_stop(Query(KEYS.stop("x"), {}, b"", "", self.answers.extend))
+
+
+async def settled() -> None:
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+async def test_a_few_stops_are_all_sent():
+    rig = SlowRig()
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(STOPS_AT_ONCE)
+        await settled()
+        rig.confirmed.set()
+
+    assert rig.stops == len(flood.answers) == STOPS_AT_ONCE
+
+
+async def test_many_stops_are_sent_a_few_times_and_each_is_answered():
+    rig = SlowRig()
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(200)
+        await settled()
+        rig.confirmed.set()
+
+    assert rig.stops == STOPS_AT_ONCE
+    assert len(flood.answers) == 200
+    assert {b'"confirmed":["x"]' in answer.payload for answer in flood.answers} == {True}
+
+
+async def test_a_stop_after_a_reset_is_sent_although_others_are_under_way():
+    rig = SlowRig()
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(50)
+        await settled()
+        rig.reset()
+        flood.stop()
+        await settled()
+        sent = rig.stops
+        rig.confirmed.set()
+
+    assert sent == STOPS_AT_ONCE + 1
+    assert rig.axes["x"].tracker.stop_latched
+
+
+async def test_a_stop_that_has_joined_is_sent_after_all_when_a_reset_takes_its_latch():
+    rig = SlowRig()
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(STOPS_AT_ONCE + 1)
+        await settled()
+        rig.reset()
+        rig.confirmed.set()
+
+    assert rig.stops == STOPS_AT_ONCE + 1
+    assert rig.axes["x"].tracker.stop_latched
+
+
+async def test_a_stop_whose_companion_fails_is_told_so():
+    rig = SlowRig(fails=True)
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(STOPS_AT_ONCE + 1)
+        await settled()
+        rig.confirmed.set()
+
+    codes = [error_of([answer]).code for answer in flood.answers]
+    assert codes == [InternalError.code] * (STOPS_AT_ONCE + 1)
+
+
+@pytest.mark.parametrize("times", [1, 100])
+async def test_stops_that_come_after_a_flood_are_sent_again(times: int):
+    rig = SlowRig()
+    rig.confirmed.set()
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(times)
+        await settled()
+        sent = rig.stops
+        flood.stop()
+
+    assert rig.stops == sent + 1

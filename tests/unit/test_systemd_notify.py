@@ -1,0 +1,316 @@
+"""The daemon and its service manager, on the jumping clock; only the datagrams are real."""
+
+import asyncio
+import os
+import socket
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from ldcnd.axis_config import AxisConfig
+from ldcnd.bus.line import Phase
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config import RigConfig, load_config
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.service import Service, describe
+from ldcnd.daemon.systemd import Notifier, reloading, status
+from ldcnd.errors import ConfigError, VelocityLimit
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.model.axes import AxisState
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import PositionSample, TelemetryItem
+from tests.support.rig import EPOCH_NS, SIMULATED
+
+WATCHDOG_S = 5.0
+
+
+class Manager:
+    """The service manager's end."""
+
+    def __init__(self, place: Path) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self.socket.bind(str(place))
+        self.environment = {
+            "NOTIFY_SOCKET": str(place),
+            "WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6)),
+            "WATCHDOG_PID": str(os.getpid()),
+        }
+
+    async def listen(self, seconds: int) -> list[str]:
+        """Return what comes within this time; the kernel keeps only a few datagrams, so they are fetched at once."""
+        messages = self.heard()
+        for _ in range(10 * seconds):
+            await asyncio.sleep(0.1)
+            messages += self.heard()
+        return messages
+
+    def heard(self) -> list[str]:
+        """Return the datagrams that have come since the last call."""
+        messages = []
+        while True:
+            try:
+                messages.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return messages
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[Manager]:
+    manager = Manager(tmp_path / "notify")
+    yield manager
+    manager.socket.close()
+
+
+@asynccontextmanager
+async def service_of(
+    manager: Manager, load: Callable[[], RigConfig] = lambda: load_config(SIMULATED), config: RigConfig | None = None
+) -> AsyncIterator[tuple[Service, Daemon, RigClient]]:
+    """Run the simulated rig as a service until the context ends."""
+    config = config or load_config(SIMULATED)
+    loop = asyncio.get_running_loop()
+    broker = MemoryBroker()
+    async with broker.session() as session, broker.session() as client_session, asyncio.TaskGroup() as group:
+        daemon = build_daemon(config, session, lambda: EPOCH_NS + round(loop.time() * 1e9), "test")
+        service = Service(daemon, Notifier(manager.environment), load, lambda: 1_234_567_890)
+        running = group.create_task(service.run(), name="service")
+        try:
+            yield service, daemon, RigClient(client_session, config.rig)
+        finally:
+            service.end()
+            await running
+
+
+def with_axis(config: RigConfig, name: str, **changes: object) -> RigConfig:
+    """Return the configuration with some keys of an axis changed."""
+
+    def changed(axis: AxisConfig) -> AxisConfig:
+        return axis.model_copy(update=changes) if axis.name == name else axis
+
+    buses = tuple(bus.model_copy(update={"axis": tuple(map(changed, bus.axis))}) for bus in config.bus)
+    return config.model_copy(update={"bus": buses})
+
+
+# -- the protocol ----------------------------------------------------------------------------------------------------
+
+
+def test_messages_travel_as_one_datagram(manager: Manager):
+    Notifier(manager.environment).tell("READY=1", status("drei Würfel\nund ≥ 2 Achsen"))
+
+    assert manager.heard() == ["READY=1\nSTATUS=drei Würfel und ≥ 2 Achsen"]
+
+
+def test_abstract_addresses_work(manager: Manager):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as abstract:
+        abstract.bind(f"\0ldcnd-test-{os.getpid()}")
+
+        Notifier({"NOTIFY_SOCKET": f"@ldcnd-test-{os.getpid()}"}).tell("READY=1")
+
+        assert abstract.recv(64) == b"READY=1"
+
+
+def test_reload_says_when_on_the_monotonic_clock():
+    assert reloading(1_234_567_890) == "RELOADING=1\nMONOTONIC_USEC=1234567"
+
+
+def test_without_a_manager_nothing_is_told_and_nothing_fails(tmp_path: Path):
+    Notifier({}).tell("READY=1")
+    Notifier({"NOTIFY_SOCKET": str(tmp_path / "gone")}).tell("READY=1")
+
+    assert not Notifier({}).is_heard
+
+
+@pytest.mark.parametrize(
+    ("environment", "watchdog_s"),
+    [
+        ({}, None),
+        ({"WATCHDOG_USEC": "5000000"}, 5.0),
+        ({"WATCHDOG_USEC": "5000000", "WATCHDOG_PID": str(os.getpid())}, 5.0),
+        ({"WATCHDOG_USEC": "5000000", "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+    ],
+)
+def test_watchdog_is_fed_only_by_the_process_that_is_watched(environment: dict[str, str], watchdog_s: float | None):
+    assert Notifier(environment).watchdog_s == watchdog_s
+
+
+# -- the service -----------------------------------------------------------------------------------------------------
+
+
+async def test_ready_comes_first_and_stopping_last(manager: Manager):
+    async with service_of(manager) as (_, daemon, _client):
+        await daemon.wait_up()
+        messages = await manager.listen(2)
+
+    messages += manager.heard()
+    assert messages[0].startswith("READY=1\nSTATUS=rig sim: 0/1 buses, 0/4 axes up; bus line0: ")
+    assert any("STATUS=rig sim: 1/1 buses, 4/4 axes up" in message for message in messages)
+    assert messages[-1] == "STOPPING=1\nSTATUS=stopping: axes come to rest"
+
+
+async def test_watchdog_is_fed_well_within_its_time(manager: Manager):
+    async with service_of(manager) as (_, daemon, _client):
+        await daemon.wait_up()
+        manager.heard()
+
+        fed = sum("WATCHDOG=1" in message for message in await manager.listen(20))
+    assert fed >= 20 / WATCHDOG_S * 2
+
+
+async def test_watchdog_starves_while_a_line_has_lost_its_deadline(manager: Manager):
+    async with service_of(manager) as (_, daemon, _client):
+        await daemon.wait_up()
+        line = daemon.rig.buses[0].bus._line
+        assert line
+        while line.phase is not Phase.REPLY:
+            await asyncio.sleep(0.0001)
+        line._watchdog.cancel()
+        line._transport.write = lambda _data: None  # type: ignore[method-assign]
+        line._turn = None  # whatever comes is a stray: the line waits for ever
+        await asyncio.sleep(1)
+        manager.heard()
+
+        messages = await manager.listen(10)
+    assert not any("WATCHDOG=1" in message for message in messages)
+
+
+async def test_status_says_which_bus_does_not_turn(manager: Manager):
+    async with service_of(manager) as (_, daemon, _client):
+        await daemon.wait_up()
+        bus = daemon.rig.buses[0].bus
+        bus.turning = lambda _now_s: False  # type: ignore[method-assign]
+
+        assert (await manager.listen(4))[-1].endswith("bus line0 does not turn")
+
+
+async def test_port_that_is_not_there_is_told_and_does_not_starve_the_watchdog(manager: Manager):
+    config = load_config(SIMULATED)
+    gone = config.bus[0].model_copy(update={"port": "/dev/ldcn-is-not-there"})
+    async with service_of(manager, config=config.model_copy(update={"bus": (gone,)})) as (_, daemon, _client):
+        fed = sum("WATCHDOG=1" in message for message in await manager.listen(60))
+        text = describe(daemon.rig)
+
+    assert text.startswith("rig sim: 0/1 buses, 0/4 axes up; bus line0: ")
+    assert "/dev/ldcn-is-not-there" in text
+    assert fed >= 60 / WATCHDOG_S * 2
+
+
+async def test_end_brings_a_moving_axis_to_rest(manager: Manager):
+    async with service_of(manager) as (service, daemon, client):
+        await daemon.wait_up()
+        await asyncio.sleep(1)
+        await client.command("x", Verb.POWER, PowerRequest(on=True))
+        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90))
+        await asyncio.sleep(1)
+        assert daemon.rig.axes["x"].tracker.state is AxisState.DISCRETE_MOTION
+
+        service.end()
+        await asyncio.sleep(3)
+
+        assert daemon.rig.axes["x"].tracker.state is not AxisState.DISCRETE_MOTION
+
+
+# -- reloading -------------------------------------------------------------------------------------------------------
+
+
+async def test_reload_is_framed_and_changes_limits_at_once(manager: Manager):
+    config = load_config(SIMULATED)
+    slower = config.bus[0].axis[0].limits.model_copy(update={"velocity": 5.0})
+    changed = with_axis(config, "x", limits=slower, velocity=4.0)
+    async with service_of(manager, lambda: changed) as (service, daemon, client):
+        await daemon.wait_up()
+        await asyncio.sleep(1)
+        await client.command("x", Verb.POWER, PowerRequest(on=True))
+        manager.heard()
+
+        service.reload()
+
+        messages = [message for message in await manager.listen(1) if message != "WATCHDOG=1"]
+        with pytest.raises(VelocityLimit):
+            await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1, velocity=6))
+        reply = await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=1))
+    assert messages[0] == "RELOADING=1\nMONOTONIC_USEC=1234567"
+    assert messages[1].startswith("READY=1\nSTATUS=rig sim: 1/1 buses")
+    assert reply.velocity == pytest.approx(4.0, rel=0.01)
+
+
+async def test_reload_does_not_touch_a_motion(manager: Manager):
+    config = load_config(SIMULATED)
+    changed = with_axis(config, "x", velocity=1.0)
+    async with service_of(manager, lambda: changed) as (service, daemon, client):
+        await daemon.wait_up()
+        await asyncio.sleep(1)
+        await client.command("x", Verb.POWER, PowerRequest(on=True))
+        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=20))
+
+        service.reload()
+        await asyncio.sleep(2)
+
+        sample = await client.last("x", TelemetryItem.POSITION)
+    assert isinstance(sample, PositionSample)
+    assert sample.value == pytest.approx(20, abs=0.1)  # at 20 units a second, as it was started
+
+
+async def test_reload_changes_the_rates_of_a_line_that_is_up(manager: Manager):
+    config = load_config(SIMULATED)
+    rates = config.bus[0].axis[0].rates.model_copy(update={"position": 1.0, "velocity": 1.0, "adc": 0.0, "state": 1.0})
+    changed = config
+    for axis in config.bus[0].axis:
+        changed = with_axis(changed, axis.name, rates=rates)
+    async with service_of(manager, lambda: changed) as (service, daemon, _client):
+        await daemon.wait_up()
+        await asyncio.sleep(2)
+        statistics = daemon.rig.buses[0].bus.statistics
+
+        service.reload()
+        await asyncio.sleep(1)
+        before = statistics.replies
+        await asyncio.sleep(10)
+
+        assert 30 <= statistics.replies - before <= 60  # 4 axes, once a second
+
+
+async def test_reload_names_what_needs_a_restart(manager: Manager):
+    config = load_config(SIMULATED)
+    other = config.bus[0].model_copy(update={"port": "/dev/ldcn-other"})
+    async with service_of(manager, lambda: config.model_copy(update={"bus": (other,)})) as (service, daemon, _client):
+        await daemon.wait_up()
+
+        service.reload()
+
+        messages = await manager.listen(2)
+        assert any(message.endswith("restart needed for bus.line0.port") for message in messages)
+        assert daemon.config == config
+
+
+async def test_wrong_file_leaves_everything_as_it_was(manager: Manager):
+    def broken() -> RigConfig:
+        raise ConfigError("rig.toml: bus[0].baud: no drive has this rate (given: 1)")
+
+    async with service_of(manager, broken) as (service, daemon, _client):
+        await daemon.wait_up()
+        before = daemon.config
+        manager.heard()
+
+        service.reload()
+
+        told = next(message for message in await manager.listen(1) if message.startswith("READY=1"))
+        assert "configuration not reloaded: rig.toml: bus[0].baud" in told
+        assert daemon.config is before
+
+
+async def test_rates_that_the_line_cannot_carry_are_not_taken(manager: Manager):
+    config = load_config(SIMULATED)
+    changed = with_axis(config, "x", rates=config.bus[0].axis[0].rates.model_copy(update={"position": 2000.0}))
+    async with service_of(manager, lambda: changed) as (service, daemon, _client):
+        await daemon.wait_up()
+        manager.heard()
+
+        service.reload()
+
+        told = next(message for message in await manager.listen(1) if message.startswith("READY=1"))
+        assert "configuration not reloaded: bus line0" in told
+        assert daemon.config == config

@@ -1,0 +1,152 @@
+"""What the recorder of an axis publishes, whoever takes the samples."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.publishing import Publisher
+from ldcnd.daemon.trace_recorder import TraceRecorder
+from ldcnd.drivers.tracer import ArmedTrace, Granted, Recorded, Tracer
+from ldcnd.errors import OutcomeUnknown
+from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, encode
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
+from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TraceChannel, TracePhase, TraceSource
+
+LONG = -1.2345678901234567e-300
+REQUEST = TraceRequest(channels=("c0",))
+
+
+class FakeTrace(ArmedTrace):
+    """Waits to be told its outcome."""
+
+    def __init__(self, columns):
+        names = [f"c{number}" for number in range(columns)]
+        channels = tuple(TraceChannel(name=name, unit="u") for name in names)
+        self.granted = Granted(channels, tuple(names), 0.0, MOST_SAMPLES, 0, TracePhase.RECORDING)
+        self.outcome = asyncio.get_running_loop().create_future()
+        self.stubborn = False
+
+    async def record(self, progress):
+        if self.stubborn:
+            await _heedless(self.outcome)
+        progress(TracePhase.UPLOADING)
+        return await self.outcome
+
+
+async def _heedless(future):
+    """Wait for a future whatever happens, as a drive on a bad line makes one wait; then give way."""
+    try:
+        await asyncio.shield(future)
+    except asyncio.CancelledError:
+        await asyncio.sleep(100)
+        raise
+
+
+class FakeTracer(Tracer):
+    source = TraceSource.HOST
+    channels = ("c0",)
+
+    def __init__(self, columns=1):
+        self.columns = columns
+        self.traces = []
+
+    async def arm(self, request):
+        self.traces.append(FakeTrace(self.columns))
+        return self.traces[-1]
+
+    async def disarm(self):
+        return False
+
+
+def recorded(samples, columns, value=1.0):
+    column = (value,) * samples
+    return Recorded(tuple(range(samples)), 0.0, 0.0, (column,) * columns, (column,) * columns)
+
+
+@asynccontextmanager
+async def recording(tracer) -> AsyncIterator[tuple[TraceRecorder, Publisher]]:
+    broker = MemoryBroker()
+    async with broker.session() as session:
+        publisher = Publisher(session, Keys("rig"), Encoding.JSON)
+        recorder = TraceRecorder("x", tracer, publisher, Clock(lambda: 10**18))
+        async with asyncio.TaskGroup() as group:
+            task = group.create_task(recorder.run(), name="traces")
+            try:
+                yield recorder, publisher
+            finally:
+                task.cancel()
+
+
+def header(publisher):
+    return publisher.last["ldcn/rig/tele/x/trace"].sample
+
+
+async def until(publisher, phase):
+    async with asyncio.timeout(10):
+        while header(publisher).phase is not phase:
+            await asyncio.sleep(0.01)
+
+
+async def test_the_longest_trace_of_the_longest_numbers_fits_into_payloads():
+    tracer = FakeTracer(MOST_CHANNELS)
+    async with recording(tracer) as (recorder, publisher):
+        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        tracer.traces[0].outcome.set_result(recorded(MOST_SAMPLES, MOST_CHANNELS, LONG))
+        await until(publisher, TracePhase.COMPLETE)
+        last = dict(publisher.last)
+
+    chunks = [last[f"ldcn/rig/tele/x/trace/{index}"].sample for index in range(header(publisher).chunks)]
+    assert sum(len(chunk.offsets_ns) for chunk in chunks) == MOST_SAMPLES
+    assert [chunk.first for chunk in chunks] == [index * len(chunks[0].offsets_ns) for index in range(len(chunks))]
+    for encoding in Encoding:
+        assert max(len(encode(each.sample, encoding)[0]) for each in last.values()) <= MAX_PAYLOAD_BYTES
+
+
+async def test_a_shorter_trace_leaves_no_chunk_of_the_longer_one_before():
+    tracer = FakeTracer()
+    async with recording(tracer) as (recorder, publisher):
+        for number, samples in enumerate((2000, 10)):
+            await recorder.carry_out(f"t-{number}", Verb.TRACE, REQUEST)
+            tracer.traces[number].outcome.set_result(recorded(samples, 1))
+            await until(publisher, TracePhase.COMPLETE)
+        keys = list(publisher.last)
+
+    assert keys == ["ldcn/rig/tele/x/trace", "ldcn/rig/tele/x/trace/0"]
+    assert (header(publisher).trace_id, header(publisher).samples) == ("t-1", 10)
+
+
+async def test_a_bug_in_a_tracer_ends_its_trace_only():
+    tracer = FakeTracer()
+    async with recording(tracer) as (recorder, publisher):
+        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        tracer.traces[0].outcome.set_exception(ZeroDivisionError())
+        await until(publisher, TracePhase.FAILED)
+        reply = await recorder.carry_out("t-2", Verb.TRACE, REQUEST)
+
+    assert reply.trace_id == "t-2"
+
+
+async def test_an_abort_in_the_same_moment_as_the_arming_still_ends_the_trace():
+    tracer = FakeTracer()
+    async with recording(tracer) as (recorder, publisher):
+        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        reply = await recorder.carry_out("t-2", Verb.TRACE_ABORT, TraceAbortRequest())
+
+        assert (reply.trace_id, header(publisher).phase) == ("t-1", TracePhase.ABORTED)
+
+
+async def test_an_abort_that_takes_too_long_says_that_nobody_knows():
+    tracer = FakeTracer()
+    async with recording(tracer) as (recorder, publisher):
+        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        tracer.traces[0].stubborn = True
+
+        with pytest.raises(OutcomeUnknown, match="did not leave its trace"):
+            await recorder.carry_out("t-2", Verb.TRACE_ABORT, TraceAbortRequest())
+
+        assert header(publisher).phase is TracePhase.RECORDING

@@ -1,0 +1,67 @@
+from ldcnd.bus.wire_log import WireEvent, WireRecord
+from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
+from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, encode_status
+from ldcnd.drivers.smartstep.packet import Command as SmartStepCommand
+from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus
+from ldcnd.drivers.transcript import LdcnTranscript, describe_smartstep
+
+
+def sent(data: bytes) -> WireRecord:
+    return WireRecord(0.0, WireEvent.SENT, data)
+
+
+def received(data: bytes) -> WireRecord:
+    return WireRecord(0.0, WireEvent.RECEIVED, data)
+
+
+def test_a_status_request_and_its_reply_are_told_in_words():
+    transcript = LdcnTranscript({})
+    items = StatusItem.POSITION | StatusItem.ADC
+    status = Status(StatusFlag.MOVE_DONE | StatusFlag.POWER_ON, position=-1200, adc=1001)
+
+    request = transcript.describe(sent(encode_packet(Packet(3, Command.READ_STATUS, bytes([items])))))
+    reply = transcript.describe(received(encode_status(LS_182AP, items, status)))
+
+    assert request.startswith("node 3: ReadStatus(")
+    assert "POSITION" in request
+    assert reply == "status 09 MOVE_DONE+POWER_ON, position -1200, adc 1001"
+
+
+def test_the_layout_of_a_reply_follows_the_node_s_dialect_and_its_defined_items():
+    transcript = LdcnTranscript({1: PIC_SERVO_V4})
+    items = StatusItem.ADC
+    defined = encode_status(PIC_SERVO_V4, items, Status(StatusFlag(0), adc=77))
+
+    transcript.describe(sent(encode_packet(Packet(1, Command.DEFINE_STATUS, bytes([items])))))
+    transcript.describe(sent(encode_packet(Packet(1, Command.NO_OPERATION, b""))))
+
+    assert len(defined) == 3  # one byte less than a LS-182AP would send
+    assert transcript.describe(received(defined)) == "status 00, adc 77"
+
+
+def test_a_reset_takes_the_defined_items_back():
+    transcript = LdcnTranscript({})
+    transcript.describe(sent(encode_packet(Packet(1, Command.DEFINE_STATUS, bytes([StatusItem.POSITION])))))
+
+    transcript.describe(sent(encode_packet(Packet(0xFF, Command.HARD_RESET, b""))))
+    transcript.describe(sent(encode_packet(Packet(1, Command.NO_OPERATION, b""))))
+
+    assert transcript.describe(received(b"\x08\x08")) == "status 08 POWER_ON"
+
+
+def test_what_is_no_packet_is_said_to_be_none():
+    transcript = LdcnTranscript({})
+
+    assert transcript.describe(sent(bytes(4))) == "no complete packet in 4 bytes"
+    assert "status checksum" in transcript.describe(received(b"\x08\x09"))
+    assert not transcript.describe(WireRecord(0.0, WireEvent.TIMEOUT))
+
+
+def test_smartstep_packets_are_told_in_words():
+    request = SmartStepCommand(2, Function.REFERENCE, 0xE000).encode()
+    reply = Reply(2, ResponseStatus(Function.REFERENCE), 0xE000, 0x1234).encode()
+
+    assert describe_smartstep(sent(request)) == "unit 2: REFERENCE E000H, 0000H"
+    assert describe_smartstep(received(reply)).endswith("E000H, 1234H")
+    assert "checksum" in describe_smartstep(received(b"nonsense"))
