@@ -11,7 +11,7 @@ from ldcnd.model.traces import TraceChunk, TraceHeader, TracePhase, TraceReply
 LOOK_S = 0.1
 ARMING_S = 30.0
 """A slow drive is told and asked some twenty words before its trace begins."""
-UNDER_WAY = frozenset({TracePhase.WAITING, TracePhase.RECORDING, TracePhase.UPLOADING})
+UNDER_WAY = frozenset({TracePhase.FILLING, TracePhase.WAITING, TracePhase.RECORDING, TracePhase.UPLOADING})
 
 
 @dataclass(frozen=True, slots=True)

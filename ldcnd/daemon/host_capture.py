@@ -64,6 +64,7 @@ class HostCapture(Poller[AxisReading]):
     Attributes:
         samples: what counts so far; empty before the trigger.
         trigger_index: which of them fired the trigger; None without one.
+        filled: set once a trigger counts, or never will.
         triggered: set once samples count, or never will.
         done: set once there are enough, or never will be.
         missed_polls: how many brought nothing.
@@ -78,6 +79,7 @@ class HostCapture(Poller[AxisReading]):
         self.deadline_at_s = NO_DEADLINE_S
         self.samples: list[HostSample] = []
         self.trigger_index: int | None = None
+        self.filled = asyncio.Event()
         self.triggered = asyncio.Event()
         self.done = asyncio.Event()
         self.missed_polls = 0
@@ -86,6 +88,8 @@ class HostCapture(Poller[AxisReading]):
         self._period_s = period_s
         self._wanted = wanted
         self._before: deque[HostSample] = deque(maxlen=wanted.pre_trigger)
+        if not wanted.pre_trigger:
+            self.filled.set()
         if wanted.fires is None:
             self.triggered.set()
 
@@ -112,6 +116,8 @@ class HostCapture(Poller[AxisReading]):
             self.triggered.set()
         else:
             self._before.append(sample)
+            if len(self._before) == self._wanted.pre_trigger:
+                self.filled.set()
         if len(self.samples) >= self._wanted.samples:
             self.done.set()
 
@@ -123,9 +129,9 @@ class HostCapture(Poller[AxisReading]):
         """There will be no more samples."""
         if not self.done.is_set():
             self.failure = error
+            self.filled.set()
             self.triggered.set()
             self.done.set()
 
     def _fires(self, values: Values) -> bool:
-        ready = len(self._before) == self._wanted.pre_trigger
-        return self._wanted.fires is not None and self._wanted.fires(values, ready)
+        return self._wanted.fires is not None and self._wanted.fires(values, self.filled.is_set())

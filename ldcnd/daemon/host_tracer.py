@@ -1,7 +1,8 @@
 """Traces by the host: for drives without a recorder of their own, polled as fast as their line allows."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from ldcnd.bus.bus import Bus
@@ -133,7 +134,7 @@ class HostTracer(Tracer):
             interval_s=interval_s,
             samples=request.samples,
             pre_trigger=pre_trigger,
-            phase=TracePhase.WAITING if request.trigger else TracePhase.RECORDING,
+            phase=_first_phase(request.trigger, pre_trigger),
         )
         self._bus.add_poller(capture)
         limit_s = GRACE_S + SLACK * request.samples * max(interval_s, shortest_s)
@@ -166,20 +167,26 @@ class ArmedCapture(ArmedTrace):
         """See `ArmedTrace`."""
         capture = self._capture
         try:
-            await self._within(capture.triggered, self._wait_s, "the trigger did not come")
+            async with self._limit(self._wait_s, "the trigger did not come"):
+                await capture.filled.wait()
+                if self.granted.phase is TracePhase.FILLING and not capture.triggered.is_set():
+                    progress(TracePhase.WAITING)
+                await capture.triggered.wait()
             if capture.trigger_index is not None:
                 progress(TracePhase.RECORDING)
-            await self._within(capture.done, self._limit_s, "the line did not bring the samples")
+            async with self._limit(self._limit_s, "the line did not bring the samples"):
+                await capture.done.wait()
         finally:
             self._bus.remove_poller(capture)
         if capture.failure:
             raise capture.failure
         return self._recorded(capture.samples)
 
-    async def _within(self, event: asyncio.Event, limit_s: float, what: str) -> None:
+    @asynccontextmanager
+    async def _limit(self, limit_s: float, what: str) -> AsyncIterator[None]:
         try:
             async with asyncio.timeout(limit_s):
-                await event.wait()
+                yield
         except TimeoutError:
             raise TraceTimedOut(f"axis {self._axis}: {what} within {limit_s:g} s", axis=self._axis) from None
 
@@ -195,6 +202,12 @@ class ArmedCapture(ArmedTrace):
             trigger_index=self._capture.trigger_index,
             missed=self._capture.missed_polls,
         )
+
+
+def _first_phase(trigger: TraceTrigger | None, pre_trigger: int) -> TracePhase:
+    if trigger is None:
+        return TracePhase.RECORDING
+    return TracePhase.FILLING if pre_trigger else TracePhase.WAITING
 
 
 def _as_number(level: Callable[[AxisReading], bool | None]) -> Callable[[AxisReading], int | None]:

@@ -47,6 +47,8 @@ class TraceTrigger(Frozen):
 class TracePhase(StrEnum):
     """How far a trace is."""
 
+    FILLING = "filling"
+    """Samples from before the trigger are gathered; until there are enough, no trigger counts."""
     WAITING = "waiting"
     """Armed; the trigger has not come, as far as the daemon can see."""
     RECORDING = "recording"

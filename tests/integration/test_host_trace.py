@@ -108,6 +108,24 @@ async def test_level_trigger_fires_on_a_signal_that_is_there_already():
     assert trace.header.trigger_index == 5
 
 
+async def test_trace_tells_when_a_trigger_counts():
+    async with running_rig() as rig:
+        await ready(rig)
+        phases = []
+        request = TraceRequest(channels=("velocity",), samples=60, pre_trigger=50, trigger=rising(2.0), interval_s=0.02)
+        armed_at = asyncio.get_running_loop().time()
+
+        await arm_trace(rig.client, "x", request)
+        async with asyncio.timeout(10):
+            while TracePhase.WAITING not in phases:
+                phases.append((await rig.client.trace_header("x")).phase)
+                await asyncio.sleep(0.02)
+        filled_s = asyncio.get_running_loop().time() - armed_at
+
+    assert set(phases[:-1]) == {TracePhase.FILLING}
+    assert filled_s == pytest.approx(50 * 0.02, abs=0.1)
+
+
 async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_the_line():
     async with running_rig() as rig:
         await ready(rig)

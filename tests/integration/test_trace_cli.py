@@ -7,6 +7,7 @@ import pytest
 
 from ldcnd.cli.trace_file import load_trace
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon
 
 pytestmark = pytest.mark.real_time
@@ -32,7 +33,7 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
                 ldcnd("trace", "take", "x", "-e", endpoint, *channels, *trigger, "--out", str(file))
             )
             async with asyncio.timeout(30):
-                while (await rig.trace_header("x")) is None:
+                while (header := await rig.trace_header("x")) is None or header.phase is TracePhase.FILLING:
                     await asyncio.sleep(0.1)
             await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=10.0))
         refused = await ldcnd("trace", "take", "x", "-e", endpoint, "-c", "torque")
