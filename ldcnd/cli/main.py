@@ -21,6 +21,7 @@ COMMANDS = {
     "plan": ("ldcnd.cli.plan", "Show what the lines of a configuration promise, before any hardware is there."),
     "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
     "axis": ("ldcnd.cli.axis", "List, watch, move, stop and home axes of a running daemon."),
+    "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
     "why": ("ldcnd.cli.why", "Tell why an axis cannot move, and what would clear that."),
     "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
     "drill": ("ldcnd.cli.drill", "Rehearse what happens when somebody disappears."),

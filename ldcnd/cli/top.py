@@ -1,0 +1,49 @@
+"""`ldcnd top`: the rig page in a terminal."""
+
+import asyncio
+import sys
+
+import click
+
+from ldcnd.cli.connection import Target, with_target
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import ConfigError
+from ldcnd.top.columns import as_text
+from ldcnd.top.follow import follow
+from ldcnd.top.glance import RigGlance
+from ldcnd.top.rig_view import RigView
+
+ENOUGH_S = 2.5
+"""Two reports of each line come in this time, so rates are known."""
+
+
+@click.command()
+@with_target
+def command(target: Target) -> None:
+    """Show every axis and line of a rig, what is wrong first; S stops all axes, Q quits.
+
+    Without a terminal, or with --json, the rig is printed once. The stop is no emergency stop.
+    """
+    if target.as_json or not sys.stdout.isatty():
+        glance = target.run(_once)
+        target.show(glance, as_text(glance))
+        return
+    target.run(_watch)
+
+
+async def _once(client: RigClient) -> RigGlance:
+    loop = asyncio.get_running_loop()
+    view = RigView(client.rig, loop.time())
+    async with asyncio.TaskGroup() as group:
+        following = group.create_task(follow(client, view), name="follow")
+        await asyncio.sleep(ENOUGH_S)
+        following.cancel()
+    return view.glance(loop.time())
+
+
+async def _watch(client: RigClient) -> None:
+    try:
+        from ldcnd.top.screen import TopScreen  # noqa: PLC0415 - an optional package
+    except ImportError as error:
+        raise ConfigError("textual is not installed", remedy="install ldcnd[tui]") from error
+    await TopScreen(client).run_async()

@@ -1,0 +1,84 @@
+"""The words in which a glance is shown: one table of axes, one of lines."""
+
+from ldcnd.model.axes import LinkState, Moving, Quality
+from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance, Severity
+
+UNKNOWN = "-"
+MARKS = {Severity.FINE: " ", Severity.NOTICE: "!", Severity.WRONG: "X"}
+"""A mark beside the colour: nobody has to tell colours apart."""
+
+AXIS_TITLES = ("", "bus", "axis", "state", "position", "velocity", "target", "A/D", "age", "rate", "control", "trouble")
+BUS_TITLES = ("", "bus", "line", "busy", "exchanges", "errors", "resent", "poll p99", "stop max", "trouble")
+
+
+def axis_cells(row: AxisGlance) -> tuple[str, ...]:
+    """Return the cells of an axis, one for each of `AXIS_TITLES`."""
+    doubt = "" if row.quality in {None, Quality.GOOD} else "?"
+    state = row.state.value if row.state else UNKNOWN
+    if row.link is LinkState.DOWN:
+        state = "no answer"
+    elif row.state and row.moving is Moving.UNKNOWN:
+        state += ", moving?"
+    rate = UNKNOWN if row.rate_hz is None else f"{row.rate_hz:.0f}/{row.rate_wanted_hz:.0f} Hz"
+    return (
+        MARKS[row.severity],
+        row.bus,
+        row.axis,
+        state,
+        UNKNOWN if row.position is None else f"{row.position:.3f}{doubt} {row.unit}",
+        UNKNOWN if row.velocity is None else f"{row.velocity:.3f}",
+        UNKNOWN if row.target is None else f"{row.target:.3f}",
+        UNKNOWN if row.adc_volts is None else f"{row.adc_volts:.2f} V",
+        UNKNOWN if row.age_s is None else f"{row.age_s:.1f} s",
+        rate,
+        row.holder or UNKNOWN,
+        row.trouble,
+    )
+
+
+def bus_cells(row: BusGlance) -> tuple[str, ...]:
+    """Return the cells of a line, one for each of `BUS_TITLES`."""
+    return (
+        MARKS[row.severity],
+        row.bus,
+        "up" if row.up else "down",
+        f"{row.utilisation:.0%}",
+        UNKNOWN if row.exchanges_per_s is None else f"{row.exchanges_per_s:.0f}/s",
+        str(row.errors),
+        str(row.resent),
+        UNKNOWN if row.poll_p99_s is None else f"{row.poll_p99_s * 1e3:.1f} ms",
+        UNKNOWN if row.stop_longest_s is None else f"{row.stop_longest_s * 1e3:.1f} ms",
+        row.trouble,
+    )
+
+
+def headline(glance: RigGlance) -> str:
+    """Return the rig in one line: who it is, and how much of it is wrong."""
+    version = f"ldcnd {glance.version}" if glance.version else "no daemon"
+    count = f"axes: {len(glance.axes)}, lines: {len(glance.buses)}"
+    return "  ·  ".join((glance.rig, version, count, _verdict(glance)))
+
+
+def _verdict(glance: RigGlance) -> str:
+    if glance.trouble:
+        return glance.trouble
+    if wrong := glance.count(Severity.WRONG):
+        return f"not working: {wrong}"
+    if doubtful := glance.count(Severity.NOTICE):
+        return f"to look at: {doubtful}"
+    return "nothing is wrong"
+
+
+def as_text(glance: RigGlance) -> str:
+    """Return everything as plain text, for a terminal that is none."""
+    axes = _table(AXIS_TITLES, [axis_cells(row) for row in glance.axes])
+    buses = _table(BUS_TITLES, [bus_cells(row) for row in glance.buses])
+    return "\n".join((headline(glance), "", *axes, "", *buses))
+
+
+def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in (titles, *rows)
+    ]

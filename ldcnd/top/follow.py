@@ -1,0 +1,31 @@
+"""Keeping a view up to date with a daemon that may go away and come back."""
+
+import asyncio
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import LdcndError
+from ldcnd.model.authority import HolderList
+from ldcnd.model.requests import HaltRequest
+from ldcnd.top.rig_view import RigView, described
+
+LOOK_S = 1.0
+"""So often the daemon is asked what it is and who controls what; everything else it publishes by itself."""
+
+
+async def follow(client: RigClient, view: RigView) -> None:
+    """Feed a view until cancelled; a daemon that does not answer is asked again."""
+    loop = asyncio.get_running_loop()
+    async with client.published(lambda sample: view.take(sample, loop.time())):
+        instance = None
+        while True:
+            try:
+                daemon = await client.daemon()
+                if daemon.instance != instance:
+                    for sample in await client.last_values():
+                        view.take(sample, loop.time())
+                    instance = daemon.instance
+                holders = await client.rig_command("holders", HaltRequest(), HolderList)
+                view.describe(described(daemon, await client.axes(), holders))
+            except LdcndError:
+                pass  # the view tells since when nothing was heard of it
+            await asyncio.sleep(LOOK_S)

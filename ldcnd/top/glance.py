@@ -1,0 +1,100 @@
+"""A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
+
+from enum import IntEnum
+
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.frozen import Frozen
+
+
+class Severity(IntEnum):
+    """How much something asks for attention; the highest is shown first."""
+
+    FINE = 0
+    NOTICE = 1
+    """It works, with a doubt: missed polls, uncertain values, a latched stop."""
+    WRONG = 2
+    """It does not work: a fault, a drive or a line that does not answer."""
+
+
+class Glance(Frozen):
+    """What every row tells."""
+
+    severity: Severity
+    """How much it asks for attention."""
+    trouble: str
+    """What is wrong, in words; empty when nothing is."""
+
+
+class AxisGlance(Glance):
+    """One axis; what is not known is null."""
+
+    axis: str
+    """Its name."""
+    bus: str
+    """The line it is on."""
+    unit: str
+    """Unit of position and target; velocity is a second of it."""
+    state: AxisState | None
+    """PLCopen state."""
+    moving: Moving
+    """Whether it moves."""
+    position: float | None
+    """Where it is."""
+    velocity: float | None
+    """How fast it moves."""
+    target: float | None
+    """Where its command ends."""
+    adc_volts: float | None
+    """Its analog input."""
+    quality: Quality | None
+    """How much the position is worth."""
+    age_s: float | None
+    """The position came so many seconds ago."""
+    rate_hz: float | None
+    """How often the position came in the last second."""
+    rate_wanted_hz: float | None
+    """How often the configuration asks for it."""
+    link: LinkState | None
+    """Whether the drive answers."""
+    holder: str | None
+    """Who controls it."""
+
+
+class BusGlance(Glance):
+    """One line."""
+
+    bus: str
+    """Its name."""
+    up: bool
+    """Its drives are polled."""
+    utilisation: float
+    """Share of the last second for which bytes were on the wire."""
+    exchanges_per_s: float | None
+    """Requests in a second; null before the second report."""
+    errors: int
+    """Exchanges that brought nothing to be trusted, since the daemon started."""
+    resent: int
+    """Exchanges sent again, since then."""
+    poll_p99_s: float | None
+    """99 % of its polls were over so many seconds after they were due."""
+    stop_longest_s: float | None
+    """The longest that a stop has taken."""
+
+
+class RigGlance(Frozen):
+    """A rig; axes and lines with the highest severity come first."""
+
+    rig: str
+    """Its name."""
+    version: str | None
+    """Of its daemon; null when none answers."""
+    trouble: str
+    """What concerns the rig as a whole; empty when nothing is wrong."""
+    axes: tuple[AxisGlance, ...]
+    """All of them."""
+    buses: tuple[BusGlance, ...]
+    """All of them."""
+
+    def count(self, severity: Severity) -> int:
+        """Return how many axes and lines have this severity."""
+        return sum(row.severity is severity for row in self.axes) + sum(row.severity is severity for row in self.buses)

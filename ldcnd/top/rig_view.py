@@ -1,0 +1,211 @@
+"""The latest of everything that a rig publishes, and what it comes to at a glance; knows no terminal and no clock.
+
+Samples are kept as they come and decoded when somebody looks: a rig publishes many more than anybody can read.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from ldcnd.messaging.codec import decode_received
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.model.authority import HolderList
+from ldcnd.model.axes import AxisInfo, LinkState, Moving, Quality
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import AxisHealth, BusHealth, LaneHealth
+from ldcnd.model.meta import DaemonInfo
+from ldcnd.model.samples import AdcSample, FaultSample, PositionSample, StateSample, TelemetryItem, VelocitySample
+from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance, Severity
+
+SILENT_S = 3.0
+"""A daemon that has not reported for so long, three reports, is said to be silent."""
+
+ModelT = TypeVar("ModelT", bound=Frozen)
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What the daemon said when it was asked.
+
+    Attributes:
+        daemon: itself.
+        axes: in the order in which they are shown.
+        holders: who controls which axis; an axis that nobody controls is missing.
+    """
+
+    daemon: DaemonInfo
+    axes: tuple[AxisInfo, ...]
+    holders: Mapping[str, str]
+
+
+def described(daemon: DaemonInfo, axes: list[AxisInfo], holders: HolderList) -> Description:
+    """Return the answers as one description."""
+    held = {holder.axis: holder.client for holder in holders.holders if holder.client is not None}
+    return Description(daemon, tuple(axes), held)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A sample and when it came, by the loop's clock."""
+
+    sample: Sample
+    at_s: float
+
+
+class RigView:
+    """What is known of one rig.
+
+    Args:
+        rig: its name.
+        now_s: when the view is made, by the clock whose times `take` and `glance` are given.
+    """
+
+    def __init__(self, rig: str, now_s: float) -> None:
+        self._keys = Keys(rig)
+        self._began_at_s = now_s
+        self._description: Description | None = None
+        self._kept: dict[str, _Kept] = {}
+        self._report_before: dict[str, BusHealth] = {}
+
+    def take(self, sample: Sample, now_s: float) -> None:
+        """Keep a sample in the place of the one before."""
+        if sample.kind is SampleKind.DELETE:
+            self._kept.pop(sample.key, None)
+            return
+        before = self._kept.get(sample.key)
+        if before and sample.key.startswith(f"{self._keys.health}/"):
+            report = self._decoded(before, BusHealth)
+            self._report_before[report.bus] = report
+        self._kept[sample.key] = _Kept(sample, now_s)
+
+    def describe(self, description: Description) -> None:
+        """Take what the daemon says of its rig."""
+        self._description = description
+
+    def glance(self, now_s: float) -> RigGlance:
+        """Return the rig as it is now, the most urgent first."""
+        description = self._description
+        trouble = self._rig_trouble(now_s)
+        axes = description.axes if description else ()
+        names = description.daemon.buses if description else ()
+        reports = {name: report for name in names if (report := self._latest(self._keys.bus_health(name), BusHealth))}
+        rows = [self._axis(axis, reports.get(axis.bus), now_s, silent=bool(trouble)) for axis in axes]
+        lines = [self._bus(report) for report in reports.values()]
+        return RigGlance(
+            rig=self._keys.rig,
+            version=description.daemon.version if description else None,
+            trouble=trouble,
+            axes=tuple(sorted(rows, key=lambda row: -row.severity)),
+            buses=tuple(sorted(lines, key=lambda line: -line.severity)),
+        )
+
+    def _rig_trouble(self, now_s: float) -> str:
+        report = self._kept.get(self._keys.health)
+        silent_s = now_s - (report.at_s if report else self._began_at_s)
+        if silent_s > SILENT_S:
+            return f"the daemon has been silent for {silent_s:.0f} s: what is shown is what it said last"
+        return "" if self._description else "waiting for the daemon"
+
+    def _axis(self, info: AxisInfo, line: BusHealth | None, now_s: float, *, silent: bool) -> AxisGlance:
+        position_key = self._keys.telemetry(info.axis, TelemetryItem.POSITION)
+        position = self._latest(position_key, PositionSample)
+        velocity = self._latest(self._keys.telemetry(info.axis, TelemetryItem.VELOCITY), VelocitySample)
+        adc = self._latest(self._keys.telemetry(info.axis, TelemetryItem.ADC), AdcSample)
+        fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
+        state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
+        health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
+        severity, trouble = _axis_trouble(state, fault, position)
+        return AxisGlance(
+            axis=info.axis,
+            bus=info.bus,
+            unit=info.unit,
+            state=state.state if state else None,
+            moving=state.moving if state and not silent else Moving.UNKNOWN,
+            position=position.value if position else None,
+            velocity=velocity.value if velocity else None,
+            target=state.command.target if state and state.command else None,
+            adc_volts=adc.volts if adc else None,
+            quality=position.quality if position else None,
+            age_s=now_s - self._kept[position_key].at_s if position else None,
+            rate_hz=health.rate_hz if health else None,
+            rate_wanted_hz=health.rate_wanted_hz if health else None,
+            link=state.link if state else None,
+            holder=self._description.holders.get(info.axis) if self._description else None,
+            severity=severity,
+            trouble=trouble,
+        )
+
+    def _bus(self, report: BusHealth) -> BusGlance:
+        before = self._report_before.get(report.bus)
+        period_s = (report.t - before.t) / 1e9 if before else 0.0
+        errors = _errors(report)
+        grown = errors - _errors(before) if before else 0
+        severity, trouble = Severity.FINE, ""
+        if not report.up:
+            severity, trouble = Severity.WRONG, "down: its drives are not polled"
+        elif grown > 0:
+            severity, trouble = Severity.NOTICE, f"{grown} exchanges brought nothing to be trusted in the last second"
+        elif slow := _slow(report.axes):
+            severity, trouble = Severity.NOTICE, f"polled less often than configured: {', '.join(slow)}"
+        poll, stop = _lane(report, "poll"), _lane(report, "stop")
+        return BusGlance(
+            bus=report.bus,
+            up=report.up,
+            utilisation=report.utilisation,
+            exchanges_per_s=(report.exchanges - before.exchanges) / period_s if before and period_s > 0 else None,
+            errors=errors,
+            resent=report.resent,
+            poll_p99_s=poll.p99_s if poll else None,
+            stop_longest_s=stop.longest_s if stop and stop.exchanges else None,
+            severity=severity,
+            trouble=trouble,
+        )
+
+    def _latest(self, key: str, model: type[ModelT]) -> ModelT | None:
+        kept = self._kept.get(key)
+        return self._decoded(kept, model) if kept else None
+
+    @staticmethod
+    def _decoded(kept: _Kept, model: type[ModelT]) -> ModelT:
+        return decode_received(model, kept.sample.payload, kept.sample.encoding)
+
+
+def _axis_trouble(
+    state: StateSample | None, fault: FaultSample | None, position: PositionSample | None
+) -> tuple[Severity, str]:
+    """Return the one thing to be said of an axis."""
+    if state is None:
+        return Severity.NOTICE, "nothing was heard of it yet"
+    if state.link is LinkState.DOWN:
+        return Severity.WRONG, "the drive does not answer"
+    if fault and (stopping := [entry for entry in fault.active if entry.stops]):
+        first = fault.first if fault.first and fault.first.stops else stopping[0]
+        return Severity.WRONG, f"{first.code}: {first.text}"
+    if state.stop_latched:
+        return Severity.NOTICE, "a stop is latched; reset clears it"
+    if fault and fault.active:
+        return Severity.NOTICE, f"{fault.active[0].code}: {fault.active[0].text}"
+    if state.link is LinkState.DEGRADED:
+        return Severity.NOTICE, "the drive missed its latest polls"
+    if position and position.quality is not Quality.GOOD:
+        return Severity.NOTICE, f"its position is {position.quality}"
+    return (Severity.NOTICE, state.last_error) if state.last_error else (Severity.FINE, "")
+
+
+ENOUGH = 0.9
+"""A rate counts as kept from this share of the configured one on: a report sees a period more or less."""
+
+
+def _slow(axes: tuple[AxisHealth, ...]) -> list[str]:
+    return [
+        axis.axis for axis in axes if axis.link is not LinkState.DOWN and axis.rate_hz < ENOUGH * axis.rate_wanted_hz
+    ]
+
+
+def _errors(report: BusHealth) -> int:
+    return report.timeouts + report.corrupt_replies + report.rejected_packets
+
+
+def _lane(report: BusHealth, name: str) -> LaneHealth | None:
+    return next((lane for lane in report.lanes if lane.lane == name), None)

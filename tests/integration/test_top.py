@@ -1,0 +1,47 @@
+"""`ldcnd top` against a daemon in its own process."""
+
+import asyncio
+from asyncio.subprocess import PIPE
+
+import pytest
+from textual.widgets import DataTable, Static
+
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.top.glance import RigGlance
+from ldcnd.top.screen import TopScreen
+from tests.support.process import LDCND, ROOT, client, daemon
+
+pytestmark = pytest.mark.real_time
+
+
+async def until(pilot, wanted):
+    """Wait until a screen shows something."""
+    async with asyncio.timeout(20):
+        while not wanted():
+            await pilot.pause(0.05)
+
+
+async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there_is_no_terminal():
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
+        printing = await asyncio.create_subprocess_exec(*LDCND, "top", "-e", endpoint, "--json", stdout=PIPE)
+        await rig.command("x", Verb.POWER, PowerRequest(on=True))
+        screen = TopScreen(rig)
+        async with screen.run_test(size=(140, 24)) as pilot:
+            axes, answer = screen.query_one("#axes", DataTable), screen.query_one("#answer", Static)
+
+            def states():
+                return {axes.get_row_at(row)[2].plain: axes.get_row_at(row)[3].plain for row in range(axes.row_count)}
+
+            await until(pilot, lambda: states().get("x") == "standstill")
+            await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=90.0, velocity=5.0))
+            await until(pilot, lambda: states()["x"] == "discrete_motion")
+            await pilot.press("s")
+            await until(pilot, lambda: "stopped and latched: x, y, z, c" in str(answer.content))
+            await until(pilot, lambda: states()["x"] != "discrete_motion")
+        state = await rig.state("x")
+        printed, _ = await printing.communicate()
+
+    glance = RigGlance.model_validate_json(printed)
+    assert state.stop_latched
+    assert [axis.axis for axis in glance.axes] == ["x", "y", "z", "c"]
+    assert all(axis.rate_hz for axis in glance.axes)
