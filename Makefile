@@ -9,7 +9,7 @@ run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
 
 test: .venv/ready check
-	$(PY) -m pytest -n 2 --dist worksteal
+	$(PY) -m pytest -n 4 --dist worksteal
 
 check: .venv/ready
 	.venv/bin/ruff check .
