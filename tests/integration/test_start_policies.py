@@ -6,7 +6,9 @@ from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import TelemetryItem
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
+from tests.support.rig import running_rig
 
 HARMLESS = {Command.READ_STATUS, Command.NO_OPERATION}
 ADOPTING = simulated_config(start="adopt")
@@ -187,3 +189,12 @@ async def test_modules_that_are_no_axes_are_kept_and_published():
     assert bus.remarks == (
         "address 6: PIC-STEP (id 3, version 1) is not configured; it is kept on the line and never moved",
     )
+
+
+async def test_the_simulated_rig_publishes_its_first_position_within_a_second_of_being_started():
+    began_at_s = asyncio.get_running_loop().time()
+    async with running_rig() as rig, rig.client.samples("x", TelemetryItem.POSITION) as samples:
+        await anext(samples)
+        took_s = asyncio.get_running_loop().time() - began_at_s
+
+    assert took_s < 1.0

@@ -143,13 +143,13 @@ class LdcnNetwork(Network):
                 remedy=f'set the far end to {RESET_BAUD} baud, or use start = "adopt"',
             )
         await self._addressing.reset_all()
-        modules = await self._addressing.address_all()
+        modules = await self._addressing.address_all(len(self._expected))
         remarks = self._compare(modules)
         deaf = await self._change_rate(modules)
         if deaf is None:
             return modules, remarks
         await self._addressing.reset_all()
-        modules = await self._addressing.address_all()
+        modules = await self._addressing.address_all(len(self._expected))
         self._rate.working = RESET_BAUD
         return modules, (
             *self._compare(modules),
