@@ -12,6 +12,7 @@ import click
 
 from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import SessionError, UnknownAxis
+from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.frozen import Frozen
@@ -48,26 +49,29 @@ class Target:
 
         return asyncio.run(within())
 
+    def run_session(self, work: Callable[[Session], Awaitable[ResultT]]) -> ResultT:
+        """Open a session, do the work with it, and close; no rig needs to be there."""
+
+        async def within() -> ResultT:
+            async with open_zenoh_session(self._settings()) as session:
+                return await work(session)
+
+        return asyncio.run(within())
+
     def show(self, model: Frozen, text: str) -> None:
         """Print one result."""
         print(model.model_dump_json() if self.as_json else text, flush=True)
 
     @asynccontextmanager
     async def _client(self) -> AsyncIterator[RigClient]:
-        endpoints = self.connect or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))
-        settings = ZenohSettings(
-            mode="client" if endpoints else None if self.config else "peer",
-            connect=endpoints,
-            listen=self.listen,
-            config_file=self.config,
-        )
+        settings = self._settings()
         async with open_zenoh_session(settings) as session:
             rig = self.rig
             if rig is None:
                 rigs = [daemon.rig for daemon in await find_rigs(session)]
                 if not rigs:
                     raise SessionError(
-                        f"no daemon answers at {', '.join(endpoints) or 'the configured endpoints'}",
+                        f"no daemon answers at {', '.join(settings.connect) or 'the configured endpoints'}",
                         remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role"
                         " sees none either",
                     )
@@ -77,6 +81,15 @@ class Target:
                     )
                 rig = rigs[0]
             yield RigClient(session, rig)
+
+    def _settings(self) -> ZenohSettings:
+        endpoints = self.connect or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))
+        return ZenohSettings(
+            mode="client" if endpoints else None if self.config else "peer",
+            connect=endpoints,
+            listen=self.listen,
+            config_file=self.config,
+        )
 
 
 def _target_options(command: CommandT) -> CommandT:

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.messaging.keys import RIG_ITSELF, ROOT, Keys
+from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Answer, Sample, SampleKind, Session
 from ldcnd.model.axes import AxisInfo, LinkState
 from ldcnd.model.frozen import Frozen
@@ -122,6 +122,20 @@ class RigClient:
         """Return samples of an axis's last trace, or None when it has no such chunk."""
         answers = await self._session.query(self._keys.trace_chunk(axis, index))
         return self._decoded(answers[0], TraceChunk) if answers else None
+
+    async def last_health(self) -> DaemonHealth | None:
+        """Return the daemon's last report about itself, or None when there is none yet."""
+        answers = await self._session.query(self._keys.health)
+        return self._decoded(answers[-1], DaemonHealth) if answers else None
+
+    async def last_bus_health(self) -> list[BusHealth]:
+        """Return the last report about each line and its axes."""
+        return [self._decoded(answer, BusHealth) for answer in await self._session.query(self._keys.bus_health("*"))]
+
+    async def states(self) -> dict[str, StateSample]:
+        """Return the last state of every axis that has one."""
+        answers = await self._session.query(self._keys.telemetry_pattern("*", TelemetryItem.STATE))
+        return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, StateSample) for answer in answers}
 
     async def state(self, axis: str) -> StateSample | None:
         """Return the axis's last state, or None when there is none yet."""
@@ -263,5 +277,5 @@ class RigClient:
 
 async def find_rigs(session: Session) -> list[DaemonInfo]:
     """Return the daemons that can be reached."""
-    answers = await session.query(f"{ROOT}/*/meta/daemon")
+    answers = await session.query(ALL_DAEMONS)
     return [decode_received(DaemonInfo, answer.payload, answer.encoding) for answer in answers if not answer.is_error]

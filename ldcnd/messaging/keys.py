@@ -19,7 +19,11 @@ RIG_ITSELF = "_"
 """Stands in the place of an axis in commands that concern the rig as a whole; no axis can have this name."""
 
 ALL_READABLE = (f"{ROOT}/*/tele/**", f"{ROOT}/*/meta/**", f"{ROOT}/*/alive/**")
-"""What may be read, on every rig; for access control, as the next three."""
+"""What may be read, on every rig; for access control, as `ALL_STOPS`, `ALL_COMMANDS` and `ALL_CLIENTS`."""
+ALL_DAEMONS = f"{ROOT}/*/meta/daemon"
+"""The description of every daemon, on every rig."""
+ALL_RUNS = f"{ROOT}/*/alive/*"
+"""The token of every run of a daemon, on every rig."""
 ALL_STOPS = f"{ROOT}/*/@stop/**"
 ALL_COMMANDS = f"{ROOT}/*/@cmd/**"
 ALL_CLIENTS = f"{ROOT}/*/client/**"
@@ -241,6 +245,19 @@ class Keys:
             return AliveAddress(instance, None)
         instance, _, axis = self._parse(key, base, "<instance>/axis/<axis>")
         return AliveAddress(instance, axis)
+
+    @classmethod
+    def of(cls, key: str) -> "Keys":
+        """Return the keys of the rig that a key belongs to.
+
+        Raises:
+            MalformedRequest: the key is no key of any rig.
+        """
+        root, _, below = key.partition("/")
+        rig, _, rest = below.partition("/")
+        if root != ROOT or not _CHUNK.fullmatch(rig) or not rest:
+            raise MalformedRequest(f"{key} is not {ROOT}/<rig>/...", value=key)
+        return cls(rig)
 
     def _parse(self, key: str, base: str, form: str) -> tuple[str, ...]:
         """Return the chunks below `base`, as many as `form` has."""

@@ -1,0 +1,134 @@
+"""Every rig that can be reached, across routers: what it is, which axes it has, and what is wrong with it."""
+
+import asyncio
+
+from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.errors import LdcndError, OutcomeUnknown
+from ldcnd.messaging.keys import ALL_RUNS, Keys
+from ldcnd.messaging.session import Session
+from ldcnd.model.axes import AxisInfo, LinkState
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
+from ldcnd.model.meta import DaemonInfo
+from ldcnd.model.samples import StateSample
+
+ASKED_AT_ONCE = 8
+"""So many rigs are asked one beside the other."""
+LATE_S = 0.25
+"""A daemon whose timers come later than this has too much to do."""
+
+
+class AxisView(Frozen):
+    """One axis of a fleet."""
+
+    info: AxisInfo
+    """What it is."""
+    state: StateSample | None
+    """Its last state; null before the first."""
+    health: AxisHealth | None
+    """How fresh its samples are; null before the first report."""
+
+
+class RigView(Frozen):
+    """One run of a daemon, and its rig."""
+
+    rig: str
+    """The rig id."""
+    instance: str
+    """The run of the daemon."""
+    daemon: DaemonInfo | None
+    """What the daemon says about itself; null when it shows its token and does not answer."""
+    health: DaemonHealth | None
+    """How its process is doing; null before the first report."""
+    buses: tuple[BusHealth, ...] = ()
+    """How its lines are doing."""
+    axes: tuple[AxisView, ...] = ()
+    """Its axes, in the order of lines and addresses."""
+    problems: tuple[str, ...] = ()
+    """What somebody should look at; empty when all is well."""
+
+
+async def survey(session: Session, rig: str | None = None) -> tuple[RigView, ...]:
+    """Ask every rig how it is, and return them by name; what one of them does not answer keeps nobody waiting.
+
+    A daemon that shows its liveliness token and answers nothing is in the list, with that as its problem.
+
+    Args:
+        session: where the rigs are.
+        rig: only this one.
+    """
+    alive: set[tuple[str, str]] = set()
+
+    def on_token(key: str, shown: bool) -> None:  # noqa: FBT001 - the session's signature
+        keys = Keys.of(key)
+        run = (keys.rig, keys.parse_alive(key).instance)
+        (alive.add if shown else alive.discard)(run)
+
+    tokens = await session.watch_tokens(ALL_RUNS, on_token)
+    try:
+        daemons = await _daemons(session)
+    finally:
+        await tokens.close()
+    runs = [daemon.rig for daemon in daemons]
+    silent = alive - {(daemon.rig, daemon.instance) for daemon in daemons}
+    slots = asyncio.Semaphore(ASKED_AT_ONCE)
+    async with asyncio.TaskGroup() as group:
+        looks = [
+            group.create_task(_look(session, daemon, slots, rival=runs.count(daemon.rig) > 1), name=f"ask {daemon.rig}")
+            for daemon in daemons
+            if rig in (None, daemon.rig)
+        ]
+    views = [look.result() for look in looks]
+    views += [_silent(name, instance) for name, instance in silent if rig in (None, name)]
+    return tuple(sorted(views, key=lambda view: (view.rig, view.instance)))
+
+
+async def _daemons(session: Session) -> list[DaemonInfo]:
+    try:
+        return await find_rigs(session)
+    except OutcomeUnknown:  # there is somebody, and none of them answers
+        return []
+
+
+async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, *, rival: bool) -> RigView:
+    """Ask one rig; what it does not answer is a problem of its own."""
+    view = RigView(rig=daemon.rig, instance=daemon.instance, daemon=daemon, health=None)
+    client = RigClient(session, daemon.rig)
+    try:
+        async with slots:
+            axes = await client.axes()
+            states = await client.states()
+            health = await client.last_health()
+            buses = tuple(sorted(await client.last_bus_health(), key=lambda bus: bus.bus))
+    except LdcndError as error:
+        return view.model_copy(update={"problems": (f"stopped answering: {error.message}",)})
+    freshness = {axis.axis: axis for bus in buses for axis in bus.axes}
+    known = {axis.axis: axis for axis in axes}  # two daemons on one rig tell of each axis twice
+    views = tuple(
+        AxisView(info=axis, state=states.get(name), health=freshness.get(name)) for name, axis in known.items()
+    )
+    problems = ["another daemon serves this rig: nothing is moved"] if rival else []
+    problems += _problems(health, buses, views)
+    return view.model_copy(update={"health": health, "buses": buses, "axes": views, "problems": tuple(problems)})
+
+
+def _silent(rig: str, instance: str) -> RigView:
+    problem = "is alive and does not answer: frozen, or this login may not ask it"
+    return RigView(rig=rig, instance=instance, daemon=None, health=None, problems=(problem,))
+
+
+def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: tuple[AxisView, ...]) -> list[str]:
+    problems = []
+    if health and health.loop_lag_s > LATE_S:
+        problems.append(f"the daemon is late by {health.loop_lag_s:.2f} s")
+    problems += [f"line {bus.bus} is not up" for bus in buses if not bus.up]
+    down = {bus.bus for bus in buses if not bus.up}
+    for axis in axes:
+        name, state = axis.info.axis, axis.state
+        if state and state.link is not LinkState.UP and axis.info.bus not in down:
+            problems.append(
+                f"{name}: its drive {'does not answer' if state.link is LinkState.DOWN else 'misses polls'}"
+            )
+        if axis.health and axis.health.faults:
+            problems.append(f"{name}: {axis.health.faults} active fault{'s' if axis.health.faults > 1 else ''}")
+    return problems
