@@ -31,7 +31,6 @@ from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, LdcndError, NotSupported, RequestRefused, ShuttingDown, StopLatched, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
-from ldcnd.model.axes import Capability
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import BufferMode, Request, Verb
@@ -69,7 +68,7 @@ class AxisService:
         self.config = config
         self.driver = driver
         self.scale = Scale(config.counts_per_unit or 1.0, reverse=config.direction == "reverse")
-        self.stoppable = Capability.STOP in driver.capabilities
+        self.stoppable = Verb.STOP in driver.capabilities
         tracker = AxisTracker if self.stoppable else ObservedTracker
         self.tracker = tracker(config.name, config.unit, ended)
         self.telemetry = AxisTelemetry(
@@ -174,7 +173,7 @@ class AxisService:
         if verb in (Verb.STOP, Verb.QUICK_STOP) and self.stoppable:
             await self.stop(StopMode.SMOOTH if verb is Verb.STOP else StopMode.ABRUPT)
             return CommandReply(command_id=command_id, axis=self.config.name, verb=verb)
-        if Capability(verb.value) not in self.driver.capabilities:
+        if verb not in self.driver.capabilities:
             raise NotSupported(
                 f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
             )

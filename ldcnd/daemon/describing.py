@@ -14,7 +14,7 @@ from ldcnd.errors import ErrorCode
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
 from ldcnd.messaging.session import Query
-from ldcnd.model.axes import AxisInfo, Capability, RegisterInfo
+from ldcnd.model.axes import AxisInfo, RegisterInfo
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo
 from ldcnd.model.plan import RigPlan
@@ -22,6 +22,7 @@ from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.schemas import all_schemas, schema_name
+from ldcnd.model.verb import Verb
 from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
 
@@ -125,7 +126,7 @@ def axis_info(bus: BusService, axis: AxisService) -> AxisInfo:
         counts_per_unit=config.counts_per_unit,
         direction=config.direction,
         limits=config.limits,
-        capabilities=tuple(sorted(driver.capabilities, key=list(Capability).index)),
+        capabilities=tuple(sorted(driver.capabilities, key=list(Verb).index)),
         items=tuple(item.value for item in TelemetryItem if item is not TelemetryItem.ADC or driver.adc_full_scale),
         adc_full_scale=driver.adc_full_scale,
         monitors=tuple(name.value for name in driver.monitors),

@@ -18,10 +18,11 @@ from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BusError, NotSupported
 from ldcnd.exchange import Exchange, Timing
-from ldcnd.model.axes import Capability, Provenance
+from ldcnd.model.axes import Provenance
 from ldcnd.model.monitors import MonitorName
 from ldcnd.model.requests import HomeMethod, PinMode
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.verb import Verb
 
 
 class StopMode(Enum):
@@ -207,7 +208,7 @@ class AxisDriver(ABC):
 
     spec: AxisSpec
     identity: str | None
-    capabilities: frozenset[Capability]
+    capabilities: frozenset[Verb]
     adc_full_scale: int | None
     home_methods: frozenset[HomeMethod]
     monitors: tuple[MonitorName, ...] = ()

@@ -5,6 +5,7 @@ from enum import StrEnum
 from pydantic import Field
 
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.verb import Verb
 
 
 class AxisState(StrEnum):
@@ -46,35 +47,6 @@ class LinkState(StrEnum):
     DOWN = "down"
 
 
-class Capability(StrEnum):
-    """What an axis can be asked to do; anything else is refused as not_supported."""
-
-    POWER = "power"
-    MOVE_ABSOLUTE = "move_absolute"
-    MOVE_RELATIVE = "move_relative"
-    MOVE_VELOCITY = "move_velocity"
-    HALT = "halt"
-    STOP = "stop"
-    QUICK_STOP = "quick_stop"
-    HOME = "home"
-    RESET = "reset"
-    SET_POSITION = "set_position"
-    SET_GAINS = "set_gains"
-    LIST_PARAMETERS = "list_parameters"
-    READ_PARAMETER = "read_parameter"
-    READ_ALL_PARAMETERS = "read_all_parameters"
-    WRITE_PARAMETER = "write_parameter"
-    CLEAR_COUNTER = "clear_counter"
-    READ_ALARMS = "read_alarms"
-    READ_PROFILE = "read_profile"
-    MOVE_ANALOG = "move_analog"
-    SET_PWM = "set_pwm"
-    TRACK = "track"
-    SET_OUTPUTS = "set_outputs"
-    TRACE = "trace"
-    TRACE_ABORT = "trace_abort"
-
-
 class Provenance(StrEnum):
     """How the daemon knows a register that cannot be read back."""
 
@@ -95,24 +67,6 @@ class RegisterInfo(Frozen):
     """Raw value; null when it is unknown."""
     provenance: Provenance
     """How the value is known."""
-
-
-PARAMETER_CAPABILITIES = frozenset(
-    {
-        Capability.LIST_PARAMETERS,
-        Capability.READ_PARAMETER,
-        Capability.READ_ALL_PARAMETERS,
-        Capability.WRITE_PARAMETER,
-        Capability.CLEAR_COUNTER,
-        Capability.READ_ALARMS,
-        Capability.READ_PROFILE,
-    }
-)
-"""What a drive with readable parameters can do and one with a position loop of its own cannot."""
-
-
-TRACE_CAPABILITIES = frozenset({Capability.TRACE, Capability.TRACE_ABORT})
-"""What every drive can do that can be polled."""
 
 
 class AxisLimits(Frozen):
@@ -151,7 +105,7 @@ class AxisInfo(Frozen):
     """forward or reverse: the sign between counts and units."""
     limits: AxisLimits
     """Software limits in axis units."""
-    capabilities: tuple[Capability, ...]
+    capabilities: tuple[Verb, ...]
     """The commands it takes."""
     items: tuple[str, ...]
     """The telemetry items it publishes."""

@@ -13,7 +13,7 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.axes import AxisState, Capability
+from ldcnd.model.axes import AxisState
 from ldcnd.model.requests import (
     HaltRequest,
     HomeRequest,
@@ -47,14 +47,14 @@ async def test_the_capabilities_tell_what_the_model_can_do(dialect):
     async with dialect_rig(dialect) as rig:
         (info,) = await rig.rig.client.axes()
 
-    special = {Capability.MOVE_ANALOG, Capability.TRACK, Capability.SET_OUTPUTS, Capability.SET_PWM}
-    expected = {Capability.SET_PWM}
+    special = {Verb.MOVE_ANALOG, Verb.TRACK, Verb.SET_OUTPUTS, Verb.SET_PWM}
+    expected = {Verb.SET_PWM}
     if dialect in (LS_173AP, LS_182AP, LS_182AP_22):
-        expected.add(Capability.MOVE_ANALOG)
+        expected.add(Verb.MOVE_ANALOG)
     if dialect is not V1:
-        expected.add(Capability.TRACK)
+        expected.add(Verb.TRACK)
     if dialect is V4:
-        expected.add(Capability.SET_OUTPUTS)
+        expected.add(Verb.SET_OUTPUTS)
     assert special & set(info.capabilities) == expected
 
 

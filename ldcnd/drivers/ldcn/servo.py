@@ -41,9 +41,9 @@ from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, d
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
 from ldcnd.exchange import Exchange
-from ldcnd.model.axes import PARAMETER_CAPABILITIES, Capability
 from ldcnd.model.requests import HomeMethod, PinMode
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.verb import PARAMETER_CAPABILITIES, Verb
 
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""
@@ -358,12 +358,12 @@ class LdcnAxis(AxisDriver):
         self._book.wrote({LIMIT_PINS: pins})
 
 
-def _capabilities(profile: Profile) -> frozenset[Capability]:
+def _capabilities(profile: Profile) -> frozenset[Verb]:
     """Return what a device of this profile can do."""
     lacking = {
-        Capability.MOVE_ANALOG: not profile.analog_target,
-        Capability.TRACK: not profile.stop_here,
-        Capability.SET_OUTPUTS: not profile.limit_outputs,
+        Verb.MOVE_ANALOG: not profile.analog_target,
+        Verb.TRACK: not profile.stop_here,
+        Verb.SET_OUTPUTS: not profile.limit_outputs,
     }
-    able = frozenset(capability for capability in Capability if not lacking.get(capability, False))
+    able = frozenset(capability for capability in Verb if not lacking.get(capability, False))
     return able - PARAMETER_CAPABILITIES

@@ -35,10 +35,10 @@ from ldcnd.drivers.smartstep.unit_parameters import UnitParameters
 from ldcnd.drivers.smartstep.unit_poller import Basic, Item, Listeners, UnitPoller, UnitWords
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.exchange import Timing
-from ldcnd.model.axes import PARAMETER_CAPABILITIES, TRACE_CAPABILITIES
 from ldcnd.model.monitors import MonitorName
 from ldcnd.model.requests import HomeMethod
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.verb import PARAMETER_CAPABILITIES, TRACE_CAPABILITIES
 
 
 @dataclass(frozen=True, slots=True)
