@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
-from ldcnd.daemon.asyncapi import asyncapi_document
+from ldcnd.daemon.asyncapi import asyncapi_document, asyncapi_text
 from ldcnd.daemon.contract import Kind, as_markdown, channels
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding
 from ldcnd.messaging.keys import Keys, matches
@@ -24,6 +24,10 @@ ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
 KEYS = Keys("rig")
 DOCUMENT = asyncapi_document()
+OFFICIAL = jsonschema.Draft7Validator(
+    json.loads((ROOT / "tests" / "vectors" / "asyncapi" / "asyncapi-3.0.0.json").read_text())
+)
+"""As the AsyncAPI Initiative publishes it."""
 
 
 def page(name: str) -> str:
@@ -138,6 +142,31 @@ def test_the_asyncapi_document_has_the_structure_of_version_3() -> None:
             assert len(operation["reply"]["messages"]) == 2
         assert set(channel.get("parameters", {})) == set(re.findall(r"\{(\w+)\}", channel["address"]))
         assert re.fullmatch(r"[A-Za-z0-9._-]+", name)
+
+
+def test_the_asyncapi_document_is_valid_by_the_official_schema() -> None:
+    OFFICIAL.validate(json.loads(asyncapi_text()))
+
+
+@pytest.mark.parametrize(
+    ("path", "wrong"),
+    [
+        (("asyncapi",), "2.6.0"),
+        (("info", "version"), None),
+        (("channels", "tele_axis_position", "addresses"), "ldcn"),
+        (("operations", "tele_axis_position", "action"), "publish"),
+        (("operations", "tele_axis_position", "channel"), "tele_axis_position"),
+        (("components", "messages", "position_sample", "payloads"), {}),
+    ],
+)
+def test_the_official_schema_finds_what_is_wrong(path: tuple[str, ...], wrong: object) -> None:
+    document = json.loads(asyncapi_text())
+    node = document
+    for name in path[:-1]:
+        node = node[name]
+    node[path[-1]] = wrong
+
+    assert not OFFICIAL.is_valid(document)
 
 
 def test_the_schemas_of_the_asyncapi_document_are_json_schemas() -> None:
