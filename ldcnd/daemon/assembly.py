@@ -14,10 +14,11 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, SimulatedLineConfig
 from ldcnd.daemon.axis_service import AxisService
-from ldcnd.daemon.bus_service import BusService
+from ldcnd.daemon.bus_service import NO_DEMANDS, BusService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.control import build_control
 from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.demand import Demand
 from ldcnd.daemon.event_log import EventLog
 from ldcnd.daemon.ledger import Ledger
 from ldcnd.daemon.publishing import Publisher
@@ -118,7 +119,8 @@ def _build_bus(
     specs = tuple(_spec(axis) for axis in settings.axis)
     network = FAMILIES[settings.family](bus, specs, settings.baud, _line(settings))
     axes = tuple(make_axis(axis, bus, network.axes[axis.name]) for axis in settings.axis)
-    return BusService(bus, network, axes, port=settings.port, family=settings.family)
+    demands = {axis.name: Demand() for axis in settings.axis} if config.telemetry.on_demand else NO_DEMANDS
+    return BusService(bus, network, axes, port=settings.port, family=settings.family, demands=demands)
 
 
 def _spec(axis: AxisConfig) -> AxisSpec:

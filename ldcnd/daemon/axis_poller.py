@@ -30,6 +30,9 @@ class AxisPoller(Poller[AxisReading]):
     Slower items ride along with the poll that is nearest to their own due time, so they are never more than half a poll
     period early or late, and the line carries one periodic exchange an axis. Deadlines are absolute: a late poll does
     not shift the next one, and missed periods are skipped, not made up for.
+
+    Attributes:
+        rates_hz: how often each item is asked for.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class AxisPoller(Poller[AxisReading]):
         missed: Missed,
     ) -> None:
         self.node = driver.spec.address
+        self.rates_hz = rates_hz
         self._driver = driver
         self._periods_s = {item: 1.0 / rate for item, rate in rates_hz.items()}
         self._period_s = min(self._periods_s.values())
@@ -50,6 +54,20 @@ class AxisPoller(Poller[AxisReading]):
         self._asked: frozenset[TelemetryItem] = frozenset()
         self.due_at_s = start_at_s
         self.deadline_at_s = start_at_s + self._period_s
+
+    def retime(self, rates_hz: Mapping[TelemetryItem, float], now_s: float) -> bool:
+        """Ask for the same items at other rates; return whether the next turn comes earlier because of it.
+
+        What is asked for more often is due within its new period, what is asked for more seldom after its next turn.
+        """
+        self.rates_hz = rates_hz
+        self._periods_s = {item: 1.0 / rate for item, rate in rates_hz.items()}
+        self._period_s = min(self._periods_s.values())
+        for item, period_s in self._periods_s.items():
+            self._due_s[item] = min(self._due_s[item], now_s + period_s)
+        due_at_s, self.due_at_s = self.due_at_s, min(self.due_at_s, now_s + self._period_s)
+        self.deadline_at_s = self.due_at_s + self._period_s
+        return self.due_at_s < due_at_s
 
     def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
         """See `Poller`."""

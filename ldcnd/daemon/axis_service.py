@@ -31,6 +31,7 @@ from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, LdcndError, NotSupported, RequestRefused, ShuttingDown, StopLatched, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
+from ldcnd.model.axes import Moving
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import BufferMode, Request, Verb
@@ -154,6 +155,11 @@ class AxisService:
         """Take a monitor from the family's own poller."""
         t, t_error_ns = self._clock.stamp(timing)
         self.telemetry.monitor(value, t, t_error_ns)
+
+    @property
+    def at_work(self) -> bool:
+        """Whether it carries out a command, moves, or may move for all that is known."""
+        return self.tracker.command is not None or self.tracker.moving is not Moving.NO
 
     # -- commands ----------------------------------------------------------------------------------------------------
 

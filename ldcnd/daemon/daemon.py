@@ -2,11 +2,15 @@
 
 import asyncio
 import contextlib
+from functools import partial
 from importlib.metadata import version
 
 from ldcnd.config import RigConfig
+from ldcnd.daemon.axis_service import AxisService
+from ldcnd.daemon.bus_service import BusService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.control import Control
+from ldcnd.daemon.demand import DEMANDED_ITEMS
 from ldcnd.daemon.describing import Describing
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.loss_policies import LeaseWatch, apply_policy
@@ -19,6 +23,7 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Declaration, Session
 from ldcnd.model.axes import LinkState
 from ldcnd.model.meta import DaemonInfo
+from ldcnd.model.samples import TelemetryItem
 
 log = get_logger("daemon")
 
@@ -122,6 +127,11 @@ class Daemon:
             await until_end(await session.serve(stop, requests.on_stop, complete=True, urgent=True))
         await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
         await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
+        for bus in self.rig.buses:
+            for axis in (axis for axis in bus.axes if axis.config.name in bus.demands):
+                for item in DEMANDED_ITEMS:
+                    key, told = keys.telemetry(axis.config.name, item), partial(_told, bus, axis, item)
+                    await until_end(await session.watch_subscribers(key, told))
         await until_end(await session.declare_token(keys.alive(self._instance)))
 
     def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
@@ -175,3 +185,7 @@ class Daemon:
             axes=tuple(self.rig.axes),
             buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
         )
+
+
+def _told(bus: BusService, axis: AxisService, item: TelemetryItem, present: bool) -> None:  # noqa: FBT001 - as above
+    bus.subscribed(axis, item, present=present)

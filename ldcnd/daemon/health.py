@@ -11,7 +11,7 @@ from ldcnd.daemon.publishing import Publisher
 from ldcnd.daemon.rig import Rig
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth
 from ldcnd.model.samples import TelemetryItem
 
 PERIOD_S = 1.0
@@ -36,7 +36,7 @@ class HealthWatch:
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
-        self._published: dict[str, int] = {}
+        self._published: dict[tuple[str, TelemetryItem], int] = {}
 
     async def run(self) -> None:
         """Report each second until cancelled; then take the reports off the network."""
@@ -102,10 +102,10 @@ class HealthWatch:
             stray_bytes=statistics.stray_bytes,
             losses=statistics.losses,
             lanes=tuple(_lane(service, lane) for lane in Lane),
-            axes=tuple(self._axis(axis, t, period_s) for axis in service.axes),
+            axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t, period_s) for axis in service.axes),
         )
 
-    def _axis(self, axis: AxisService, t: int, period_s: float) -> AxisHealth:
+    def _axis(self, axis: AxisService, asked_hz: Mapping[TelemetryItem, float], t: int, period_s: float) -> AxisHealth:
         name = axis.config.name
         last = self._publisher.last.get(self._keys.telemetry(name, TelemetryItem.POSITION))
         return AxisHealth(
@@ -113,18 +113,27 @@ class HealthWatch:
             link=axis.tracker.link,
             sample_age_s=max(0.0, (t - last.measured_at_ns) / 1e9) if last else None,
             rate_wanted_hz=axis.config.rates.position,
-            rate_hz=max(0, self._positions(name) - self._published[name]) / period_s,
+            rate_hz=self._granted_hz(name, TelemetryItem.POSITION, period_s),
             faults=len(axis.tracker.active_faults),
+            items=tuple(
+                ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(name, item, period_s))
+                for item, hz in asked_hz.items()
+            ),
         )
 
-    def _positions(self, axis: str) -> int:
-        """Return how many positions of an axis were published so far."""
-        last = self._publisher.last.get(self._keys.telemetry(axis, TelemetryItem.POSITION))
+    def _granted_hz(self, axis: str, item: TelemetryItem, period_s: float) -> float:
+        """Return how often an item was published since the last report."""
+        before = self._published.get((axis, item), 0)
+        return max(0, self._count(axis, item) - before) / period_s
+
+    def _count(self, axis: str, item: TelemetryItem) -> int:
+        """Return how many samples of an item were published so far."""
+        last = self._publisher.last.get(self._keys.telemetry(axis, item))
         return last.sample.seq + 1 if last else 0
 
     def _note_counters(self) -> None:
         self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}
-        self._published = {axis: self._positions(axis) for axis in self._rig.axes}
+        self._published = {(axis, item): self._count(axis, item) for axis in self._rig.axes for item in TelemetryItem}
 
 
 def _lane(service: BusService, lane: Lane) -> LaneHealth:

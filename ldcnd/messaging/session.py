@@ -165,6 +165,8 @@ OnQuery = Callable[[Query], None]
 OnSample = Callable[[Sample], None]
 OnToken = Callable[[str, bool], None]
 """Learns that the token of a key has appeared (True) or vanished (False)."""
+OnSubscribed = Callable[[bool], None]
+"""Learns whether anybody subscribes to a key now."""
 
 
 class Declaration:
@@ -218,6 +220,17 @@ class Session(ABC):
     @abstractmethod
     async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
         """Take the samples that match a key expression; the oldest are lost when the loop is too slow."""
+
+    @abstractmethod
+    async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
+        """Learn whether anybody subscribes to a key, wherever in the network; first how it is now.
+
+        What comes and goes quicker than the loop takes it may be left out; the last call is always the truth.
+
+        Args:
+            key: a concrete key that this session publishes on.
+            on_subscribed: takes the news.
+        """
 
     @abstractmethod
     async def query(

@@ -1,4 +1,4 @@
-"""The session on a real Zenoh network; with `zenoh_config`, the only module that knows zenoh.
+"""The session on a real Zenoh network; with `zenoh_config` and `zenoh_values`, the only module that knows zenoh.
 
 Zenoh calls back on its own threads: there, items are handed over to the loop and nothing else happens, because one
 blocked callback holds up everything that comes over the same link. What may block on a peer that does not read runs on
@@ -8,16 +8,17 @@ Source: behaviour of eclipse-zenoh 1.10.2, measured.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+import contextlib
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypedDict
+from typing import Protocol
 
 import zenoh
 from zenoh.handlers import Callback
 
-from ldcnd.errors import OutcomeUnknown, SessionError, ValueOutOfRange
+from ldcnd.errors import SessionError, ValueOutOfRange
 from ldcnd.log import get_logger
 from ldcnd.messaging import zenoh_failures
 from ldcnd.messaging.hand_over import Collector, HandOver, Intake, TokenChanges
@@ -30,16 +31,16 @@ from ldcnd.messaging.session import (
     Declaration,
     OnQuery,
     OnSample,
+    OnSubscribed,
     OnToken,
     Qos,
     Query,
-    Sample,
-    SampleKind,
     Session,
 )
 from ldcnd.messaging.workers import Workers
 from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.messaging.zenoh_values import TRAVEL, no_answer, to_answers, to_sample, to_stamp
 
 __all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
 
@@ -53,20 +54,6 @@ CLOSE_TIME_S = 1.5
 """Then Zenoh has so long to say goodbye; with a frozen, congested peer it can take 12 s, and is left to itself."""
 QUERY_GRACE_S = 0.5
 """Zenoh ends a query at its time-out; it is given up for lost so much later."""
-
-
-class _Travel(TypedDict):
-    congestion_control: zenoh.CongestionControl
-    priority: zenoh.Priority
-    express: bool
-
-
-_DROP = zenoh.CongestionControl.DROP
-_TRAVEL: Mapping[Qos, _Travel] = {
-    Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
-    Qos.EVENT: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True},
-    Qos.BULK: {"congestion_control": _DROP, "priority": zenoh.Priority.BACKGROUND, "express": False},
-}
 
 
 class _Undeclarable(Protocol):
@@ -119,6 +106,18 @@ class _Declared:
     stop: Callable[[], object]
 
 
+@dataclass(frozen=True, slots=True)
+class _SubscriberWatch:
+    """A publisher that publishes nothing, and the listener that it was declared for."""
+
+    publisher: _Undeclarable
+    listener: _Undeclarable
+
+    def undeclare(self) -> None:
+        self.listener.undeclare()
+        self.publisher.undeclare()
+
+
 class ZenohSession(Session):
     """One participant; made by `open_zenoh_session`."""
 
@@ -135,13 +134,13 @@ class ZenohSession(Session):
     def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
         """Publish; cheaper once the key's publisher is declared, which happens in the background."""
         self._must_be_open()
-        timestamp = _stamp(measured_at_ns, self._stamp_id)
+        timestamp = to_stamp(measured_at_ns, self._stamp_id)
         outlet = self._outlets.get(key) or self._new_outlet(key, qos)
         try:
             if outlet.publisher and outlet.qos is qos:
                 outlet.publisher.put(payload, encoding=encoding, timestamp=timestamp)
             else:
-                self._session.put(key, payload, encoding=encoding, timestamp=timestamp, **_TRAVEL[qos])
+                self._session.put(key, payload, encoding=encoding, timestamp=timestamp, **TRAVEL[qos])
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot publish: {error}") from error
 
@@ -150,7 +149,7 @@ class ZenohSession(Session):
         self._must_be_open()
         outlet = self._outlets.get(key)
         try:
-            self._session.delete(key, **_TRAVEL[outlet.qos if outlet else Qos.EVENT])
+            self._session.delete(key, **TRAVEL[outlet.qos if outlet else Qos.EVENT])
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot delete: {error}") from error
 
@@ -187,11 +186,31 @@ class ZenohSession(Session):
         samples = HandOver(self._loop, on_sample, UNDELIVERED_SAMPLES)
 
         def take(sample: zenoh.Sample) -> None:
-            samples.offer(_sample(sample))
+            samples.offer(to_sample(sample))
 
         return await self._declare(
             lambda: self._session.declare_subscriber(key, Callback(take, indirect=False)), samples.close
         )
+
+    async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
+        """Learn whether anybody subscribes: Zenoh tells it to those who have declared that they publish."""
+
+        def look(publisher: zenoh.Publisher) -> None:
+            with contextlib.suppress(zenoh.ZError):  # it is being taken back at this moment
+                status: zenoh.MatchingStatus = publisher.matching_status  # type: ignore[assignment] # its stub says bool
+                on_subscribed(status.matching)
+
+        # the status is read on the loop, so that two changes cannot pass each other on their way there
+        looks = HandOver[zenoh.Publisher](self._loop, look, 1)
+
+        def declare() -> _SubscriberWatch:
+            publisher = self._session.declare_publisher(key)
+            changed: Callback[zenoh.MatchingStatus] = Callback(lambda _: looks.offer(publisher), indirect=False)
+            listener = publisher.declare_matching_listener(changed)
+            looks.offer(publisher)
+            return _SubscriberWatch(publisher, listener)
+
+        return await self._declare(declare, looks.close)
 
     async def query(
         self,
@@ -233,12 +252,12 @@ class ZenohSession(Session):
             raise SessionError(f"{key}: cannot ask: {error}") from error
         except TimeoutError:
             if not collector.items:
-                raise _no_answer(key, timeout_s) from None
+                raise no_answer(key, timeout_s) from None
         finally:
             if not collector.done.is_set():
                 # waits for a callback that is running, so not here
                 workers.submit(token.cancel)
-        return _answers(key, collector.items, timeout_s)
+        return to_answers(key, collector.items, timeout_s)
 
     async def declare_token(self, key: str) -> Declaration:
         """Show a token."""
@@ -304,7 +323,7 @@ class ZenohSession(Session):
 
         def declare() -> None:
             try:
-                outlet.publisher = self._session.declare_publisher(key, **_TRAVEL[qos])
+                outlet.publisher = self._session.declare_publisher(key, **TRAVEL[qos])
             except zenoh.ZError as error:
                 log.debug("publisher not declared", key=key, reason=str(error))
 
@@ -336,49 +355,10 @@ class _AnswerPath:
                 if answer.is_error:
                     asked.reply_err(answer.payload, encoding=answer.encoding)
                 else:
-                    stamp = _stamp(answer.measured_at_ns, self.stamp_id)
+                    stamp = to_stamp(answer.measured_at_ns, self.stamp_id)
                     asked.reply(answer.key, answer.payload, encoding=answer.encoding, timestamp=stamp)
             asked.drop()  # type: ignore[no-untyped-call] # the stub leaves its result open
         except zenoh.ZError as error:
             log.warning("answer lost", reason=str(error))
         finally:
             self.on_gone()
-
-
-def _sample(sample: zenoh.Sample) -> Sample:
-    put = sample.kind == zenoh.SampleKind.PUT
-    return Sample(
-        key=str(sample.key_expr),
-        payload=sample.payload.to_bytes(),
-        encoding=str(sample.encoding) if put else "",
-        kind=SampleKind.PUT if put else SampleKind.DELETE,
-        measured_at_ns=_stamped_ns(sample.timestamp),
-    )
-
-
-def _answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> list[Answer]:
-    answers: list[Answer] = []
-    for reply in replies:
-        if (sample := reply.ok) is not None:
-            stamp = _stamped_ns(sample.timestamp)
-            answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), stamp))
-        elif (error := reply.err) is not None:
-            answers.append(Answer(key, error.payload.to_bytes(), str(error.encoding), is_error=True))
-    # Zenoh itself says so, in the place of whoever did not answer
-    arrived = [answer for answer in answers if not (answer.is_error and answer.payload == b"Timeout")]
-    if len(arrived) < len(answers) and not arrived:
-        raise _no_answer(key, timeout_s)
-    return arrived
-
-
-def _no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
-    return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
-
-
-def _stamp(at_ns: int | None, stamp_id: zenoh.TimestampId) -> zenoh.Timestamp | None:
-    """Return Zenoh's timestamp of an instant; exact, its resolution is a quarter of a nanosecond."""
-    return None if at_ns is None else zenoh.Timestamp(zenoh.NTP64(*divmod(at_ns, 10**9)), stamp_id)
-
-
-def _stamped_ns(timestamp: zenoh.Timestamp | None) -> int | None:
-    return None if timestamp is None else timestamp.get_time_as_ntp64().as_nanos()

@@ -25,6 +25,17 @@ class LaneHealth(Frozen):
     """The longest one."""
 
 
+class ItemHealth(Frozen):
+    """How often one telemetry item comes."""
+
+    item: str
+    """Last chunk of its key."""
+    asked_hz: float = Field(ge=0)
+    """How often the drive is asked for it now: as configured, or its idle rate while nobody takes it."""
+    granted_hz: float = Field(ge=0)
+    """How often it was published in the last period."""
+
+
 class AxisHealth(Frozen):
     """How fresh an axis's samples are."""
 
@@ -40,6 +51,8 @@ class AxisHealth(Frozen):
     """How often it was published in the last period."""
     faults: int = Field(ge=0)
     """Faults that stand now."""
+    items: tuple[ItemHealth, ...] = ()
+    """What it is asked for; empty for a drive family that paces itself."""
 
 
 class BusHealth(Frozen):

@@ -73,3 +73,29 @@ def test_items_that_are_switched_off_and_converters_that_do_not_exist_are_not_po
 
     assert wanted_rates_hz(rates, adc=False) == {POSITION: 10, STATE: 5}
     assert wanted_rates_hz(rates, adc=True) == {POSITION: 10, ADC: 2, STATE: 5}
+
+
+def test_an_item_that_is_wanted_more_often_comes_within_its_new_period():
+    axis = poller({POSITION: 1.0, STATE: 5.0})
+    axis.next_exchange(0.0)
+
+    earlier = axis.retime({POSITION: 20.0, STATE: 5.0}, 0.02)
+
+    assert earlier
+    (first_s, first), (second_s, second), *_ = polls(axis, 1.0)
+    assert first_s == pytest.approx(0.07)
+    assert second_s == pytest.approx(0.12)
+    assert POSITION in first
+    assert POSITION in second
+
+
+def test_an_item_that_is_wanted_more_seldom_keeps_the_state_at_its_rate():
+    axis = poller({POSITION: 20.0, STATE: 5.0})
+    polls(axis, 1.0)
+
+    earlier = axis.retime({POSITION: 1.0, STATE: 5.0}, 1.0)
+
+    assert not earlier
+    asked = Counter(item for _, items in polls(axis, 11.0) for item in items)
+    assert asked[STATE] == pytest.approx(50, abs=2)
+    assert asked[POSITION] == pytest.approx(10, abs=1)

@@ -1,0 +1,71 @@
+"""What travels, in Zenoh's terms and in ours: quality of service, instants, samples and answers."""
+
+from collections.abc import Mapping, Sequence
+from typing import TypedDict
+
+import zenoh
+
+from ldcnd.errors import OutcomeUnknown
+from ldcnd.messaging.session import Answer, Qos, Sample, SampleKind
+
+
+class Travel(TypedDict):
+    """How Zenoh is told to carry something."""
+
+    congestion_control: zenoh.CongestionControl
+    priority: zenoh.Priority
+    express: bool
+
+
+_DROP = zenoh.CongestionControl.DROP
+TRAVEL: Mapping[Qos, Travel] = {
+    Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
+    Qos.EVENT: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True},
+    Qos.BULK: {"congestion_control": _DROP, "priority": zenoh.Priority.BACKGROUND, "express": False},
+}
+
+
+def to_sample(sample: zenoh.Sample) -> Sample:
+    """Return a sample as the session's users know it."""
+    put = sample.kind == zenoh.SampleKind.PUT
+    return Sample(
+        key=str(sample.key_expr),
+        payload=sample.payload.to_bytes(),
+        encoding=str(sample.encoding) if put else "",
+        kind=SampleKind.PUT if put else SampleKind.DELETE,
+        measured_at_ns=_stamped_ns(sample.timestamp),
+    )
+
+
+def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> list[Answer]:
+    """Return the answers to a query.
+
+    Raises:
+        OutcomeUnknown: the only one is Zenoh's own, that the time is over.
+    """
+    answers: list[Answer] = []
+    for reply in replies:
+        if (sample := reply.ok) is not None:
+            stamp = _stamped_ns(sample.timestamp)
+            answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), stamp))
+        elif (error := reply.err) is not None:
+            answers.append(Answer(key, error.payload.to_bytes(), str(error.encoding), is_error=True))
+    # Zenoh itself says so, in the place of whoever did not answer
+    arrived = [answer for answer in answers if not (answer.is_error and answer.payload == b"Timeout")]
+    if len(arrived) < len(answers) and not arrived:
+        raise no_answer(key, timeout_s)
+    return arrived
+
+
+def no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
+    """Return the error for a query that nobody has answered in time."""
+    return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
+
+
+def to_stamp(at_ns: int | None, stamp_id: zenoh.TimestampId) -> zenoh.Timestamp | None:
+    """Return Zenoh's timestamp of an instant; exact, its resolution is a quarter of a nanosecond."""
+    return None if at_ns is None else zenoh.Timestamp(zenoh.NTP64(*divmod(at_ns, 10**9)), stamp_id)
+
+
+def _stamped_ns(timestamp: zenoh.Timestamp | None) -> int | None:
+    return None if timestamp is None else timestamp.get_time_as_ntp64().as_nanos()
