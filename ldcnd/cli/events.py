@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.model.events import EventList, EventsRequest
+from ldcnd.client.events import latest_events
 
 
 @click.command()
@@ -14,8 +14,7 @@ from ldcnd.model.events import EventList, EventsRequest
 @with_target
 def command(target: Target, axis: str | None, count: int) -> None:
     """Show the latest events of the rig, oldest first."""
-    request = EventsRequest(axis=axis, count=count)
-    for event in target.run(lambda client: client.rig_command("events", request, EventList)).events:
+    for event in target.run(lambda client: latest_events(client, count, axis)):
         at = datetime.fromtimestamp(event.t / 1e9, UTC).isoformat(timespec="milliseconds")
         who = event.client or "somebody"
         why = f": {event.reason}" if event.reason else ""

@@ -8,9 +8,10 @@ from typing import TypeVar
 
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
+from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Answer, Sample, SampleKind, Session
 from ldcnd.model.axes import AxisInfo, LinkState
+from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import BusInfo, DaemonInfo
@@ -203,6 +204,20 @@ class RigClient:
         declaration = await self._session.subscribe(self._keys.telemetry_pattern(axis, item), samples.take)
         try:
             yield samples
+        finally:
+            await declaration.close()
+
+    @asynccontextmanager
+    async def command_events(self, take: Callable[[CommandEvent], None]) -> AsyncIterator[None]:
+        """Hand every event to `take` for the time of the context; `follow_events` misses none."""
+
+        def decode(sample: Sample) -> None:
+            if sample.kind is SampleKind.PUT:
+                take(decode_received(CommandEvent, sample.payload, sample.encoding))
+
+        declaration = await self._session.subscribe(self._keys.telemetry_pattern("*", EVENT), decode)
+        try:
+            yield
         finally:
             await declaration.close()
 

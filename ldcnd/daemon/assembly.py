@@ -85,7 +85,7 @@ def build_daemon(
     def next_command_id() -> str:
         return f"{instance}-{next(serial)}"
 
-    events = EventLog(publisher, clock)
+    events = EventLog(publisher, clock, instance)
     ledger = Ledger(events.changed)
 
     def make_axis(axis: AxisConfig, bus: Bus, driver: AxisDriver) -> AxisService:

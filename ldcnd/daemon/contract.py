@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from ldcnd.daemon.publishing import EVENT
-from ldcnd.messaging.keys import RIG_ITSELF, Keys
+from ldcnd.messaging.keys import EVENT, RIG_ITSELF, Keys
 from ldcnd.model.axes import AxisInfo
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen

@@ -1,23 +1,28 @@
 """The latest events of a rig: kept for those who come late, published for those who listen."""
 
 from collections import deque
+from collections.abc import Iterable
 
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.ledger import Entry
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.errors import LdcndError
 from ldcnd.log import get_logger
-from ldcnd.model.events import CommandEvent
+from ldcnd.model.events import CommandEvent, EventList, EventsRequest
 
 log = get_logger("events")
 
 KEPT_EVENTS = 1000
+PAGE_BYTES = 12_000
+"""Events in one reply: with its other fields it stays below what a payload may have."""
 
 
 class EventLog:
     """Numbers, keeps and publishes what happens to commands."""
 
-    def __init__(self, publisher: Publisher, clock: Clock) -> None:
+    def __init__(self, publisher: Publisher, clock: Clock, run: str) -> None:
+        self._run = run
+        self._end = 0
         self._publisher = publisher
         self._clock = clock
         self._kept: deque[CommandEvent] = deque(maxlen=KEPT_EVENTS)
@@ -30,6 +35,8 @@ class EventLog:
         event = CommandEvent(
             t=self._clock.now_ns(),
             seq=seq,
+            run=self._run,
+            number=self._end,
             axis=entry.axis,
             command_id=entry.command_id,
             verb=entry.verb.value,
@@ -38,6 +45,7 @@ class EventLog:
             reason=entry.reason,
             code=error.code.value if error else None,
         )
+        self._end += 1
         self._kept.append(event)
         self._publisher.publish_event(event)
         log.info(
@@ -50,7 +58,31 @@ class EventLog:
             reason=entry.reason,
         )
 
-    def latest(self, count: int, axis: str | None) -> tuple[CommandEvent, ...]:
-        """Return the latest events, oldest first."""
-        wanted = [event for event in self._kept if axis is None or event.axis == axis]
-        return tuple(wanted[-count:])
+    def page(self, request: EventsRequest) -> EventList:
+        """Return the events that were asked for, as many as one reply takes."""
+        oldest = self._end - len(self._kept)
+        if request.from_number is None:
+            matching = [event for event in self._kept if request.axis in (None, event.axis)]
+            events = _fitting(reversed(matching[-request.count :]))[::-1]
+            return self._list(events, events[0].number if events else self._end, self._end)
+        first = min(max(oldest, request.from_number), self._end)
+        wanted = [event for event in list(self._kept)[first - oldest :] if request.axis in (None, event.axis)]
+        events = _fitting(wanted[: request.count])
+        return self._list(events, first, wanted[len(events)].number if len(events) < len(wanted) else self._end)
+
+    def _list(self, events: list[CommandEvent], first: int, following: int) -> EventList:
+        return EventList(
+            run=self._run, first_number=first, next_number=following, end_number=self._end, events=tuple(events)
+        )
+
+
+def _fitting(events: Iterable[CommandEvent]) -> list[CommandEvent]:
+    """Return as many events as one reply takes, one at least."""
+    fitting: list[CommandEvent] = []
+    room = PAGE_BYTES
+    for event in events:
+        room -= len(event.model_dump_json()) + 1
+        if fitting and room < 0:
+            break
+        fitting.append(event)
+    return fitting

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.session import Qos, Session
 from ldcnd.model.axes import Quality
 from ldcnd.model.events import CommandEvent
@@ -13,7 +13,6 @@ from ldcnd.model.monitors import MonitorName
 from ldcnd.model.samples import Sample, TelemetryItem
 from ldcnd.model.traces import TraceChunk, TraceHeader
 
-EVENT = "event"
 QOS = {
     TelemetryItem.POSITION: Qos.TELEMETRY,
     TelemetryItem.VELOCITY: Qos.TELEMETRY,

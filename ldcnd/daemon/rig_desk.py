@@ -90,8 +90,7 @@ class RigDesk:
         )
 
     def _latest(self, payload: bytes, encoding: str) -> EventList:
-        request = decode(EventsRequest, payload, encoding)
-        return EventList(events=self._events.latest(request.count, request.axis))
+        return self._events.page(decode(EventsRequest, payload, encoding))
 
     def _wire_log(self, payload: bytes, encoding: str) -> WireLogReply:
         return wire_page(self._rig, decode(WireLogRequest, payload, encoding), self._clock)

@@ -18,6 +18,9 @@ ROOT = "ldcn"
 RIG_ITSELF = "_"
 """Stands in the place of an axis in commands that concern the rig as a whole; no axis can have this name."""
 
+EVENT = "event"
+"""Stands in the place of an item where the events of an axis are published."""
+
 ALL_READABLE = (f"{ROOT}/*/tele/**", f"{ROOT}/*/meta/**", f"{ROOT}/*/alive/**")
 """What may be read, on every rig; for access control, as `ALL_STOPS`, `ALL_COMMANDS` and `ALL_CLIENTS`."""
 ALL_DAEMONS = f"{ROOT}/*/meta/daemon"

@@ -44,6 +44,10 @@ class CommandEvent(Frozen):
     """When, UTC in ns since 1970."""
     seq: int = Field(ge=0)
     """Grows by one with every event of the axis."""
+    run: str
+    """The run of the daemon, as in `meta/daemon`: with another one, numbers begin anew."""
+    number: int = Field(ge=0)
+    """Grows by one with every event of the rig: a gap is filled by asking for what is missing."""
     axis: str
     """The axis."""
     command_id: str
@@ -83,16 +87,26 @@ class CommandOutcome(Frozen):
 
 
 class EventsRequest(Frozen):
-    """Ask for the latest events."""
+    """Ask for events: the latest, or those from a number on."""
 
     axis: str | None = None
     """Only this axis."""
     count: int = Field(default=100, ge=1, le=1000)
-    """At most so many, the latest."""
+    """At most so many, and never more than one reply takes."""
+    from_number: int | None = Field(default=None, ge=0)
+    """The first of these and later ones; the latest when missing."""
 
 
 class EventList(Frozen):
-    """The latest events, oldest first: the reply to `@cmd/_/events`."""
+    """Events, oldest first: the reply to `@cmd/_/events`."""
 
+    run: str
+    """The run of the daemon that they are of."""
+    first_number: int = Field(ge=0)
+    """From here on nothing was left out; above what was asked for when that is forgotten."""
+    next_number: int = Field(ge=0)
+    """Where to ask on."""
+    end_number: int = Field(ge=0)
+    """The number of the event that comes next."""
     events: tuple[CommandEvent, ...]
     """What has happened."""

@@ -1,0 +1,145 @@
+"""The events of a rig without gaps: what the network drops is fetched from the daemon's memory.
+
+An event has a number, so a gap is seen when the next one comes, and at the latest when the daemon is asked again.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import OutcomeUnknown, SessionError
+from ldcnd.model.events import CommandEvent, EventList, EventsRequest
+from ldcnd.model.verbs import EVENTS
+
+LOOK_PERIOD_S = 2.0
+"""So often the daemon is asked whether the last event was missed, while none comes."""
+RETRY_S = 0.5
+"""A daemon out of reach is asked again after so long."""
+UNREAD_EVENTS = 1024
+"""A reader that is slower keeps so many events that have come; what is beyond is fetched when it gets there."""
+
+
+class Events:
+    """An endless iterator over the events of a rig, in their order, each once; made by `follow_events`.
+
+    Attributes:
+        lost: how many events the daemon had forgotten before they could be fetched.
+        restarts: how often the daemon was started anew meanwhile; what its former run said last may be missing.
+    """
+
+    def __init__(self, client: RigClient, axis: str | None, at: EventList) -> None:
+        self.lost = 0
+        self.restarts = 0
+        self._client = client
+        self._axis = axis
+        self._run = at.run
+        self._next = at.first_number
+        self._behind = True  # something may have happened before the subscription reached the daemon
+        self._ready: deque[CommandEvent] = deque()
+        self._live: deque[CommandEvent] = deque(maxlen=UNREAD_EVENTS)
+        self._arrived = asyncio.Event()
+
+    def take(self, event: CommandEvent) -> None:
+        """Take an event from the session; an old one gives way to it when the reader is slow, and is fetched later."""
+        self._live.append(event)
+        self._arrived.set()
+
+    def __aiter__(self) -> "Events":
+        return self
+
+    async def __anext__(self) -> CommandEvent:
+        """Return the next event, whenever that comes."""
+        while True:
+            while self._ready:
+                event = self._ready.popleft()
+                if self._axis in (None, event.axis):
+                    return event
+            if self._behind:
+                await self._fetch()
+            elif not self._take_live():
+                await self._wait(LOOK_PERIOD_S)
+                self._behind = self._behind or not self._live
+
+    def _take_live(self) -> bool:
+        """Move what follows without a gap to the events that are ready; tell whether there was anything to do."""
+        self._arrived.clear()
+        while self._live and not self._behind:
+            event = self._live.popleft()
+            if event.run == self._run and event.number < self._next:
+                continue
+            self._behind = event.run != self._run or event.number > self._next
+            if not self._behind:
+                self._next += 1
+                self._ready.append(event)
+        return self._behind or bool(self._ready)
+
+    async def _fetch(self) -> None:
+        """Ask for the next page from where this reader is; try again for as long as nobody answers."""
+        while True:
+            try:
+                page = await self._client.rig_command(EVENTS, EventsRequest(from_number=self._next), EventList)
+            except (OutcomeUnknown, SessionError):
+                await asyncio.sleep(RETRY_S)
+                continue
+            if page.run == self._run:
+                break
+            self._run, self._next = page.run, 0
+            self.restarts += 1
+        self.lost += page.first_number - self._next
+        self._next, self._behind = page.next_number, page.next_number < page.end_number
+        self._ready.extend(page.events)
+
+    async def _wait(self, at_most_s: float) -> None:
+        """Wait until an event comes, but not for ever: the last of them may be the one that was missed."""
+        try:
+            async with asyncio.timeout(at_most_s):
+                await self._arrived.wait()
+        except TimeoutError:
+            return
+
+
+@asynccontextmanager
+async def follow_events(client: RigClient, axis: str | None = None, *, history: bool = False) -> AsyncIterator[Events]:
+    """Follow what happens to commands for the time of the context: no event is lost silently.
+
+    Args:
+        client: the rig.
+        axis: only this one.
+        history: begin with what the daemon remembers, up to 1000 events, instead of now.
+
+    Raises:
+        SessionError: nobody serves this rig, or this login may not ask for events.
+    """
+    request = EventsRequest(from_number=0, count=1) if history else EventsRequest(count=1)
+    page = await client.rig_command(EVENTS, request, EventList)
+    at = page if history else page.model_copy(update={"first_number": page.end_number})
+    events = Events(client, axis, at)
+    async with client.command_events(events.take):
+        yield events
+
+
+async def latest_events(client: RigClient, count: int, axis: str | None = None) -> list[CommandEvent]:
+    """Return the latest events that the daemon remembers, oldest first, however many replies that takes.
+
+    Args:
+        client: the rig.
+        count: at most so many, 1 to 1000.
+        axis: only this one.
+
+    Raises:
+        LdcndError: as the daemon refused it, of the same class.
+    """
+    page = await client.rig_command(EVENTS, EventsRequest(axis=axis, count=count), EventList)
+    if len(page.events) >= count or page.first_number == 0:
+        return list(page.events)
+    run, end, events = page.run, page.end_number, list[CommandEvent]()
+    at = 0 if axis else max(0, end - count)
+    while at < end:
+        page = await client.rig_command(EVENTS, EventsRequest(axis=axis, count=count, from_number=at), EventList)
+        if page.run != run:
+            break
+        events += page.events
+        at = page.next_number
+    return events[-count:]
