@@ -1,6 +1,7 @@
 """`ldcnd pki`: certificates and roles for a network with mutual TLS."""
 
 import datetime as dt
+from collections.abc import Iterable
 from pathlib import Path
 
 import click
@@ -39,7 +40,7 @@ def init(folder: Path, name: str) -> None:
 @FOLDER
 @click.argument("name")
 @click.option("--role", type=click.Choice([role.value for role in Role]), required=True, help="What it may do.")
-@click.option("--host", "hosts", multiple=True, help="Host name at which clients find a daemon; may be repeated.")
+@click.option("--host", "hosts", multiple=True, help="Host name at which a daemon or router is found; may be repeated.")
 @click.option("--ip", "addresses", multiple=True, help="The same, an IP address.")
 @click.option("--days", type=click.IntRange(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
 def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
@@ -49,9 +50,12 @@ def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: t
     file = site.add(login, _now(), days)
     if login.role is Role.DAEMON:
         click.echo(f'{file}: in the rig\'s configuration, [zenoh] config_file = "{file.resolve()}"')
+    elif login.role is Role.ROUTER:
+        click.echo(f"{file}: start the router with it, `zenohd --config {file.name}`")
     else:
         click.echo(f"{file}: hand it over on a safe way; use it as --config {file.name}")
-        _say_restart(site.daemon_files())
+    if login.role is not Role.DAEMON:
+        _say_restart(other for other in site.listener_files() if other != file)
 
 
 @command.command()
@@ -62,12 +66,12 @@ def revoke(folder: Path, name: str) -> None:
     site = Site(folder)
     site.revoke(name)
     click.echo(f"{name}: revoked")
-    _say_restart(site.daemon_files())
+    _say_restart(site.listener_files())
 
 
-def _say_restart(files: tuple[Path, ...]) -> None:
+def _say_restart(files: Iterable[Path]) -> None:
     for file in files:
-        click.echo(f"restart the daemon of {file}: rules are read at its start")
+        click.echo(f"restart what runs with {file}: rules are read at its start")
 
 
 def _now() -> dt.datetime:

@@ -60,7 +60,7 @@ class Events:
                 await self._fetch()
             elif not self._take_live():
                 await self._wait(LOOK_PERIOD_S)
-                self._behind = self._behind or not self._live
+                self._behind = not self._live
 
     def _take_live(self) -> bool:
         """Move what follows without a gap to the events that are ready; tell whether there was anything to do."""

@@ -23,6 +23,8 @@ class Role(StrEnum):
     """Reads, stops and commands."""
     DAEMON = "daemon"
     """Serves a rig; listens."""
+    ROUTER = "router"
+    """Carries messages between the others, and keeps viewers and operators apart; listens."""
 
 
 class Flow(StrEnum):
@@ -71,18 +73,36 @@ PRESENCE = (
     Rule("presence_out", Flow.EGRESS, ("declare_liveliness_subscriber", "liveliness_query"), (ALL_CLIENTS,)),
 )
 
+EVERYTHING = (*ASKING, *TELLING)
+EVERYWHERE = ("**", ALL_COMMANDS, ALL_STOPS)
+CARRY = (
+    Rule("carry_in", Flow.INGRESS, EVERYTHING, EVERYWHERE),
+    Rule("carry_out", Flow.EGRESS, EVERYTHING, EVERYWHERE),
+)
+
 RULES = (*WATCH, *STOP, *COMMAND, *PRESENCE)
 PERMITTED: Mapping[Role, tuple[Rule, ...]] = {Role.VIEWER: (*WATCH, *STOP), Role.OPERATOR: RULES}
+"""At a daemon that people connect to."""
+PERMITTED_BEHIND_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED, Role.ROUTER: CARRY}
+"""At a daemon that routers connect to as well: they have looked at who asks."""
+PERMITTED_AT_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED_BEHIND_ROUTER, Role.DAEMON: CARRY}
+"""At a router. Which rig a daemon speaks for is not looked at."""
 
 
-def access_control(subject: Subject, logins: Mapping[Role, tuple[str, ...]]) -> dict[str, object]:
+def access_control(
+    subject: Subject,
+    logins: Mapping[Role, tuple[str, ...]],
+    permitted: Mapping[Role, tuple[Rule, ...]] = PERMITTED,
+) -> dict[str, object]:
     """Return the value of Zenoh's `access_control`: each login may do what its role permits, and nothing else.
 
     Args:
         subject: by what logins are known.
         logins: who has which role. A role that nobody has is left out, because Zenoh refuses an empty list.
+        permitted: what each role permits.
     """
-    present = {role: names for role in PERMITTED if (names := logins.get(role, ()))}
+    present = {role: names for role in permitted if (names := logins.get(role, ()))}
+    rules = dict.fromkeys(rule for role in (*PERMITTED, *present) for rule in permitted[role])
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -94,8 +114,8 @@ def access_control(subject: Subject, logins: Mapping[Role, tuple[str, ...]]) -> 
                 "messages": list(rule.messages),
                 "key_exprs": list(rule.keys),
             }
-            for rule in RULES
+            for rule in rules
         ],
         "subjects": [{"id": f"{role}s", subject.value: list(names)} for role, names in present.items()],
-        "policies": [{"rules": [rule.name for rule in PERMITTED[role]], "subjects": [f"{role}s"]} for role in present],
+        "policies": [{"rules": [rule.name for rule in permitted[role]], "subjects": [f"{role}s"]} for role in present],
     }

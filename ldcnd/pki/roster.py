@@ -24,7 +24,7 @@ class Login(Frozen):
     role: Role
     """What it may do."""
     hosts: tuple[str, ...] = ()
-    """Where a daemon can be found: host names and IP addresses."""
+    """Where a daemon or a router can be found: host names and IP addresses."""
     revoked: bool = False
     """It may do nothing any more. It stays on the roster, because its certificate lives on: a second login of this name
     would give the old certificate its rights back."""

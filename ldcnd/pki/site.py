@@ -1,25 +1,35 @@
 """A site's folder: authority, roster, and one Zenoh configuration for each login, ready to be handed over.
 
 Each configuration holds its certificate and key, so it is one file, for any Zenoh program, and it is a secret. Those of
-the daemons hold the access rules as well; they are written anew whenever the roster changes.
+daemons and routers hold the access rules as well; they are written anew whenever the roster changes.
 """
 
 import base64
 import datetime as dt
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from ldcnd.errors import ConfigError
-from ldcnd.pki.access import Role, Subject, access_control
+from ldcnd.messaging.zenoh_settings import LEASE_MS, RETRY_MS
+from ldcnd.pki.access import (
+    PERMITTED_AT_ROUTER,
+    PERMITTED_BEHIND_ROUTER,
+    Role,
+    Rule,
+    Subject,
+    access_control,
+)
 from ldcnd.pki.certificates import Credentials, issue_client, issue_daemon, new_authority
 from ldcnd.pki.roster import FILE, RESERVED, Login, Roster, read_roster
 
 PORT = 7447
 AUTHORITY = "ca"
 PRIVATE = 0o600
+LISTENERS = (Role.DAEMON, Role.ROUTER)
 
 
 class Site:
@@ -50,39 +60,43 @@ class Site:
                 else "exists"
             )
             raise ConfigError(f"{login.name}: this login {why}; choose another name")
-        if login.role is Role.DAEMON and not login.hosts:
-            raise ConfigError(f"{login.name}: a daemon needs a host name or an IP address at which clients find it")
-        if login.role is Role.DAEMON:
+        if login.role in LISTENERS and not login.hosts:
+            raise ConfigError(
+                f"{login.name}: a {login.role} needs a host name or an IP address at which clients find it"
+            )
+        if login.role in LISTENERS:
             made = issue_daemon(self._authority, login.name, login.hosts, now, days)
         else:
             made = issue_client(self._authority, login.name, now, days)
         _write(self._folder / f"{login.name}.pem", made.certificate)
         _write(self._folder / f"{login.name}.key", made.key)
         self._keep(self._roster.with_login(login))
-        if login.role is not Role.DAEMON:
+        if login.role not in LISTENERS:
             self._write_configuration(login.name, self._client(made))
         return self._folder / f"{login.name}.json5"
 
     def revoke(self, name: str) -> None:
-        """Take a viewer's or operator's rights back; daemons learn of it when they are restarted with their new file.
+        """Take a viewer's or operator's rights back; who listens learns of it when restarted with the new file.
 
         Raises:
-            ConfigError: there is no such login, or it is a daemon, whose certificate clients would trust all the same.
+            ConfigError: there is no such login, or it listens, and clients would trust its certificate all the same.
         """
         login = self._roster.find(name)
         if login is None or login.revoked:
             raise ConfigError(f"{name}: there is no such login; there are: {', '.join(self._present()) or 'none'}")
-        if login.role is Role.DAEMON:
+        if login.role in LISTENERS:
             raise ConfigError(
-                f"{name}: a daemon cannot be revoked, clients trust its certificate until it ends; set up a new site"
+                f"{name}: a {login.role} cannot be revoked, clients trust its certificate until it ends;"
+                " set up a new site"
             )
         self._keep(self._roster.with_login(login.model_copy(update={"revoked": True})))
         for suffix in ("json5", "pem", "key"):
             (self._folder / f"{name}.{suffix}").unlink(missing_ok=True)
 
-    def daemon_files(self) -> tuple[Path, ...]:
-        """Return the configurations of the daemons."""
-        return tuple(self._folder / f"{name}.json5" for name in self._roster.names(Role.DAEMON))
+    def listener_files(self) -> tuple[Path, ...]:
+        """Return the configurations of the daemons and routers, which hold the access rules."""
+        names = (name for role in LISTENERS for name in self._roster.names(role))
+        return tuple(self._folder / f"{name}.json5" for name in names)
 
     def _present(self) -> tuple[str, ...]:
         return tuple(login.name for login in self._roster.logins if not login.revoked)
@@ -93,21 +107,34 @@ class Site:
         self._roster = roster
         for name in roster.names(Role.DAEMON):
             self._write_configuration(name, self._daemon(self._credentials(name)))
+        for name in roster.names(Role.ROUTER):
+            self._write_configuration(name, self._router(self._credentials(name)))
 
     def _daemon(self, own: Credentials) -> dict[str, object]:
-        logins = {role: self._roster.names(role) for role in (Role.VIEWER, Role.OPERATOR)}
+        return self._listener(own, "peer", PERMITTED_BEHIND_ROUTER)
+
+    def _router(self, own: Credentials) -> dict[str, object]:
+        """Return what a Zenoh router starts with; which other routers it connects to is for whoever starts it."""
         return {
-            "mode": "peer",
+            **self._listener(own, "router", PERMITTED_AT_ROUTER),
+            "connect": {"retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]}},
+        }
+
+    def _listener(self, own: Credentials, mode: str, permitted: Mapping[Role, tuple[Rule, ...]]) -> dict[str, object]:
+        logins = {role: self._roster.names(role) for role in Role}
+        return {
+            "mode": mode,
             "listen": {"endpoints": [f"tls/[::]:{PORT}"]},
             **self._transport(own, listens=True),
-            "access_control": access_control(Subject.CERTIFICATES, logins),
+            "access_control": access_control(Subject.CERTIFICATES, logins, permitted),
         }
 
     def _client(self, own: Credentials) -> dict[str, object]:
-        daemons = (login for login in self._roster.logins if login.role is Role.DAEMON and not login.revoked)
+        present = [login for login in self._roster.logins if not login.revoked]
+        listeners = [login for role in (Role.ROUTER, Role.DAEMON) for login in present if login.role is role]
         return {
             "mode": "client",
-            "connect": {"endpoints": [f"tls/{_bracketed(login.hosts[0])}:{PORT}" for login in daemons]},
+            "connect": {"endpoints": [f"tls/{_bracketed(login.hosts[0])}:{PORT}" for login in listeners]},
             **self._transport(own, listens=False),
         }
 
@@ -125,7 +152,7 @@ class Site:
             tls["listen_private_key_base64"] = _base64(own.key)
         return {
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-            "transport": {"link": {"protocols": ["tls"], "tls": tls}},
+            "transport": {"link": {"protocols": ["tls"], "tls": tls, "tx": {"lease": LEASE_MS}}},
         }
 
     def _credentials(self, name: str) -> Credentials:

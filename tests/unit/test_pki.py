@@ -13,7 +13,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ldcnd.cli.main import cli
 from ldcnd.errors import ConfigError
-from ldcnd.pki.access import Role, Subject, access_control
+from ldcnd.pki.access import PERMITTED, Role, Subject, access_control
 from ldcnd.pki.roster import Login, read_roster
 from ldcnd.pki.site import Site, new_login, set_up
 
@@ -83,6 +83,7 @@ def test_a_revoked_name_is_not_given_again(site: Site, tmp_path: Path) -> None:
     [
         (VIC, "exists"),
         (Login(name="bob", role=Role.DAEMON), "needs a host"),
+        (Login(name="gate", role=Role.ROUTER), "a router needs a host"),
         (Login(name="ca", role=Role.VIEWER), "reserved"),
     ],
 )
@@ -95,6 +96,27 @@ def test_a_login_that_cannot_be_is_refused(site: Site, login: Login, words: str)
 def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="cannot be a login"):
         new_login(name, Role.VIEWER, ())
+
+
+def test_a_router_tells_people_apart_and_carries_for_daemons_and_routers(site: Site, tmp_path: Path) -> None:
+    site.add(Login(name="gate", role=Role.ROUTER, hosts=("10.0.0.1",)), NOW, 30)
+    site.add(Login(name="bob", role=Role.OPERATOR), NOW, 30)
+
+    router = configuration(tmp_path, "gate")
+    policies = {tuple(policy["subjects"]): policy["rules"] for policy in router["access_control"]["policies"]}
+    assert router["mode"] == "router"
+    assert router["access_control"]["default_permission"] == "deny"
+    assert policies[("viewers",)] == [rule.name for rule in PERMITTED[Role.VIEWER]]
+    assert policies[("operators",)] == [rule.name for rule in PERMITTED[Role.OPERATOR]]
+    assert policies[("daemons",)] == policies[("routers",)] == ["carry_in", "carry_out"]
+    assert configuration(tmp_path, "bob")["connect"] == {"endpoints": ["tls/10.0.0.1:7447", "tls/10.0.0.5:7447"]}
+
+
+def test_to_a_daemon_a_router_is_trusted_and_another_daemon_is_nobody(site: Site, tmp_path: Path) -> None:
+    site.add(Login(name="gate", role=Role.ROUTER, hosts=("10.0.0.1",)), NOW, 30)
+    site.add(Login(name="other", role=Role.DAEMON, hosts=("10.0.0.6",)), NOW, 30)
+
+    assert subjects(tmp_path) == {"viewers": ["vic"], "operators": ["ada"], "routers": ["gate"]}
 
 
 def test_a_daemon_is_not_revoked_because_clients_would_trust_it_all_the_same(site: Site) -> None:
@@ -169,7 +191,7 @@ def test_the_command_line_makes_a_site_and_says_what_to_do_next(tmp_path: Path) 
         printed += result.output
 
     assert f'config_file = "{folder}/bench.json5"' in printed
-    assert printed.count(f"restart the daemon of {folder}/bench.json5") == 2
+    assert printed.count(f"restart what runs with {folder}/bench.json5") == 2
     assert read_roster(tmp_path / "site").find("ada") == Login(name="ada", role=Role.OPERATOR, revoked=True)
 
 
