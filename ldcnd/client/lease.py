@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from itertools import count
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError, LeaseExpired
+from ldcnd.errors import LdcndError, LeaseExpired, OutcomeUnknown, SessionError
 from ldcnd.model.authority import AcquireRequest, LeaseReply, LeaseRequest
 from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import Request, Verb
@@ -55,8 +55,8 @@ class Control:
                 continue  # an answer was lost; the next renewal is due soon
 
     async def release(self) -> None:
-        """Give control back; it may have been taken away meanwhile."""
-        with contextlib.suppress(LeaseExpired):
+        """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told."""
+        with contextlib.suppress(LeaseExpired, OutcomeUnknown, SessionError):
             await self._client.rig_command("release", LeaseRequest(lease=self.lease.lease), LeaseReply)
 
 
@@ -78,10 +78,16 @@ async def control(
     """
     request = AcquireRequest(client=name, axes=axes, lease_s=lease_s, force=force)
     held = Control(client, await client.rig_command("acquire", request, LeaseReply))
-    async with asyncio.TaskGroup() as group:
-        keeper = group.create_task(held.keep(), name=f"lease of {name}")
-        try:
-            yield held
-        finally:
-            keeper.cancel()
-            await held.release()
+    try:
+        async with asyncio.TaskGroup() as group:
+            keeper = group.create_task(held.keep(), name=f"lease of {name}")
+            try:
+                yield held
+            finally:
+                keeper.cancel()
+                await held.release()
+    except BaseExceptionGroup as errors:
+        # the renewals never fail, so this is the caller's own error: it is raised as itself
+        if len(errors.exceptions) > 1:
+            raise
+        raise errors.exceptions[0] from None

@@ -17,6 +17,7 @@ from ldcnd.errors import (
     LeaseRequired,
     PositionLimit,
     StaleSequence,
+    UnknownAxis,
 )
 from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply
 from ldcnd.model.axes import AxisState
@@ -250,3 +251,13 @@ async def test_nothing_is_in_the_way_of_an_axis_that_is_ready():
         await asyncio.sleep(0.2)
 
         assert (await rig.client.why("x")).can_move
+
+
+async def test_an_error_under_a_lease_is_raised_as_itself():
+    async with running_rig() as rig:
+        with pytest.raises(UnknownAxis):
+            async with control(rig.client, "ann", "x") as held:
+                await held.command("nowhere", Verb.POWER, PowerRequest(on=True))
+
+        async with control(rig.client, "bob", "x"):
+            pass  # ann's lease was given back all the same
