@@ -24,6 +24,7 @@ COMMANDS = {
     "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
     "why": ("ldcnd.cli.why", "Tell why an axis cannot move, and what would clear that."),
     "fleet": ("ldcnd.cli.fleet", "Show every rig, axis, version and health that can be reached."),
+    "fault": ("ldcnd.cli.fault", "Explain a fault or an error code: what to check, how to clear it."),
     "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
     "drill": ("ldcnd.cli.drill", "Rehearse what happens when somebody disappears."),
     "bus": ("ldcnd.cli.bus", "Look at the lines of a running daemon."),

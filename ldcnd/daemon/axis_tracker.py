@@ -7,6 +7,7 @@ from enum import Enum
 from ldcnd.daemon.guards import MOTION_STATES, AxisView
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
+from ldcnd.fault_pages import page_of
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.requests import Verb
@@ -205,6 +206,7 @@ class AxisTracker:
                 since=now_ns,
                 source="daemon" if fault in (LINK_LOST, LOOP_OPENED) else "drive",
                 stops=fault.stops,
+                page=page_of(fault.code),
             )
             for fault in faults
         )

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from ldcnd.daemon import guards
 from ldcnd.daemon.axis_tracker import AxisTracker
 from ldcnd.errors import DriveFault, LdcndError
+from ldcnd.fault_pages import page_of_error
+from ldcnd.model.samples import FaultEntry
 from ldcnd.model.why import Cause, WhyReply
 
 
@@ -21,7 +23,7 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         admit,
         lambda: guards.check_reachable(view),
         lambda: guards.check_not_latched(view),
-        *(_fault(view.name, fault.text) for fault in tracker.active_faults if fault.source == "drive"),
+        *(_fault(view.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
         lambda: guards.check_not_in_error(view),
         lambda: guards.check_enabled(view),
         lambda: guards.check_stands(view),
@@ -33,7 +35,9 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         try:
             check()
         except LdcndError as error:
-            causes.append(Cause(code=error.code.value, text=error.message, remedy=error.remedy))
+            causes.append(
+                Cause(code=error.code.value, text=error.message, remedy=error.remedy, page=page_of_error(error))
+            )
     first = tracker.first_fault
     return WhyReply(
         axis=view.name,
@@ -43,8 +47,10 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
     )
 
 
-def _fault(axis: str, text: str) -> Callable[[], None]:
+def _fault(axis: str, fault: FaultEntry) -> Callable[[], None]:
     def check() -> None:
-        raise DriveFault(f"axis {axis}: {text}", axis=axis, remedy="remove the cause, then send reset")
+        raise DriveFault(
+            f"axis {axis}: {fault.text}", axis=axis, value=fault.code, remedy="remove the cause, then send reset"
+        )
 
     return check

@@ -18,6 +18,7 @@ import pydantic_core
 
 from ldcnd import errors
 from ldcnd.errors import LdcndError, MalformedRequest, PayloadTooLarge
+from ldcnd.fault_pages import page_of_error
 from ldcnd.model.errors import ErrorReply, ReceivedError
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.schemas import schema_name
@@ -160,6 +161,7 @@ def error_reply(error: LdcndError) -> ErrorReply:
         limit=_finite(error.limit),
         nearest=error.nearest if error.nearest is None or math.isfinite(error.nearest) else None,
         remedy=error.remedy,
+        page=page_of_error(error),
     )
 
 

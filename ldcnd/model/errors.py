@@ -17,6 +17,7 @@ class ReceivedError(Frozen):
     limit: float | str | None = Field(default=None, description="the limit that the value broke")
     nearest: float | None = Field(default=None, description="the closest value that would be accepted")
     remedy: str | None = Field(default=None, description="what to do about it")
+    page: str | None = Field(default=None, description="where its page is, below a console or the documentation")
 
 
 class ErrorReply(ReceivedError):

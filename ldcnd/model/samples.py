@@ -79,6 +79,8 @@ class FaultEntry(Frozen):
     """Who says so: drive or daemon."""
     stops: bool = True
     """The motor is off because of it; false for a warning."""
+    page: str | None = None
+    """Where its page is, below a console or the documentation: what to check, how to clear it."""
 
 
 class FaultSample(Sample):

@@ -12,6 +12,8 @@ class Cause(Frozen):
     """What is in the way."""
     remedy: str | None
     """The command, or the hand, that clears it."""
+    page: str | None = None
+    """Where its page is, below a console or the documentation."""
 
 
 class WhyReply(Frozen):

@@ -1,0 +1,144 @@
+"""Every code that an operator can meet has a page, and what the page says can be done."""
+
+import re
+import shlex
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from ldcnd import errors
+from ldcnd.cli.main import cli
+from ldcnd.daemon.axis_tracker import LINK_LOST, LOOP_OPENED, AxisTracker
+from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
+from ldcnd.drivers.smartstep.alarms import ALARMS, AlarmKind
+from ldcnd.errors import DriveFault, ErrorCode, LdcndError
+from ldcnd.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
+from ldcnd.messaging.codec import error_reply
+
+DAEMON_FAULTS = {LINK_LOST.code, LOOP_OPENED.code}
+ALARM_CODES = {f"alarm_{known.code:04x}" for known in ALARMS if known.kind is not AlarmKind.NONE} | {UNLISTED_ALARM}
+FAULTS = DAEMON_FAULTS | ALARM_CODES | set(FaultCode)
+HEADINGS = [
+    "## What it means",
+    "## What the daemon has done",
+    "## What to check",
+    "## How to clear it",
+    "## Never",
+]
+MANUALS = ("LS-182AP manual", "PIC-SERVO manual", "serial communications manual")
+PLACEHOLDERS = {"FILE": "pyproject.toml", "CONFIG": "config/simulated.toml", "NAME": "line0", "VALUE": "1"}
+ERROR_CLASSES = [
+    member
+    for member in vars(errors).values()
+    if isinstance(member, type) and issubclass(member, LdcndError) and member is not LdcndError
+]
+
+
+def text_of(code: str) -> str:
+    text = page_text(code)
+    assert text is not None
+    return text
+
+
+def commands_of(text: str) -> list[str]:
+    return [span for span in re.findall(r"`(ldcnd [^`]+)`", text) if span != "ldcnd run"]
+
+
+def test_every_code_has_a_page_and_every_page_a_code():
+    assert codes() == FAULTS | set(ErrorCode)
+
+
+@pytest.mark.parametrize("code", sorted(codes()))
+def test_a_page_has_the_answers_in_the_order_in_which_they_are_needed(code):
+    lines = text_of(code).splitlines()
+
+    assert lines[0].startswith(f"# {code}: ")
+    assert [line for line in lines if line.startswith("#")][1:] == HEADINGS
+    for heading in HEADINGS:
+        assert not lines[lines.index(heading) + 2].startswith("#"), f"nothing below {heading!r}"
+
+
+@pytest.mark.parametrize("code", sorted(codes()))
+def test_a_page_is_plain(code):
+    without_code = re.sub(r"`[^`]*`", "", text_of(code))
+
+    assert not re.search(r"<[a-z/!]|&\w+;", without_code), "no HTML: a console shows the page as it is"
+    assert "{" not in without_code
+
+
+@pytest.mark.parametrize("code", sorted(FAULTS - DAEMON_FAULTS))
+def test_the_page_of_a_drives_fault_names_manual_and_section(code):
+    meaning = text_of(code).split("## ")[1]
+
+    assert any(manual in meaning for manual in MANUALS)
+    assert re.search(r'section \d|, "|", |manual, \d', meaning)
+
+
+@pytest.mark.parametrize("code", sorted(codes()))
+def test_a_page_refers_to_pages_that_exist(code):
+    referred = re.findall(r"page `(\w+)`|see `(\w+)`", text_of(code), re.IGNORECASE)
+
+    for name in filter(None, (name for pair in referred for name in pair)):
+        assert page_of(name), name
+
+
+@pytest.mark.parametrize("command", sorted({span for code in codes() for span in commands_of(text_of(code))}))
+def test_every_command_of_the_pages_is_one(command):
+    _, *words = (PLACEHOLDERS.get(word, word) for word in shlex.split(command))
+    group: click.Command = cli
+    context = click.Context(cli)
+    while isinstance(group, click.Group) and words and (found := group.get_command(context, words[0])):
+        group, words = found, words[1:]
+
+    assert group.make_context("ldcnd", words) is not None
+
+
+@pytest.mark.parametrize("code", sorted(WARNINGS))
+def test_the_page_of_a_warning_says_that_nothing_was_stopped(code):
+    done = text_of(code).split("## ")[2]
+
+    assert "went on" in done
+    assert "error_stop" not in done
+
+
+@pytest.mark.parametrize("error", ERROR_CLASSES)
+def test_an_error_reply_leads_to_its_page(error):
+    assert error_reply(error("it failed")).page == f"faults/{error.code}"
+
+
+def test_a_drive_fault_leads_to_the_page_of_what_the_drive_says():
+    assert error_reply(DriveFault("still open", value="stop_input")).page == "faults/stop_input"
+
+
+@pytest.mark.parametrize(
+    ("code", "page"),
+    [("link_lost", "faults/link_lost"), ("alarm_0010", "faults/alarm_0010"), ("alarm_0123", "faults/alarm_unlisted")],
+)
+def test_a_fault_leads_to_its_page(code, page):
+    assert page_of(code) == page
+    assert (FOLDER / f"{page.removeprefix('faults/')}.md").exists()
+
+
+def test_the_published_fault_names_its_page():
+    tracker = AxisTracker("x", "mm")
+    tracker.link = type(tracker.link).UP
+
+    tracker.disconnected(now_ns=1)
+
+    assert [fault.page for fault in tracker.active_faults] == ["faults/link_lost"]
+
+
+def test_a_code_without_a_page_has_none():
+    assert page_of("../errors") is None
+    assert page_text("nonsense") is None
+
+
+def test_the_command_line_shows_a_page_and_lists_all():
+    runner = CliRunner()
+
+    assert runner.invoke(cli, ["fault", "stop_input"]).output == text_of("stop_input")
+    assert runner.invoke(cli, ["fault"]).output.split() == sorted(codes())
+    refused = runner.invoke(cli, ["fault", "nonsense"])
+    assert refused.exit_code == 2
+    assert "nonsense" in refused.output
