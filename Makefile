@@ -1,9 +1,9 @@
-# Two commands matter: `make run` (the daemon on the simulated rig) and `make test` (everything CI runs).
+# Two commands matter: `make run` (the daemon on the simulated rig) and `make test` (every check and every test).
 PY := .venv/bin/python
 CONFIG ?= config/simulated.toml
 PYTHON ?= python3
 
-.PHONY: run test check fix soak bench clean
+.PHONY: run test check fix docs soak bench clean
 
 run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
@@ -24,6 +24,11 @@ fix: .venv/ready
 	.venv/bin/ldcnd schema write
 	.venv/bin/ldcnd schema configuration
 
+# the site in build/docs, warnings as errors, and its tutorials followed; apart from `make test`, whose time it would eat up
+docs: .venv/docs-ready
+	.venv/bin/sphinx-build -W --keep-going -q -b html -d build/doctrees docs build/docs
+	$(PY) -m pytest tests/integration/test_pages.py -m pages
+
 # properties on cases that were never tried, for as long as an hour
 soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
@@ -35,6 +40,10 @@ bench: .venv/ready
 	$(PYTHON) -m venv .venv
 	.venv/bin/pip install --quiet --disable-pip-version-check uv
 	.venv/bin/uv pip install --quiet --python $(PY) -c constraints.txt -e '.[test]'
+	@touch $@
+
+.venv/docs-ready: .venv/ready
+	.venv/bin/uv pip install --quiet --python $(PY) -c constraints.txt -e '.[test,docs]'
 	@touch $@
 
 clean:

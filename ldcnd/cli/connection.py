@@ -99,7 +99,13 @@ def _target_options(command: CommandT) -> CommandT:
         click.option("--rig", help="Which rig, when several can be reached."),
         click.option("--config", type=click.Path(path_type=Path), help="Zenoh configuration file to start from."),
         click.option("--listen", "-l", multiple=True, help="Zenoh endpoint to listen on; may be repeated."),
-        click.option("--connect", "-e", multiple=True, help=f"Zenoh endpoint of the daemon [{DEFAULT_ENDPOINT}]."),
+        click.option(
+            "--connect",
+            "-e",
+            multiple=True,
+            envvar="LDCND_CONNECT",
+            help=f"Zenoh endpoint of the daemon [$LDCND_CONNECT, or {DEFAULT_ENDPOINT}].",
+        ),
     ):
         command = option(command)
     return command

@@ -1,9 +1,7 @@
 """Every code that an operator can meet has a page, and what the page says can be done."""
 
 import re
-import shlex
 
-import click
 import pytest
 from click.testing import CliRunner
 
@@ -15,6 +13,7 @@ from ldcnd.drivers.smartstep.alarms import ALARMS, AlarmKind
 from ldcnd.errors import DriveFault, ErrorCode, LdcndError
 from ldcnd.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
 from ldcnd.messaging.codec import error_reply
+from tests.support.pages import command_lines, require_command_line
 
 DAEMON_FAULTS = {LINK_LOST.code, LOOP_OPENED.code}
 ALARM_CODES = {f"alarm_{known.code:04x}" for known in ALARMS if known.kind is not AlarmKind.NONE} | {UNLISTED_ALARM}
@@ -27,7 +26,7 @@ HEADINGS = [
     "## Never",
 ]
 MANUALS = ("LS-182AP manual", "PIC-SERVO manual", "serial communications manual")
-PLACEHOLDERS = {"FILE": "pyproject.toml", "CONFIG": "config/simulated.toml", "NAME": "line0", "VALUE": "1"}
+PLACEHOLDERS = {"VALUE": "1"}
 ERROR_CLASSES = [
     member
     for member in vars(errors).values()
@@ -85,13 +84,9 @@ def test_a_page_refers_to_pages_that_exist(code):
 
 @pytest.mark.parametrize("command", sorted({span for code in codes() for span in commands_of(text_of(code))}))
 def test_every_command_of_the_pages_is_one(command):
-    _, *words = (PLACEHOLDERS.get(word, word) for word in shlex.split(command))
-    group: click.Command = cli
-    context = click.Context(cli)
-    while isinstance(group, click.Group) and words and (found := group.get_command(context, words[0])):
-        group, words = found, words[1:]
+    (words,) = command_lines(command)
 
-    assert group.make_context("ldcnd", words) is not None
+    require_command_line([PLACEHOLDERS.get(word, word) for word in words])
 
 
 @pytest.mark.parametrize("code", sorted(WARNINGS))

@@ -1,0 +1,113 @@
+"""The commands of the pages work; those that no test can run are few, and say why."""
+
+import json
+import re
+import tomllib
+
+import pytest
+
+from tests.support.page_reader import PageReader
+from tests.support.pages import ROOT, Block, blocks_of, command_lines, pages, require_command_line
+
+FIRST_RIG = "docs/tutorials/first-rig.md"
+NEXT = (
+    "docs/tutorials/move-from-python.md",
+    "docs/tutorials/take-a-trace.md",
+    "docs/tutorials/record-and-export.md",
+)
+BY_THEMSELVES = ("docs/how-to/simulate-a-line.md", "docs/how-to/secure-a-rig.md")
+FOLLOWED = {FIRST_RIG, *NEXT, *BY_THEMSELVES}
+"""Pages whose blocks are run here, all of them but those in `NOT_RUN`."""
+ELSEWHERE = {
+    "deploy/INSTALL.md": "test_every_command_of_the_guide_works",
+    "docs/how-to/take-a-trace.md": "test_a_move_is_traced_to_a_file_shown_and_drawn",
+}
+"""Pages whose commands another test runs."""
+NOT_RUN = {
+    ("README.md", "make run    # makes the environment, then runs the daemon on the simulated rig"): "CI does it",
+    ("README.md", ".venv/bin/ldcnd axis list"): "test_the_tour_of_the_readme_runs",
+    ("README.md", ".venv/bin/python examples/move_and_watch.py"): (
+        "test_the_example_follows_a_moving_axis_to_its_target"
+    ),
+    (FIRST_RIG, "python3 -m venv ldcnd-env"): "fetches packages",
+    ("docs/how-to/secure-a-rig.md", "ldcnd axis move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (
+        "needs the socket of the service"
+    ),
+    ("docs/how-to/secure-a-rig.md", "ldcnd axis list --config wall_display.json5   # lists"): (
+        "needs the machines of a site; tests/integration/test_security_lan.py has one"
+    ),
+}
+"""Blocks that are not run from the page, each by its first line, with the reason or the test that does it."""
+BLOCKS = [block for page in pages() for block in blocks_of(page)]
+RUNNABLE = [block for block in BLOCKS if block.language in ("sh", "console", "python")]
+
+
+@pytest.mark.parametrize("block", RUNNABLE, ids=str)
+def test_every_block_is_run_or_says_why_not(block: Block) -> None:
+    assert block.page in FOLLOWED or block.page in ELSEWHERE or (block.page, block.first_line) in NOT_RUN, (
+        "add the page to FOLLOWED, or the block with its reason to NOT_RUN"
+    )
+
+
+def test_no_exception_outlives_its_block() -> None:
+    known = {(block.page, block.first_line) for block in RUNNABLE}
+
+    assert set(NOT_RUN) <= known
+    assert FOLLOWED | set(ELSEWHERE) <= {block.page for block in BLOCKS}
+
+
+def test_every_test_that_runs_a_block_exists() -> None:
+    sources = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    named = [*ELSEWHERE.values(), *(reason for reason in NOT_RUN.values() if reason.startswith("test_"))]
+
+    assert [name for name in named if f"def {name}(" not in sources] == []
+
+
+@pytest.mark.parametrize("block", [block for block in RUNNABLE if block.language != "python"], ids=str)
+def test_every_command_line_is_one(block: Block) -> None:
+    for words in command_lines(block.text):
+        require_command_line(words)
+
+
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.language in ("toml", "json")], ids=str)
+def test_every_file_is_well_formed(block: Block) -> None:
+    assert (tomllib if block.language == "toml" else json).loads(block.text)
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page) -> None:
+    text = re.sub(r"(?ms)^```.*?^```$|`[^`]*`", "", page.read_text())
+
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        place, _, _ = target.partition("#")
+        if place and "://" not in place and place != "../how-to/install.md":  # a copy of deploy/INSTALL.md
+            assert (page.parent / place).exists(), target
+
+
+@pytest.mark.pages
+@pytest.mark.real_time
+@pytest.mark.timeout(300)
+async def test_the_tutorials_can_be_followed(tmp_path) -> None:
+    async with PageReader(tmp_path) as reader:
+        await reader.follow(ROOT / FIRST_RIG, NOT_RUN)
+        assert "not referenced" in reader.printed
+        assert "a stop was asked for" in reader.printed
+
+    async with PageReader(tmp_path) as reader:
+        await reader.start_daemon("rig.toml")
+        for page in NEXT:
+            await reader.follow(ROOT / page, NOT_RUN)
+
+    assert "there: standstill" in reader.printed
+    assert "nearest: 100.0" in reader.printed
+    assert "killed" in reader.printed
+    assert (tmp_path / "move.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "run.csv").read_text().count("\n") > 100
+
+
+@pytest.mark.real_time
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("page", BY_THEMSELVES)
+async def test_a_how_to_can_be_followed(page: str, tmp_path) -> None:
+    async with PageReader(tmp_path) as reader:
+        await reader.follow(ROOT / page, NOT_RUN)
