@@ -5,6 +5,7 @@ from typing import Any, TypeVar
 
 from ldcnd.bus.exchange_queue import ExchangeQueue, Lane
 from ldcnd.bus.line import Line, Phase
+from ldcnd.bus.mute_nodes import MuteNodes
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
@@ -20,9 +21,6 @@ ReplyT = TypeVar("ReplyT")
 
 log = get_logger("bus")
 
-MISSES_BEFORE_BACKOFF = 3
-FIRST_BACKOFF_S = 0.05
-LONGEST_BACKOFF_S = 1.0
 FIRST_REOPEN_S = 0.1
 LONGEST_REOPEN_S = 2.0
 LONGEST_OPENING_S = 10.0
@@ -41,7 +39,7 @@ class Bus:
         self._loop = asyncio.get_running_loop()
         self._queue: ExchangeQueue[Job] = ExchangeQueue()
         self._pollers: set[Poller[Any]] = set()  # also those whose poll is on the wire
-        self._misses: dict[int, int] = {}
+        self._mute = MuteNodes()
         self._line: Line | None = None  # None while the port is not open
         self._opened = asyncio.Event()
         self._closed = asyncio.Event()
@@ -64,7 +62,7 @@ class Bus:
             PacketRejected: the node refused our packet as damaged at every attempt; it was not executed.
             BadReply: the reply was intact but makes no sense.
         """
-        return await self._submit(exchange, lane, then_baud=None)
+        return await self._submit(exchange, lane)
 
     async def change_baud(self, exchange: Exchange[ReplyT], baud: int) -> ReplyT:
         """Run the exchange that tells the nodes to change their rate, then change ours before anything else is sent.
@@ -72,12 +70,19 @@ class Bus:
         Raises:
             As `execute`; NotSupported when the transport cannot change its rate.
         """
-        if self.fixed_baud:
-            raise NotSupported(
-                f"bus {self.settings.name}: the port cannot change its rate",
-                remedy="configure the rate the far end uses",
-            )
+        self._require_changeable()
         return await self._submit(exchange, Lane.COMMAND, then_baud=baud)
+
+    async def execute_at(self, baud: int, exchange: Exchange[ReplyT]) -> ReplyT:
+        """Run one command exchange at another rate than the line's, which it has back before anything else is sent.
+
+        For a node that may be at that rate; to the others it is noise.
+
+        Raises:
+            As `execute`; NotSupported when the transport cannot change its rate.
+        """
+        self._require_changeable()
+        return await self._submit(exchange, Lane.COMMAND, at_baud=baud)
 
     def add_poller(self, poller: Poller[Any]) -> None:
         """Let a poller take part from its `due_at_s` on; adding it again only moves its turn.
@@ -149,18 +154,35 @@ class Bus:
 
     def misses(self, node: int) -> int:
         """Return how many exchanges in a row this node has left unanswered."""
-        return self._misses.get(node, 0)
+        return self._mute.misses(node)
 
     def longest_s(self, exchange: Exchange[Any]) -> float:
         """Return how long an exchange occupies the line at most when nothing is lost, in seconds."""
         byte_s = self.settings.bits_per_byte / self.baud
         return (len(exchange.request) + exchange.reply_bytes) * byte_s + exchange.response_s
 
-    async def _submit(self, exchange: Exchange[ReplyT], lane: Lane, then_baud: int | None) -> ReplyT:
+    def _require_changeable(self) -> None:
+        if self.fixed_baud:
+            raise NotSupported(
+                f"bus {self.settings.name}: the port cannot change its rate",
+                remedy="configure the rate the far end uses",
+            )
+
+    @property
+    def fence_s(self) -> float:
+        """What it takes to get back in step after a reply was lost, in seconds."""
+        probe = self.resync.probe(self._mute.failing())
+        flush_s = len(self.resync.flush) * self.settings.bits_per_byte / self.baud
+        return self.resync.quiet_s + flush_s + self.resync.settle_s + (self.longest_s(probe) if probe else 0.0)
+
+    async def _submit(
+        self, exchange: Exchange[ReplyT], lane: Lane, *, then_baud: int | None = None, at_baud: int | None = None
+    ) -> ReplyT:
         if self._line is None:
             raise self._down()
         future: asyncio.Future[ReplyT] = self._loop.create_future()
-        job = Job(exchange, lane, self._loop.time(), future, attempts=self.settings.attempts, then_baud=then_baud)
+        job = Job(exchange, lane, self._loop.time(), future, attempts=self.settings.attempts)
+        job.then_baud, job.at_baud = then_baud, at_baud
         self._queue.push(job, lane)
         self._kick()
         return await future
@@ -201,7 +223,7 @@ class Bus:
         """Serve the line until it is lost or the caller is cancelled; then every caller has its outcome."""
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
-        self._misses.clear()
+        self._mute.forget()
         self._line = line = Line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
         self._closed.clear()
         self._opened.set()
@@ -235,21 +257,24 @@ class Bus:
 
     def failing(self) -> set[int]:
         """See `Users`."""
-        return set(self._misses)
+        return self._mute.failing()
 
     def answered(self, turn: Turn) -> None:
         """See `Users`."""
-        if self._misses and turn.exchange.reply_bytes:
-            self._misses.pop(turn.exchange.node, None)
+        if turn.exchange.reply_bytes and (also := self._mute.answered(turn.exchange.node)) is not None:
+            for poller in self._pollers:
+                if poller.node == also:
+                    self._queue.schedule(poller, poller.due_at_s)
         if isinstance(turn, PollTurn):
             self._schedule(turn.poller, turn.poller.due_at_s)
 
     def missed(self, turn: Turn, now_s: float) -> None:
         """See `Users`."""
         node = turn.exchange.node
-        misses = self._misses[node] = self._misses.get(node, 0) + 1
+        self._mute.missed(node)
         if isinstance(turn, PollTurn):
-            self._schedule(turn.poller, max(turn.poller.due_at_s, now_s + _backoff_s(misses)))
+            pause_s = self._mute.pause_s(node, self.longest_s(turn.exchange) + self.settings.margin_s + self.fence_s)
+            self._schedule(turn.poller, max(turn.poller.due_at_s, now_s + pause_s))
 
     def _schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Give a poller its next turn, unless it was removed while its poll was on the wire."""
@@ -271,10 +296,3 @@ class Bus:
         self._pollers.clear()
         for waiting in self._queue.drain():
             waiting.fail(BusDown(f"bus {self.settings.name} was lost ({reason}) before the exchange was complete"))
-
-
-def _backoff_s(misses: int) -> float:
-    """How long a node that missed so many exchanges in a row is left alone."""
-    if misses < MISSES_BEFORE_BACKOFF:
-        return 0.0
-    return min(LONGEST_BACKOFF_S, FIRST_BACKOFF_S * 2.0 ** min(10, misses - MISSES_BEFORE_BACKOFF))

@@ -159,7 +159,9 @@ class Line:
                 why = "came with surplus bytes" if data else "came too early" if early else "is damaged"
                 self._distrust(turn, reply + data, why)
             elif not exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
-                self._keep(reply, now_s, until_s)
+                # not believed before no other reply can come
+                self.phase, self._kept = Phase.LINGER, (reply, now_s)
+                self._watchdog.set(until_s)
             else:
                 self._settle(turn, reply, now_s)
             return
@@ -171,12 +173,6 @@ class Line:
         exchange = turn.exchange
         wire_s = (len(exchange.request) + exchange.reply_bytes) * self._byte_s
         return self._sent_at_s + wire_s + exchange.response_s + LINGER_S
-
-    def _keep(self, reply: bytes, now_s: float, until_s: float) -> None:
-        """Do not believe the reply to a packet that must not be repeated before no other reply can come."""
-        self.phase = Phase.LINGER
-        self._kept = (reply, now_s)
-        self._watchdog.set(until_s)
 
     def _settle(self, turn: Turn, reply: bytes, now_s: float) -> None:
         if turn.exchange.check(reply) is ReplyVerdict.REJECTED:
@@ -203,21 +199,21 @@ class Line:
         turn.completed(reply, timing)
 
     def _release(self, turn: Turn) -> None:
-        self._turn = None
-        self.phase = Phase.IDLE
-        if turn.then_baud:
-            self._switch_baud(turn.then_baud)
+        self._turn, self.phase = None, Phase.IDLE
+        if turn.then_baud or turn.at_baud:
+            self._tune(turn.then_baud or self.baud)
 
     def _rejected(self, turn: Turn, reply: bytes) -> None:
         """The node did not execute our packet: the line is in step, and sending again is always safe."""
         self._note(WireEvent.RECEIVED, reply, "packet rejected")
         self._statistics.rejected_packets += 1
         self._users.answered(turn)
-        self._turn = None
-        self.phase = Phase.IDLE
+        self._turn, self.phase = None, Phase.IDLE
         if turn.rejected():
             self._statistics.resent += 1
             self._users.again(turn)
+        if turn.at_baud:
+            self._tune(self.baud)
         self._next()
 
     # -- losses ------------------------------------------------------------------------------------------------------
@@ -229,8 +225,7 @@ class Line:
 
     def _lose(self, turn: Turn, error: BusError) -> None:
         """Settle the turn whose reply will never be trusted, and fence the line."""
-        now_s = self._loop.time()
-        self._turn = None
+        now_s, self._turn = self._loop.time(), None
         self._buffer.clear()
         self._users.missed(turn, now_s)
         if not isinstance(turn, Probe):
@@ -239,6 +234,8 @@ class Line:
         if turn.lost(error):
             self._statistics.resent += 1
             self._users.again(turn)
+        if turn.at_baud:
+            self._tune(self.baud)
         self._fence(now_s)
 
     def _stray(self, data: bytes, now_s: float) -> None:
@@ -254,6 +251,8 @@ class Line:
             self._fence(now_s)
 
     def _fence(self, now_s: float) -> None:
+        if self.phase is Phase.CLOSED:
+            return
         self._statistics.resynchronisations += 1
         self._note(WireEvent.RESYNC)
         self.phase = Phase.FENCE
@@ -310,9 +309,12 @@ class Line:
     def _send(self, turn: Turn, now_s: float) -> None:
         exchange = turn.exchange
         settings = self._settings
-        request_s = len(exchange.request) * self._byte_s
-        reply_s = exchange.reply_bytes * self._byte_s
         self._turn = turn
+        if turn.at_baud:
+            self._tune(turn.at_baud, for_good=False)
+            if self.phase is Phase.CLOSED:
+                return
+        request_s, reply_s = len(exchange.request) * self._byte_s, exchange.reply_bytes * self._byte_s
         self._sent_at_s = now_s
         self._request_over_s = now_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
         self._buffered_early = False
@@ -349,15 +351,16 @@ class Line:
             self._stray(data, self._loop.time())
         return b""
 
-    def _switch_baud(self, baud: int) -> None:
+    def _tune(self, baud: int, *, for_good: bool = True) -> None:
         try:
             self._transport.set_baud(baud)
         except TransportLost as error:
             self.transport_lost(error.message)
             return
         self._note(WireEvent.BAUD, note=str(baud))
-        self.baud = baud
         self._byte_s = self._settings.bits_per_byte / baud
+        if for_good:
+            self.baud = baud
 
     # -- time --------------------------------------------------------------------------------------------------------
 

@@ -17,16 +17,18 @@ class Turn(ABC):
         exchange: what is sent.
         lane: where it waited.
         wanted_at_s: since when, in loop time.
-        then_baud: the rate to use from the end of this exchange on.
+        then_baud: the rate to use from the end of this exchange on; None for the present one.
+        at_baud: the rate of this exchange alone; None for the line's.
     """
 
-    __slots__ = ("exchange", "lane", "then_baud", "wanted_at_s")
+    __slots__ = ("at_baud", "exchange", "lane", "then_baud", "wanted_at_s")
 
-    def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float, then_baud: int | None = None) -> None:
+    def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float) -> None:
         self.exchange = exchange
         self.lane = lane
         self.wanted_at_s = wanted_at_s
-        self.then_baud = then_baud
+        self.then_baud: int | None = None
+        self.at_baud: int | None = None
 
     @abstractmethod
     def completed(self, reply: bytes, timing: Timing) -> None:
@@ -83,9 +85,8 @@ class Job(Turn):
         future: "asyncio.Future[Any]",
         *,
         attempts: int,
-        then_baud: int | None = None,
     ) -> None:
-        super().__init__(exchange, lane, wanted_at_s, then_baud)
+        super().__init__(exchange, lane, wanted_at_s)
         self.future = future
         self.attempts = attempts
         self.attempts_left = attempts

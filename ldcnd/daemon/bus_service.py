@@ -21,10 +21,12 @@ log = get_logger("bus")
 
 FIRST_RETRY_S = 0.5
 LONGEST_RETRY_S = 10.0
-LOOK_PERIOD_S = 0.25
+FIRST_LOOK_S = 0.25
+LONGEST_LOOK_S = 2.0
+"""Longest pause between two looks for drives that have gone: what powers up must be back within 3 s."""
+LOOK_SHARE = 0.01
+"""Of the line's time, for these looks; more where the longest pause is too short for that."""
 NO_DEMANDS: Mapping[str, Demand] = MappingProxyType({})
-LONGEST_LOOK_S = 1.0
-"""Pause between two searches for drives that have gone: what powers up must be back within 3 s."""
 
 
 class BusService:
@@ -130,21 +132,24 @@ class BusService:
 
     async def _look_after(self) -> None:
         """Look for drives that have lost power and came back; return when the line is lost."""
-        pause_s = LOOK_PERIOD_S
+        pause_s = FIRST_LOOK_S
+        loop = asyncio.get_running_loop()
         while not await self._closed_within(pause_s):
+            pause_s = FIRST_LOOK_S
             if not self.network.incomplete():
-                pause_s = LOOK_PERIOD_S
                 continue
+            began_s = loop.time()
             heard: frozenset[str] = frozenset()
             try:
                 heard = await self.network.rejoin(self._restarted)
             except LdcndError as error:
                 log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
-            now_s = asyncio.get_running_loop().time()
+            now_s = loop.time()
             for axis in self.axes:
                 if axis.config.name in heard:
                     self._poll(axis, now_s)
-            pause_s = LOOK_PERIOD_S if heard else min(2 * pause_s, LONGEST_LOOK_S)
+            if not heard:
+                pause_s = min((now_s - began_s + self.bus.fence_s) / LOOK_SHARE, LONGEST_LOOK_S)
 
     async def _closed_within(self, pause_s: float) -> bool:
         try:

@@ -25,10 +25,8 @@ MARGIN_S = 0.005
 class RecordingTurn(Turn):
     """A turn that notes in its users' story what it hears."""
 
-    def __init__(
-        self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND, then_baud: int | None = None
-    ):
-        super().__init__(exchange, lane, 0.0, then_baud)
+    def __init__(self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND):
+        super().__init__(exchange, lane, 0.0)
         self.story = story
         self.send_again = False
         self.timing: Timing | None = None
@@ -106,15 +104,17 @@ class Bench:
         self,
         number: int,
         lane: Lane = Lane.COMMAND,
-        then_baud: int | None = None,
         *,
+        then_baud: int | None = None,
+        at_baud: int | None = None,
         reply_bytes: int = toy.REPLY_BYTES,
         response_s: float = toy.RESPONSE_S,
         repeatable: bool = True,
     ) -> RecordingTurn:
         """Queue an exchange of that number."""
         exchange = toy.exchange(number, reply_bytes=reply_bytes, response_s=response_s, repeatable=repeatable)
-        turn = RecordingTurn(exchange, self.users.story, lane, then_baud)
+        turn = RecordingTurn(exchange, self.users.story, lane)
+        turn.then_baud, turn.at_baud = then_baud, at_baud
         self.users.waiting.append(turn)
         self.line.kick()
         return turn

@@ -185,6 +185,64 @@ async def test_a_lost_reply_changes_no_rate():
     assert bench.line.baud == 115_200
 
 
+async def test_an_exchange_at_another_rate_leaves_the_line_at_its_own():
+    bench = Bench()
+
+    bench.add(1, at_baud=19_200)
+    bench.add(2)
+    await settle()
+
+    assert bench.wire.history == [
+        "baud 19200",
+        f"write {toy.request(1, 1).hex()}",
+        "baud 115200",
+        f"write {toy.request(1, 2).hex()}",
+    ]
+    assert bench.sent(2) == pytest.approx([6 * (REQUEST_S + REPLY_S) + 0.0001])
+    assert bench.story == ["completed 1", "completed 2"]
+
+
+async def test_the_fence_of_an_exchange_at_another_rate_is_at_the_lines_own():
+    bench = Bench()
+    bench.replies({1: []})
+
+    bench.add(1, at_baud=19_200)
+    bench.add(2)
+    await settle()
+
+    assert bench.wire.history[:4] == [
+        "baud 19200",
+        f"write {toy.request(1, 1).hex()}",
+        "baud 115200",
+        f"write {toy.FLUSH.hex()}",
+    ]
+    assert bench.story == ["lost 1", "completed 2"]
+    assert bench.line.baud == 115_200
+
+
+async def test_a_port_that_is_lost_on_its_way_to_another_rate_loses_the_turn():
+    bench = Bench()
+    bench.wire.set_baud = lambda _baud: bench.wire.write(b"")  # type: ignore[method-assign]
+    bench.wire.fails_to_write = True
+
+    bench.add(1, at_baud=19_200)
+
+    assert bench.story == ["lost 1", "line lost: the port is gone"]
+
+
+async def test_a_port_that_is_lost_on_its_way_back_is_one_loss():
+    bench = Bench()
+    bench.replies({1: []})
+    bench.add(1, at_baud=19_200)
+    bench.wire.set_baud = lambda _baud: bench.wire.write(b"")  # type: ignore[method-assign]
+    bench.wire.fails_to_write = True
+
+    await settle()
+
+    assert bench.story == ["lost 1", "line lost: the port is gone"]
+    assert bench.line.phase is Phase.CLOSED
+
+
 async def test_a_lost_port_ends_the_turn_then_the_line_once():
     bench = Bench()
 

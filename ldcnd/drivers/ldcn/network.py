@@ -58,7 +58,7 @@ class LdcnNetwork(Network):
         )
         self._addressing = Addressing(bus, self._rate, plan)
         self._adoption = Adoption(bus, self._rate, self._expected)
-        self._rejoin = Rejoin(bus, self._rate, self._addressing)
+        self._rejoin = Rejoin(bus, self._rate, self._addressing, self._expected)
         drives = {drive.spec.name: drive for drive in self._drives.values()}
         self._groups = Groups(bus, plan, self._addressing, drives, snapshots=line.snapshot)
         self.axes: Mapping[str, AxisDriver] = drives
@@ -204,7 +204,7 @@ class LdcnNetwork(Network):
         return any(self._bus.misses(each.address) >= MISSES_UNTIL_MUTE for each in self._expected)
 
     async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:
-        """See `Network`: one round of `Rejoin`."""
+        """See `Network`: one look of `Rejoin`."""
 
         def addressing(address: int) -> None:
             if address in self._drives:
@@ -212,7 +212,7 @@ class LdcnNetwork(Network):
                 restarted(self._names[address])
 
         silent = tuple(each for each in self._expected if self._bus.misses(each.address))
-        heard = await self._rejoin.round(silent, addressing)
+        heard = await self._rejoin.look(silent, addressing)
         return frozenset(self._names[address] for address in heard if address in self._names)
 
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
