@@ -29,9 +29,10 @@ docs: .venv/docs-ready
 	.venv/bin/sphinx-build -W --keep-going -q -b html -d build/doctrees docs build/docs
 	$(PY) -m pytest tests/integration/test_pages.py -m pages
 
-# properties on cases that were never tried, for as long as an hour
+# properties on cases that were never tried, for as long as an hour, and what takes minutes
 soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
+	$(PY) -m pytest -m soak -n 2 --timeout 3600
 
 bench: .venv/ready
 	$(PY) -m tests.bench

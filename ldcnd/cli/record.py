@@ -4,70 +4,89 @@ import asyncio
 import signal
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TextIO
 
 import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
-from ldcnd.model.frozen import Frozen
 
 FILE = click.Path(path_type=Path, dir_okay=False)
+EXISTING_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+EXIT_INCOMPLETE = 1
 
 
 @click.group(invoke_without_command=True)
 @click.option("--out", "-o", type=FILE, help="The file to write, NAME.mcap.")
-@click.option("--rotate-mb", type=click.IntRange(1), default=1000, show_default=True, help="Begin a new file then.")
+@click.option("--rotate-mb", type=click.IntRange(1), default=250, show_default=True, help="Begin a new file then.")
 @with_target
 def command(target: Target, out: Path | None, rotate_mb: int) -> None:
-    """Record everything that a rig publishes until SIGTERM or SIGINT."""
+    """Record everything that a rig publishes until SIGTERM or SIGINT; a killed recorder loses one second at most."""
     if click.get_current_context().invoked_subcommand:
         return
     if out is None:
         raise click.UsageError("--out is missing")
-    target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
+    _require_mcap()
+    try:
+        target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
+    except OSError as error:
+        raise click.ClickException(f"{error.filename or out}: cannot be written: {error.strerror}") from error
 
 
 @command.command("recover")
-@click.argument("damaged", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.argument("damaged", type=EXISTING_FILE)
 @click.argument("whole", type=FILE)
 def recover_file(damaged: Path, whole: Path) -> None:
     """Copy what can be read of DAMAGED, such as NAME.mcap.part after a power cut, into WHOLE."""
     _require_mcap()
-    from ldcnd.recording.mcap_file import recover  # noqa: PLC0415 - needs an optional package
+    from ldcnd.recording.recovery import recover  # noqa: PLC0415 - needs an optional package
 
-    click.echo(f"{recover(damaged, whole)} messages recovered")
+    saved = recover(damaged, whole)
+    _tell_damages(damaged, [str(damage) for damage in saved.damages])
+    until = f", the last of {_utc(saved.last_ns)}" if saved.messages else ""
+    click.echo(f"{saved.messages} messages recovered{until}; {saved.losses.missing.total()} missing in between")
 
 
 @command.command("export")
-@click.argument("recording", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@click.option("--csv", "table", type=click.File("w", encoding="utf-8"), default=sys.stdout, help="Table to write.")
-def export(recording: Path, table: TextIO) -> None:
-    """Write RECORDING as a table: one row for each value of each message."""
+@click.argument("recording", type=EXISTING_FILE)
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+def export(recording: Path, folder: Path) -> None:
+    """Write RECORDING into FOLDER as CSV: a table for each topic, a row for each message, a column for each value."""
     _require_mcap()
-    from ldcnd.recording.mcap_file import export_csv  # noqa: PLC0415 - needs an optional package
+    from ldcnd.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
 
-    export_csv(recording, table)
+    done = export_tables(recording, folder)
+    click.echo(f"{done.rows} messages in {len(done.tables)} tables in {folder}")
+    if done.damages:
+        _tell_damages(recording, [str(damage) for damage in done.damages])
+        sys.exit(EXIT_INCOMPLETE)
 
 
 async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
-    _require_mcap()
-    from ldcnd.recording.recorder import Recorder  # noqa: PLC0415 - needs an optional package
+    from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder  # noqa: PLC0415 - needs an optional package
 
-    descriptions: dict[str, Frozen] = {"daemon": await client.daemon()}
-    descriptions |= {f"axis_{axis.axis}": axis for axis in await client.axes()}
-    descriptions |= {f"bus_{bus.bus}": bus for bus in await client.buses()}
-    ending = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, ending.set)
+    descriptions = await client.descriptions()
     with Recorder(out, descriptions, time.time_ns, rotate_bytes) as recorder:
-        async with client.published(recorder.take):
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, recorder.end)
+        async with client.published(recorder.take, KEPT_SAMPLES) as gave_way:
             click.echo(f"recording rig {client.rig} to {out}", err=True)
-            await ending.wait()
-    click.echo(f"{recorder.messages} messages", err=True)
+            try:
+                await recorder.run(gave_way)
+            finally:
+                click.echo(recorder.summary, err=True)
+
+
+def _tell_damages(path: Path, damages: list[str]) -> None:
+    for damage in damages:
+        click.echo(f"{path}, {damage}", err=True)
+
+
+def _utc(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds")
 
 
 def _require_mcap() -> None:

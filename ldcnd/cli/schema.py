@@ -6,9 +6,8 @@ import click
 
 from ldcnd.config_reference import config_reference
 from ldcnd.daemon.asyncapi import asyncapi_text
-from ldcnd.daemon.contract import as_markdown
+from ldcnd.daemon.contract import all_schemas, as_markdown
 from ldcnd.errors import ConfigError
-from ldcnd.model.schemas import all_schemas
 
 
 @click.group()

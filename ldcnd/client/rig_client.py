@@ -9,7 +9,7 @@ from typing import TypeVar
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
-from ldcnd.messaging.session import Answer, Sample, SampleKind, Session
+from ldcnd.messaging.session import UNDELIVERED_SAMPLES, Answer, Declaration, Sample, SampleKind, Session
 from ldcnd.model.axes import AxisInfo, LinkState
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
@@ -94,6 +94,17 @@ class RigClient:
     async def buses(self) -> list[BusInfo]:
         """Return all lines."""
         return [self._decoded(answer, BusInfo) for answer in await self._session.query(self._keys.bus_pattern)]
+
+    async def descriptions(self) -> dict[str, bytes]:
+        """Return all that describes the rig, as JSON, by what follows `meta/` in its key; schemas are left out."""
+        found: dict[str, bytes] = {}
+        for pattern in self._keys.description_patterns:
+            for answer in await self._session.query(pattern):
+                if answer.is_error:
+                    raise decode_error(answer.payload, answer.encoding)
+                if answer.key != self._keys.health:
+                    found[answer.key.partition("/meta/")[2]] = answer.payload
+        return found
 
     async def last(self, axis: str, item: TelemetryItem) -> Measurement | None:
         """Return the last value of an item, or None when there is none yet."""
@@ -222,13 +233,22 @@ class RigClient:
             await declaration.close()
 
     @asynccontextmanager
-    async def published(self, take: Callable[[Sample], None]) -> AsyncIterator[None]:
-        """Hand all telemetry, events and health reports to `take`, as they come, for the time of the context."""
+    async def published(
+        self, take: Callable[[Sample], None], kept: int = UNDELIVERED_SAMPLES
+    ) -> AsyncIterator[Callable[[], int]]:
+        """Hand all telemetry, events and health reports to `take`, as they come, for the time of the context.
+
+        Args:
+            take: takes what was published.
+            kept: so many samples of a kind may wait for it; yields a function that returns how many more gave way.
+        """
         async with AsyncExitStack() as declared:
+            declarations: list[Declaration] = []
             for key in (self._keys.all_telemetry, f"{self._keys.health}/**"):
-                declaration = await self._session.subscribe(key, take)
+                declaration = await self._session.subscribe(key, take, kept)
                 declared.push_async_callback(declaration.close)
-            yield
+                declarations.append(declaration)
+            yield lambda: sum(declaration.lost for declaration in declarations)
 
     @asynccontextmanager
     async def health(self, take: Callable[[DaemonHealth | BusHealth], None]) -> AsyncIterator[None]:

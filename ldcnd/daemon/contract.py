@@ -4,10 +4,13 @@ Derived from the same keys, models and verbs that the daemon runs on; `docs/refe
 are made from it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
+from types import MappingProxyType
 
+from ldcnd.config import RigConfig
 from ldcnd.messaging.keys import EVENT, RIG_ITSELF, Keys
 from ldcnd.model.axes import AxisInfo
 from ldcnd.model.events import CommandEvent
@@ -19,7 +22,7 @@ from ldcnd.model.plan import RigPlan
 from ldcnd.model.replies import CommandReply, StopReply
 from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
 from ldcnd.model.samples import SAMPLE_MODELS
-from ldcnd.model.schemas import schema_name
+from ldcnd.model.schemas import PUBLIC_MODELS, schema_name, schema_text
 from ldcnd.model.traces import TraceChunk, TraceHeader
 from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
@@ -96,6 +99,7 @@ def _descriptions() -> Iterator[Channel]:
         (_KEYS.daemon, DaemonInfo),
         (_KEYS.commands, CommandList),
         (_KEYS.plan, RigPlan),
+        (_KEYS.configuration, RigConfig),
         (_KEYS.axis(_AXIS), AxisInfo),
         (_KEYS.bus(_BUS), BusInfo),
     ):
@@ -128,6 +132,16 @@ def _channel(key: str, kind: Kind, sent: type[Frozen], taken: type[Frozen] | Non
     name = "_".join("rig" if chunk == RIG_ITSELF else chunk for chunk in chunks)
     doc = (taken or sent).__doc__ or ""
     return Channel(name, key, kind, sent, taken, summary or doc.strip().partition("\n")[0])
+
+
+@cache
+def all_schemas() -> Mapping[str, str]:
+    """Return the schema text of every public model by name, as `schemas/` holds and `meta/schema/<name>` serves it.
+
+    Made once, it takes a tenth of a second.
+    """
+    models: tuple[type[Frozen], ...] = (*PUBLIC_MODELS, RigConfig)
+    return MappingProxyType({schema_name(model): schema_text(model) for model in models})
 
 
 def as_markdown() -> str:

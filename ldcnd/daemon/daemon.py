@@ -59,7 +59,9 @@ class Daemon:
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
         self._health = HealthWatch(rig, self._keys, publisher, clock)
-        self._describing = Describing(rig, self._keys, publisher, self._info, plan_rig(config), self._health)
+        self._describing = Describing(
+            rig, self._keys, publisher, self._info, lambda: self._config, plan_rig(config), self._health
+        )
 
     @property
     def config(self) -> RigConfig:

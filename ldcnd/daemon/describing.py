@@ -7,6 +7,7 @@ from functools import partial
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.bus_service import BusService
+from ldcnd.daemon.contract import all_schemas
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.daemon.rig import Rig
@@ -21,7 +22,7 @@ from ldcnd.model.plan import RigPlan
 from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.schemas import all_schemas, schema_name
+from ldcnd.model.schemas import schema_name
 from ldcnd.model.verb import Verb
 from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
@@ -35,6 +36,7 @@ class Describing:
         keys: Keys,
         publisher: Publisher,
         daemon: Callable[[], DaemonInfo],
+        configuration: Callable[[], Frozen],
         plan: RigPlan,
         health: HealthWatch,
     ) -> None:
@@ -42,6 +44,7 @@ class Describing:
         self._keys = keys
         self._publisher = publisher
         self._daemon = daemon
+        self._configuration = configuration
         self.plan = plan
         self._health = health
         self._schemas: Mapping[str, bytes] = {keys.schema(name): text.encode() for name, text in all_schemas().items()}
@@ -62,6 +65,7 @@ class Describing:
             self._keys.daemon: self._daemon,
             self._keys.commands: command_list,
             self._keys.plan: lambda: self.plan,
+            self._keys.configuration: self._configuration,
         }
         for bus in self._rig.buses:
             models[self._keys.bus(bus.bus.settings.name)] = partial(bus_info, bus)

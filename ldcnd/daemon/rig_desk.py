@@ -12,10 +12,9 @@ from ldcnd.errors import UnknownVerb
 from ldcnd.log import get_logger
 from ldcnd.messaging.codec import decode
 from ldcnd.model import verbs
-from ldcnd.model.authority import AcquireRequest, Holder, HolderList, LeaseReply, LeaseRequest
+from ldcnd.model.authority import AcquireRequest, Holder, HolderList, HoldersRequest, LeaseReply, LeaseRequest
 from ldcnd.model.events import CommandOutcome, EventList, EventsRequest, OutcomeRequest
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.requests import HaltRequest
 from ldcnd.model.wire_log import WireLogReply, WireLogRequest
 
 log = get_logger("authority")
@@ -72,7 +71,7 @@ class RigDesk:
         return _reply(lease)
 
     def _holders(self, payload: bytes, encoding: str) -> HolderList:
-        decode(HaltRequest, payload, encoding)
+        decode(HoldersRequest, payload, encoding)
         holders = [(axis, self._authority.holder(axis)) for axis in self._rig.axes]
         return HolderList(
             required=self._authority.required,

@@ -124,6 +124,16 @@ class Keys:
         return f"{self._root}/meta/plan"
 
     @property
+    def configuration(self) -> str:
+        """What the daemon runs with."""
+        return f"{self._root}/meta/configuration"
+
+    @property
+    def description_patterns(self) -> tuple[str, ...]:
+        """All descriptions but the schemas; the daemon's health is among them, that of its lines is not."""
+        return (f"{self._root}/meta/*", self.axis_pattern, self.bus_pattern)
+
+    @property
     def health(self) -> str:
         """How the daemon is doing; how its lines are is below it."""
         return f"{self._root}/meta/health"

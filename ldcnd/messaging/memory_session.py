@@ -166,17 +166,18 @@ class MemorySession(Session):
         self._broker.queryables.append(queryable)
         return self._declared(undeclare)
 
-    async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
+    async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
         """Take samples."""
         self._must_be_open()
-        subscription = _Subscription(key, HandOver(self._loop, on_sample, UNDELIVERED_SAMPLES))
+        samples = HandOver(self._loop, on_sample, kept)
+        subscription = _Subscription(key, samples)
 
         def undeclare() -> None:
             self._broker.remove(subscription)
-            subscription.samples.close()
+            samples.close()
 
         self._broker.add(subscription)
-        return self._declared(undeclare)
+        return self._declared(undeclare, lambda: samples.lost)
 
     async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
         """Learn whether anybody subscribes; this session's own subscriptions count as well, as with Zenoh."""
@@ -257,12 +258,12 @@ class MemorySession(Session):
             if matches(subscription.key, sample.key):
                 subscription.samples.offer(sample)
 
-    def _declared(self, undeclare: Callable[[], None]) -> Declaration:
+    def _declared(self, undeclare: Callable[[], None], lost: Callable[[], int] = int) -> Declaration:
         async def take_back() -> None:
             self._declarations.remove(declaration)
             undeclare()
 
-        declaration = Declaration(take_back)
+        declaration = Declaration(take_back, lost)
         self._declarations.append(declaration)
         return declaration
 

@@ -172,9 +172,15 @@ OnSubscribed = Callable[[bool], None]
 class Declaration:
     """Something that a session has made known to the network; made by its session."""
 
-    def __init__(self, take_back: Callable[[], Awaitable[None]]) -> None:
+    def __init__(self, take_back: Callable[[], Awaitable[None]], lost: Callable[[], int] = int) -> None:
         self._take_back = take_back
+        self._lost = lost
         self._closed = False
+
+    @property
+    def lost(self) -> int:
+        """How many samples gave way so far because the callback did not take them in time."""
+        return self._lost()
 
     async def close(self) -> None:
         """Take it back; safe to call twice. No callback runs afterwards, undelivered queries are refused."""
@@ -218,8 +224,14 @@ class Session(ABC):
         """
 
     @abstractmethod
-    async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
-        """Take the samples that match a key expression; the oldest are lost when the loop is too slow."""
+    async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
+        """Take the samples that match a key expression; the oldest are lost when the loop is too slow.
+
+        Args:
+            key: the expression.
+            on_sample: takes a sample.
+            kept: so many samples may wait for the loop.
+        """
 
     @abstractmethod
     async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:

@@ -181,15 +181,17 @@ class ZenohSession(Session):
             intake.close,
         )
 
-    async def subscribe(self, key: str, on_sample: OnSample) -> Declaration:
+    async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
         """Take samples."""
-        samples = HandOver(self._loop, on_sample, UNDELIVERED_SAMPLES)
+        samples = HandOver(self._loop, on_sample, kept)
 
         def take(sample: zenoh.Sample) -> None:
             samples.offer(to_sample(sample))
 
         return await self._declare(
-            lambda: self._session.declare_subscriber(key, Callback(take, indirect=False)), samples.close
+            lambda: self._session.declare_subscriber(key, Callback(take, indirect=False)),
+            samples.close,
+            lambda: samples.lost,
         )
 
     async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
@@ -295,7 +297,9 @@ class ZenohSession(Session):
                 self._declared.clear()
                 await closer.stop(DRAIN_TIME_S / 10)
 
-    async def _declare(self, make: Callable[[], _Undeclarable], stop: Callable[[], object]) -> Declaration:
+    async def _declare(
+        self, make: Callable[[], _Undeclarable], stop: Callable[[], object], lost: Callable[[], int] = int
+    ) -> Declaration:
         self._must_be_open()
         try:
             entity = await self._workers.run(make, DECLARE_TIME_S, lambda late: late.undeclare())
@@ -304,7 +308,7 @@ class ZenohSession(Session):
         except TimeoutError:
             raise SessionError(f"cannot declare within {DECLARE_TIME_S:g} s: a peer takes nothing") from None
         self._declared.append(declared := _Declared(entity, stop))
-        return Declaration(partial(self._undeclare, declared))
+        return Declaration(partial(self._undeclare, declared), lost)
 
     async def _undeclare(self, declared: _Declared) -> None:
         """Take a declaration back, then stop its callback: what arrives in between is still served."""

@@ -38,6 +38,10 @@ class LeaseReply(Frozen):
     """It ends so many seconds after the daemon received this request, unless renewed."""
 
 
+class HoldersRequest(Frozen):
+    """Ask who controls what."""
+
+
 class Holder(Frozen):
     """Who controls an axis."""
 

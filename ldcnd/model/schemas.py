@@ -1,12 +1,10 @@
-"""JSON Schema of every public model: what `schemas/` holds and `meta/schema/<name>` serves."""
+"""JSON Schemas of the public models."""
 
 import json
 import re
-from collections.abc import Mapping
 from functools import cache
-from types import MappingProxyType
 
-from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply, LeaseRequest
+from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply, LeaseRequest
 from ldcnd.model.axes import AxisInfo
 from ldcnd.model.errors import ErrorReply
 from ldcnd.model.events import CommandEvent, CommandOutcome, EventList, EventsRequest, OutcomeRequest
@@ -41,6 +39,7 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
     EventList,
     EventsRequest,
     HolderList,
+    HoldersRequest,
     LeaseReply,
     LeaseRequest,
     MoveTogetherReply,
@@ -71,16 +70,10 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
     *SAMPLE_MODELS.values(),
     *REQUEST_MODELS.values(),
 )
-"""Everything that crosses the network."""
+"""Everything that crosses the network but the configuration, which is no part of the vocabulary."""
 
 
 def schema_text(model: type[Frozen]) -> str:
     """Return the model's JSON Schema as stable text with a final newline."""
     schema = {"$schema": DIALECT, **model.model_json_schema(mode="serialization")}
     return json.dumps(schema, indent=2, sort_keys=True) + "\n"
-
-
-@cache
-def all_schemas() -> Mapping[str, str]:
-    """Return the schema text of every public model by name; made once, it takes a tenth of a second."""
-    return MappingProxyType({schema_name(model): schema_text(model) for model in PUBLIC_MODELS})

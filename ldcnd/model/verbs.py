@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply, LeaseRequest
+from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply, LeaseRequest
 from ldcnd.model.events import CommandOutcome, EventList, EventsRequest, OutcomeRequest
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.group_moves import MoveTogetherReply, MoveTogetherRequest
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.rehearsal import RehearsalReply, RehearsalRequest
-from ldcnd.model.requests import HaltRequest
 from ldcnd.model.why import WhyReply, WhyRequest
 from ldcnd.model.wire_log import WireLogReply, WireLogRequest
 
@@ -36,7 +35,7 @@ RIG_VERBS: Mapping[str, VerbModels] = MappingProxyType(
         ACQUIRE: VerbModels(AcquireRequest, LeaseReply),
         RENEW: VerbModels(LeaseRequest, LeaseReply),
         RELEASE: VerbModels(LeaseRequest, LeaseReply),
-        HOLDERS: VerbModels(HaltRequest, HolderList),
+        HOLDERS: VerbModels(HoldersRequest, HolderList),
         OUTCOME: VerbModels(OutcomeRequest, CommandOutcome),
         EVENTS: VerbModels(EventsRequest, EventList),
         REHEARSE: VerbModels(RehearsalRequest, RehearsalReply),

@@ -19,11 +19,10 @@ from ldcnd.errors import (
     StaleSequence,
     UnknownAxis,
 )
-from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply
+from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply
 from ldcnd.model.axes import AxisState
 from ldcnd.model.events import CommandOutcome, CommandStatus, EventList, EventsRequest, OutcomeRequest
 from ldcnd.model.requests import (
-    HaltRequest,
     MoveAbsoluteRequest,
     MoveRelativeRequest,
     MoveVelocityRequest,
@@ -60,7 +59,7 @@ async def test_a_leased_rig_moves_under_a_lease_only():
             state = await rig.client.wait_for_end("x", reply.command_id)
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
-        holders = await rig.client.rig_command("holders", HaltRequest(), HolderList)
+        holders = await rig.client.rig_command("holders", HoldersRequest(), HolderList)
         assert {holder.client for holder in holders.holders} == {None}
 
 

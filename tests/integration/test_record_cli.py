@@ -20,7 +20,7 @@ async def ldcnd(*arguments):
 
 
 async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
-    path, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
+    path, whole, tables = tmp_path / "run.mcap", tmp_path / "whole.mcap", tmp_path / "tables"
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
         recording = await asyncio.create_subprocess_exec(*LDCND, "record", "-o", str(path), "-e", endpoint, stderr=PIPE)
         assert recording.stderr
@@ -32,9 +32,10 @@ async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
             recording.send_signal(signal.SIGTERM)
             _, told = await recording.communicate()
 
-    exported = await ldcnd("record", "export", str(path))
+    exported = await ldcnd("record", "export", str(path), str(tables))
     recovered = await ldcnd("record", "recover", str(path), str(whole))
     assert recording.returncode == 0
+    assert "none missing" in told.decode()
     assert exported[0] == 0, exported[2]
-    assert "/ldcn/sim/tele/x/position,value," in exported[1]
+    assert (tables / "ldcn.sim.tele.x.position.csv").read_text().startswith("t_ns,received_ns,")
     assert (recovered[0], recovered[1].split()[0]) == (0, told.decode().split()[0])

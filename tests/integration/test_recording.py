@@ -1,109 +1,272 @@
 """Recordings of a whole daemon on the jumping clock, read back with the format's own reader."""
 
 import asyncio
-import csv
 import json
-from collections import Counter
+import resource
+import signal
+import sys
+from asyncio.subprocess import PIPE
 
-import jsonschema
 import pytest
 from mcap.reader import make_reader
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config import RigConfig
 from ldcnd.errors import ConfigError
+from ldcnd.messaging.codec import Encoding, encode
+from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.axes import AxisState
+from ldcnd.model.events import CommandEvent, CommandStatus
+from ldcnd.model.health import DaemonHealth
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
-from ldcnd.recording.mcap_file import export_csv, recover
-from ldcnd.recording.recorder import Recorder
-from tests.support.rig import EPOCH_NS, SIMULATED, running_rig
+from ldcnd.recording.mcap_file import FACTS
+from ldcnd.recording.recorder import FLUSH_PERIOD_S, Recorder
+from ldcnd.recording.recovery import recover
+from tests.support.process import ROOT
+from tests.support.recordings import LARGE, checked_topics, recorded_rig, thirty_one_axes
+from tests.support.rig import EPOCH_NS
 
-LARGE = 1 << 30
+HEALTH = "ldcn/sim/meta/health"
 
 
-def read(path):
+def messages(path):
     with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        attached = {attachment.name: json.loads(attachment.data) for attachment in reader.iter_attachments()}
-        return list(reader.iter_messages()), attached
+        return [
+            (channel.topic, message.data)
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        ]
 
 
-async def record(path, seconds, rotate_bytes=LARGE):
-    """Record a rig whose axis x moves, and return how many values were published on each key meanwhile."""
-    counts = Counter()
-    async with running_rig() as rig:
-        await rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        recorder = Recorder(path, {"daemon": await rig.client.daemon()}, lambda: EPOCH_NS, rotate_bytes)
-
-        def take(sample):
-            counts[sample.key] += 1
-            recorder.take(sample)
-
-        with recorder:
-            async with rig.client.published(take):
-                await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-                await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
-                await asyncio.sleep(seconds)
-    return counts
+def attached(path):
+    with path.open("rb") as stream:
+        return {attachment.name: json.loads(attachment.data) for attachment in make_reader(stream).iter_attachments()}
 
 
-async def test_every_published_value_is_in_the_file_and_fits_the_schema_in_the_file(tmp_path):
+def facts(path):
+    with path.open("rb") as stream:
+        (found,) = [record.metadata for record in make_reader(stream).iter_metadata() if record.name == FACTS]
+    return found
+
+
+async def record_a_move(path, seconds, **options):
+    """Record a rig whose axis x moves to 5 mm; return how many values were published on each key."""
+    async with recorded_rig(path, **options) as recorded:
+        await recorded.rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        await recorded.rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await recorded.rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await asyncio.sleep(seconds)
+    return recorded.published
+
+
+async def thirty_one_axes_are_in_the_file(path, seconds, position_hz):
+    async with recorded_rig(path, thirty_one_axes(position_hz)) as recorded:
+        await recorded.rig.until("a7", lambda state: state.state is AxisState.DISABLED)
+        await recorded.rig.client.command("a7", Verb.POWER, PowerRequest(on=True))
+        await asyncio.sleep(seconds)
+
+    topics = checked_topics(path)
+    assert topics == recorded.published
+    positions = [count for topic, count in topics.items() if topic.endswith("/position")]
+    assert len(positions) == 31
+    assert min(positions) >= seconds * position_hz - 1
+    assert topics["ldcn/sim/tele/a7/event"] >= 2
+    assert facts(path)["missing"] == "0"
+    return topics.total()
+
+
+@pytest.mark.timeout(240)
+async def test_every_value_of_31_axes_is_in_the_file_and_fits_the_schema_in_the_file(tmp_path):
+    await thirty_one_axes_are_in_the_file(tmp_path / "run.mcap", 60.0, position_hz=5.0)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+async def test_ten_minutes_of_31_axes_are_in_the_file_and_fit_the_schema_in_the_file(tmp_path):
+    print(await thirty_one_axes_are_in_the_file(tmp_path / "run.mcap", 600.0, position_hz=20.0), "messages")
+
+
+async def test_the_file_says_what_was_recorded(tmp_path):
     path = tmp_path / "run.mcap"
 
-    counts = await record(path, seconds=60.0)
+    await record_a_move(path, 1.0)
 
-    messages, attached = read(path)
-    recorded = Counter(channel.topic.removeprefix("/") for _, channel, _ in messages)
-    validators = {}
-    for schema, _, message in messages:
-        if schema.id not in validators:
-            validators[schema.id] = jsonschema.Draft202012Validator(json.loads(schema.data))
-        if message.sequence % 20 == 0:
-            validators[schema.id].validate(json.loads(message.data))
-    assert recorded == counts
-    assert {"ldcn/sim/tele/x/event", "ldcn/sim/tele/x/position", "ldcn/sim/meta/health"} <= set(recorded)
-    assert len(messages) > 2000
-    assert attached["daemon.json"]["rig"] == "sim"
+    documents = attached(path)
+    described = {"daemon.json", "commands.json", "plan.json", "configuration.json", "axes/x.json", "buses/line0.json"}
+    assert described <= set(documents)
+    assert RigConfig.model_validate(documents["configuration.json"]).bus[0].axis[0].name == "x"
+    assert documents["axes/x.json"]["unit"] == "mm"
     assert not path.with_name("run.mcap.part").exists()
 
 
-async def test_a_recording_that_was_cut_is_recovered_up_to_the_cut(tmp_path):
+async def test_events_are_log_messages_that_viewers_know_and_nothing_of_them_is_lost(tmp_path):
+    path = tmp_path / "run.mcap"
+
+    await record_a_move(path, 2.0)
+
+    with path.open("rb") as stream:
+        found = list(make_reader(stream).iter_messages(topics=["/ldcn/sim/tele/x/event"]))
+    logs = [json.loads(message.data) for _, _, message in found]
+    assert {schema.name for schema, _, _ in found} == {"foxglove.Log"}
+    # the fields of foxglove.Log, as documented
+    assert {"timestamp", "level", "message", "name", "file", "line"} < set(logs[0])
+    assert [log["event"]["seq"] for log in logs] == list(range(len(logs)))
+    ended = logs[-1]
+    event = CommandEvent.model_validate(ended["event"])
+    assert (event.verb, event.status, ended["level"]) == (Verb.MOVE_ABSOLUTE, CommandStatus.DONE, 2)
+    assert ended["timestamp"] == {"sec": event.t // 10**9, "nsec": event.t % 10**9}
+    assert ended["message"].startswith("x: move_absolute done by ")
+
+
+async def test_a_rig_that_says_little_is_on_the_disk_all_the_same(tmp_path):
+    path, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
+    recorder = Recorder(path, {}, lambda: EPOCH_NS, LARGE)
+    async with asyncio.TaskGroup() as group:
+        with recorder:
+            group.create_task(recorder.run(lambda: 0), name="recorder")
+            recorder.take(health(0))
+
+            await asyncio.sleep(1.1 * FLUSH_PERIOD_S)
+
+            saved = recover(path.with_name("run.mcap.part"), whole)
+            recorder.end()
+    assert saved.messages == 1
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("seconds", "axes"), [(20.4, 4), pytest.param(300.4, 31, marks=[pytest.mark.soak, pytest.mark.timeout(900)])]
+)
+async def test_all_but_the_last_chunk_of_a_killed_recorder_is_recovered(tmp_path, seconds, axes):
+    path, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
+    arguments = ("-m", "tests.support.killed_recorder", str(path), str(seconds), str(axes))
+    killed = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdout=PIPE, cwd=ROOT)
+    told, _ = await killed.communicate()
+
+    saved = recover(path.with_name("run.mcap.part"), whole)
+
+    flushed, recorded = map(int, told.splitlines()[-1].split())
+    assert killed.returncode == -signal.SIGKILL
+    assert 0 < flushed < recorded
+    assert saved.messages == flushed == checked_topics(whole).total()
+    assert recorded - flushed < 2 * recorded / seconds  # no more than about a second of it
+    assert facts(whole)["missing"] == "0"
+    assert "configuration.json" in attached(whole)
+
+
+async def test_a_recording_that_was_cut_tells_where_and_is_recovered_up_to_there(tmp_path):
     path, cut, whole = tmp_path / "run.mcap", tmp_path / "cut.mcap.part", tmp_path / "whole.mcap"
-    await record(path, seconds=60.0)
+    await record_a_move(path, 10.0)
     data = path.read_bytes()
-    cut.write_bytes(data[: len(data) * 2 // 3])
+    cut.write_bytes(data[: len(data) // 2])
 
-    count = recover(cut, whole)
+    saved = recover(cut, whole)
 
-    before = [(channel.topic, message.data) for _, channel, message in read(path)[0]]
-    messages, attached = read(whole)
-    assert len(before) / 4 < count < len(before)
-    assert [(channel.topic, message.data) for _, channel, message in messages] == before[:count]
-    assert attached["daemon.json"]["rig"] == "sim"
+    before = messages(path)
+    (damage,) = saved.damages
+    assert len(before) / 4 < saved.messages < len(before)
+    assert messages(whole) == before[: saved.messages]
+    assert len(data) // 4 < damage.at_bytes <= len(data) // 2
+    assert "cut short" in damage.reason
+    assert facts(whole)["damage 1"] == str(damage)
+
+
+async def test_a_chunk_that_was_damaged_costs_no_other_chunk(tmp_path):
+    path, damaged, whole = tmp_path / "run.mcap", tmp_path / "damaged.mcap", tmp_path / "whole.mcap"
+    await record_a_move(path, 10.0)
+    with path.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    data = bytearray(path.read_bytes())
+    data[chunks[4].chunk_start_offset + chunks[4].chunk_length - 20] ^= 0xFF
+    damaged.write_bytes(data)
+
+    saved = recover(damaged, whole)
+
+    (damage,) = saved.damages
+    assert damage.at_bytes == chunks[4].chunk_start_offset
+    assert saved.messages > 0.7 * len(messages(path))
+    assert saved.losses.missing.total() > 0
+    assert saved.messages + saved.losses.missing.total() == len(messages(path))
+
+
+def test_what_is_no_recording_is_refused_and_leaves_nothing_behind(tmp_path):
+    text = tmp_path / "text.mcap"
+    text.write_text("no recording")
+
+    with pytest.raises(ConfigError, match="not an MCAP file"):
+        recover(text, tmp_path / "whole.mcap")
+
+    assert list(tmp_path.iterdir()) == [text]
 
 
 async def test_a_full_file_is_followed_by_the_next_without_a_gap(tmp_path):
-    counts = await record(tmp_path / "run.mcap", seconds=60.0, rotate_bytes=20_000)
+    published = await record_a_move(tmp_path / "run.mcap", 20.0, rotate_bytes=50_000)
 
     files = sorted(tmp_path.iterdir())
-    parts = [read(file) for file in files]
     assert len(files) > 1
-    assert sum(len(messages) for messages, _ in parts) == counts.total()
-    assert all(attached["daemon.json"]["rig"] == "sim" for _, attached in parts)
+    assert sum((checked_topics(file) for file in files), start=published - published) == published
+    assert all("configuration.json" in attached(file) for file in files)
 
 
-async def test_a_recording_becomes_a_table(tmp_path):
-    path, table = tmp_path / "run.mcap", tmp_path / "run.csv"
-    await record(path, seconds=5.0)
+async def test_a_recording_whose_next_file_exists_ends_with_one_error_and_is_whole(tmp_path):
+    path, taken = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
+    taken.write_bytes(b"precious")
 
-    with table.open("w", encoding="utf-8") as stream:
-        count = export_csv(path, stream)
+    refused = pytest.RaisesExc(ConfigError, match=r"run-2\.mcap exists already")
+    with pytest.RaisesGroup(refused, flatten_subgroups=True):
+        await record_a_move(path, 60.0, rotate_bytes=50_000)
 
-    with table.open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    position = [row for row in rows if (row["topic"], row["field"]) == ("/ldcn/sim/tele/x/position", "value")]
-    assert len(rows) == count
-    assert float(position[-1]["value"]) == pytest.approx(5.0, abs=0.01)
-    assert int(position[-1]["t_ns"]) > int(position[0]["t_ns"]) > EPOCH_NS
+    assert taken.read_bytes() == b"precious"
+    assert checked_topics(path).total() > 100
+    assert sorted(tmp_path.iterdir()) == [taken, path]
+
+
+async def test_a_full_disk_ends_the_recording_and_what_was_written_is_recovered(tmp_path):
+    path, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.RaisesGroup(OSError, flatten_subgroups=True):
+            await record_a_move(path, 60.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    assert recover(path.with_name("run.mcap.part"), whole).messages > 100
+
+
+def health(seq, key=HEALTH):
+    report = DaemonHealth(t=EPOCH_NS + seq, seq=seq, loop_lag_s=0.0, published=0, missed_reports=0)
+    return Sample(key, *encode(report, Encoding.JSON), SampleKind.PUT, report.t)
+
+
+async def test_what_is_missing_is_counted_in_the_file(tmp_path):
+    path = tmp_path / "run.mcap"
+    with Recorder(path, {}, lambda: EPOCH_NS, LARGE) as recorder:
+        for seq in (7, 8, 11, 12, 0, 1):  # two lost, then a restart
+            recorder.take(health(seq))
+        recorder.take(Sample("ldcn/sim/tele/x/position", b"{}", "application/json", SampleKind.PUT, None))
+
+    found = facts(path)
+    assert {name: found[name] for name in ("messages", "missing", "restarts", "not_understood")} == {
+        "messages": "6",
+        "missing": "2",
+        "restarts": "1",
+        "not_understood": "1",
+    }
+    assert found[f"missing /{HEALTH}"] == "2"
+    assert "2 missing" in recorder.summary
+
+
+async def test_what_the_recorder_was_too_slow_for_is_counted(tmp_path):
+    path = tmp_path / "run.mcap"
+    async with recorded_rig(path, kept=8) as recorded:
+        await asyncio.sleep(1.0)
+        for seq in range(1000, 1100):  # at once: nobody can take them in between
+            sample = health(seq)
+            recorded.rig.session.publish(HEALTH, sample.payload, encoding=sample.encoding, qos="telemetry")
+        await asyncio.sleep(0.01)
+
+    assert int(facts(path)["too_slow"]) >= 92
+    assert "too slow" in recorded.recorder.summary
 
 
 def test_a_recording_never_overwrites_another(tmp_path):
@@ -125,28 +288,3 @@ def test_a_recording_never_overwrites_what_a_cut_left_of_another(tmp_path):
 
     assert "ldcnd record recover" in str(refused.value.remedy)
     assert left.read_bytes() == b"precious"
-
-
-def thirty_one_axes():
-    document = load_config(SIMULATED).model_dump()
-    (bus,), (line,) = document["bus"], document["sim"]
-    x, drive = bus["axis"][0], line["module"][0]
-    bus["axis"] = [{**x, "name": f"a{address}", "address": address} for address in range(1, 32)]
-    line["module"] = [drive] * 31
-    return RigConfig.model_validate(document)
-
-
-async def test_thirty_one_axes_are_recorded_without_a_gap(tmp_path):
-    path = tmp_path / "run.mcap"
-    async with running_rig(thirty_one_axes()) as rig:
-        recorder = Recorder(path, {}, lambda: EPOCH_NS, LARGE)
-        with recorder:
-            async with rig.client.published(recorder.take):
-                await asyncio.sleep(15.0)
-
-    sequences = {}
-    for _, channel, message in read(path)[0]:
-        sequences.setdefault(channel.topic, []).append(message.sequence)
-    assert sum(topic.endswith("/position") for topic in sequences) == 31
-    for sequence in sequences.values():
-        assert sequence == list(range(sequence[0], sequence[0] + len(sequence)))

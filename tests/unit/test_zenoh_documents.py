@@ -10,13 +10,13 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.daemon.asyncapi import asyncapi_document, asyncapi_text
-from ldcnd.daemon.contract import Kind, as_markdown, channels
+from ldcnd.daemon.contract import Kind, all_schemas, as_markdown, channels
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding
 from ldcnd.messaging.keys import Keys, matches
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.requests import Verb
+from ldcnd.model.requests import REQUEST_MODELS, Verb
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.schemas import all_schemas, schema_name
+from ldcnd.model.schemas import schema_name
 from ldcnd.model.verbs import RIG_VERBS
 from ldcnd.pki.access import RULES
 
@@ -102,6 +102,10 @@ def test_every_payload_has_a_public_schema() -> None:
     models: set[type[Frozen]] = {model for channel in channels() for model in (channel.sent, channel.taken) if model}
 
     assert {schema_name(model) for model in models} <= set(all_schemas())
+
+
+def test_no_verb_of_the_rig_is_described_as_a_motion_of_an_axis() -> None:
+    assert not {models.request for models in RIG_VERBS.values()} & set(REQUEST_MODELS.values())
 
 
 def test_channel_names_are_unique() -> None:

@@ -1,0 +1,91 @@
+"""What a published value looks like to stock viewers: events are log messages, everything else is itself.
+
+Source: Foxglove's message schemas, `foxglove.Log`; a viewer knows it by its name and shows the fields that it knows.
+"""
+
+from collections.abc import Mapping
+from enum import IntEnum
+from functools import cache
+from types import MappingProxyType
+
+from pydantic import Field
+
+from ldcnd.model.events import CommandEvent, CommandStatus
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.schemas import schema_text
+from ldcnd.recording.topics import Published
+
+NS_PER_S = 10**9
+LOG_SCHEMA = "foxglove.Log"
+
+
+class LogLevel(IntEnum):
+    """How much a log message matters."""
+
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+
+
+LEVELS: Mapping[CommandStatus, LogLevel] = MappingProxyType(
+    {
+        CommandStatus.ABORTED: LogLevel.WARNING,
+        CommandStatus.REFUSED: LogLevel.WARNING,
+        CommandStatus.FAILED: LogLevel.ERROR,
+        CommandStatus.UNKNOWN: LogLevel.ERROR,
+    }
+)
+"""What is not here went as asked."""
+
+
+class Instant(Frozen):
+    """A point in time, UTC since 1970."""
+
+    sec: int = Field(ge=0)
+    """Whole seconds."""
+    nsec: int = Field(ge=0, lt=NS_PER_S)
+    """Nanoseconds of the second."""
+
+
+class LogMessage(Frozen):
+    """An event as a log message: what viewers show, and the event itself, whole."""
+
+    timestamp: Instant
+    """When it happened."""
+    level: LogLevel
+    """2 for what went as asked, 3 for what was refused or ended early, 4 for failures."""
+    message: str
+    """The event in one sentence."""
+    name: str
+    """The axis."""
+    file: str = ""
+    """Nothing: events have no place in a program."""
+    line: int = Field(default=0, ge=0)
+    """Nothing, likewise."""
+    event: CommandEvent
+    """The event as it was published."""
+
+
+def message_of(value: Published) -> Frozen:
+    """Return what stands for a value in a recording."""
+    return _log_message(value) if isinstance(value, CommandEvent) else value
+
+
+@cache
+def schema_of(message: type[Frozen]) -> tuple[str, str]:
+    """Return name and text of the schema of a message."""
+    return LOG_SCHEMA if message is LogMessage else f"ldcnd.{message.__name__}", schema_text(message)
+
+
+def _log_message(event: CommandEvent) -> LogMessage:
+    sec, nsec = divmod(event.t, NS_PER_S)
+    who = event.client or "somebody"
+    why = f": {event.reason}" if event.reason else ""
+    code = f" [{event.code}]" if event.code else ""
+    return LogMessage(
+        timestamp=Instant(sec=sec, nsec=nsec),
+        level=LEVELS.get(event.status, LogLevel.INFO),
+        message=f"{event.axis}: {event.verb} {event.status} by {who} ({event.command_id}){why}{code}",
+        name=event.axis,
+        event=event,
+    )

@@ -1,0 +1,74 @@
+"""Recordings as tables."""
+
+import asyncio
+import csv
+import json
+
+import pytest
+
+from ldcnd.errors import ConfigError
+from ldcnd.model.axes import AxisState
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.recording.tables import export_tables
+from tests.support.recordings import recorded_rig
+from tests.support.rig import EPOCH_NS
+
+
+async def record_a_move(path):
+    async with recorded_rig(path) as recorded:
+        rig = recorded.rig
+        await rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await rig.client.wait_for_end("x", reply.command_id)
+        await asyncio.sleep(3.0)
+    return reply.command_id
+
+
+def rows(folder, topic):
+    with (folder / f"ldcn.sim.{topic}.csv").open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+async def test_each_topic_becomes_a_table_whose_columns_are_its_values(tmp_path):
+    path, folder = tmp_path / "run.mcap", tmp_path / "tables"
+    command_id = await record_a_move(path)
+
+    done = export_tables(path, folder)
+
+    positions = rows(folder, "tele.x.position")
+    assert set(folder.iterdir()) == set(done.tables)
+    assert not done.damages
+    assert float(positions[-1]["value"]) == pytest.approx(5.0, abs=0.01)
+    assert int(positions[-1]["t_ns"]) > int(positions[0]["t_ns"]) > EPOCH_NS
+    assert positions[0]["unit"] == "mm"
+    assert done.rows == sum(len(rows(folder, table.stem.removeprefix("ldcn.sim."))) for table in done.tables)
+    # what is inside of something has a column too, empty where there is nothing
+    states = rows(folder, "tele.x.state")
+    assert command_id in {state["command.command_id"] for state in states}
+    assert states[0]["command.command_id"] == ""
+    assert float(rows(folder, "meta.health.line0")[-1]["axes.0.rate_hz"]) > 10
+    assert json.loads(rows(folder, "tele.x.fault")[0]["active"]) == []
+    assert rows(folder, "tele.x.event")[-1]["event.status"] == CommandStatus.DONE
+
+
+async def test_of_a_damaged_recording_the_rest_is_exported_and_it_says_so(tmp_path):
+    path, cut = tmp_path / "run.mcap", tmp_path / "cut.mcap.part"
+    await record_a_move(path)
+    data = path.read_bytes()
+    cut.write_bytes(data[: len(data) // 2])
+
+    whole, rest = export_tables(path, tmp_path / "whole"), export_tables(cut, tmp_path / "rest")
+
+    assert 0 < rest.rows < whole.rows
+    assert len(rest.damages) == 1
+
+
+async def test_tables_are_never_overwritten(tmp_path):
+    path, folder = tmp_path / "run.mcap", tmp_path / "tables"
+    await record_a_move(path)
+    export_tables(path, folder)
+
+    with pytest.raises(ConfigError, match="exists already"):
+        export_tables(path, folder)

@@ -1,0 +1,39 @@
+"""A process that records a rig on the jumping clock and kills itself, without any goodbye, in the middle.
+
+Run as `python -m tests.support.killed_recorder FILE SECONDS AXES`; prints how many values it had recorded at its last
+flush, and how many in all.
+"""
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+from ldcnd.recording.mcap_file import McapFile
+from tests.support.jumping_clock import JumpingLoop
+from tests.support.recordings import recorded_rig, thirty_one_axes
+
+MOST_AXES = 31
+
+
+async def record_and_die(path: Path, seconds: float, axes: int) -> None:
+    """Record for so long, then die."""
+    async with recorded_rig(path, thirty_one_axes(20.0) if axes == MOST_AXES else None) as recorded:
+        flushed = 0
+        flush = McapFile.flush
+
+        def counted(file: McapFile) -> None:
+            nonlocal flushed
+            flush(file)
+            flushed = recorded.recorder.messages
+
+        setattr(McapFile, "flush", counted)  # noqa: B010 - a method; nobody else tells where the last chunk ended
+        await asyncio.sleep(seconds)
+        print(flushed, recorded.recorder.messages, flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+        runner.run(record_and_die(Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])))
