@@ -14,15 +14,17 @@ def bucket_limit_s(bucket: int) -> float:
 class LatencyHistogram:
     """Durations in buckets that double; constant size, constant cost."""
 
-    __slots__ = ("counts", "longest_s")
+    __slots__ = ("counts", "longest_s", "total_s")
 
     def __init__(self) -> None:
         self.counts = [0] * BUCKETS
+        self.total_s = 0.0
         self.longest_s = 0.0
 
     def add(self, duration_s: float) -> None:
         """Count one duration, in seconds, not negative."""
         self.counts[min(BUCKETS - 1, int(duration_s * 15625).bit_length())] += 1
+        self.total_s += duration_s
         self.longest_s = max(self.longest_s, duration_s)
 
     def quantile_s(self, fraction: float) -> float:

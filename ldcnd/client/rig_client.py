@@ -248,7 +248,7 @@ class RigClient:
                 declaration = await self._session.subscribe(key, take, kept)
                 declared.push_async_callback(declaration.close)
                 declarations.append(declaration)
-            yield lambda: sum(declaration.lost for declaration in declarations)
+            yield lambda: sum(declaration.load.lost for declaration in declarations)
 
     @asynccontextmanager
     async def health(self, take: Callable[[DaemonHealth | BusHealth], None]) -> AsyncIterator[None]:

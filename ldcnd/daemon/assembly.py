@@ -97,7 +97,11 @@ def build_daemon(
     rig = Rig(config.rig, buses, groups)
     leased = config.authority == "leased"
     control = build_control(rig, ledger, events, clock, next_command_id, instance=instance, leased=leased)
-    return Daemon(config, session, rig, control, publisher, clock, instance)
+
+    def eeprom_writes(axis: AxisService) -> int | None:
+        return eeprom.total(axis.config.name) if eeprom and axis.driver.parameters else None
+
+    return Daemon(config, session, rig, control, publisher, clock, instance, eeprom_writes)
 
 
 def _build_bus(

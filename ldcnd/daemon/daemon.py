@@ -12,7 +12,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.control import Control
 from ldcnd.daemon.demand import DEMANDED_ITEMS
 from ldcnd.daemon.describing import Describing
-from ldcnd.daemon.health import HealthWatch
+from ldcnd.daemon.health import EepromWrites, HealthWatch
 from ldcnd.daemon.loss_policies import LeaseWatch, apply_policy
 from ldcnd.daemon.planning import plan_rig
 from ldcnd.daemon.publishing import Publisher
@@ -20,7 +20,7 @@ from ldcnd.daemon.requests import Requests
 from ldcnd.daemon.rig import Rig
 from ldcnd.log import get_logger
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Declaration, Session
+from ldcnd.messaging.session import Declaration, Load, Session
 from ldcnd.model.axes import LinkState
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.samples import TelemetryItem
@@ -46,6 +46,7 @@ class Daemon:
         publisher: Publisher,
         clock: Clock,
         instance: str,
+        eeprom_writes: EepromWrites,
     ) -> None:
         self.rig = rig
         self._control = control
@@ -58,7 +59,8 @@ class Daemon:
         self._started_ns = clock.now_ns()
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
-        self._health = HealthWatch(rig, self._keys, publisher, clock)
+        self._declarations: list[Declaration] = []
+        self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
         self._describing = Describing(
             rig, self._keys, publisher, self._info, lambda: self._config, plan_rig(config), self._health
         )
@@ -121,6 +123,7 @@ class Daemon:
         describing = self._describing
 
         async def until_end(declaration: Declaration) -> None:
+            self._declarations.append(declaration)
             declared.push_async_callback(declaration.close)
 
         await until_end(await session.serve(keys.all_telemetry, describing.on_telemetry, complete=False))
@@ -135,6 +138,11 @@ class Daemon:
                     key, told = keys.telemetry(axis.config.name, item), partial(_told, bus, axis, item)
                     await until_end(await session.watch_subscribers(key, told))
         await until_end(await session.declare_token(keys.alive(self._instance)))
+
+    def _load(self) -> Load:
+        """Return how the daemon keeps up with what is asked of it."""
+        loads = [declaration.load for declaration in self._declarations]
+        return Load(sum(load.waiting for load in loads), sum(load.lost for load in loads))
 
     def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
         """Notice another daemon on the same rig: two of them would move every axis twice."""

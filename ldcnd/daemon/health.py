@@ -1,7 +1,7 @@
 """How the rig is doing: gathers what the lines count and publishes it once a second."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.daemon.axis_service import AxisService
@@ -10,9 +10,12 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.daemon.rig import Rig
 from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Load
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth
 from ldcnd.model.samples import TelemetryItem
+
+EepromWrites = Callable[[AxisService], int | None]
 
 PERIOD_S = 1.0
 LAG_LOOKS = 10
@@ -23,16 +26,34 @@ LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
 class HealthWatch:
     """Reports on one rig.
 
+    Args:
+        rig: what is reported on.
+        keys: where.
+        publisher: takes the reports, and knows what else was published.
+        clock: as everywhere.
+        load: returns how the daemon keeps up with its queries.
+        eeprom_writes: returns how often an axis's EEPROM was written, None where nobody knows.
+
     Attributes:
         latest: the newest report of each key.
     """
 
-    def __init__(self, rig: Rig, keys: Keys, publisher: Publisher, clock: Clock) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        keys: Keys,
+        publisher: Publisher,
+        clock: Clock,
+        load: Callable[[], Load],
+        eeprom_writes: EepromWrites,
+    ) -> None:
         self.latest: dict[str, Frozen] = {}
         self._rig = rig
         self._keys = keys
         self._publisher = publisher
         self._clock = clock
+        self._load = load
+        self._eeprom_writes = eeprom_writes
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
@@ -67,6 +88,7 @@ class HealthWatch:
             lag_s: how late a timer came since.
         """
         t = self._clock.now_ns()
+        load = self._load()
         reports: dict[str, Frozen] = {
             self._keys.health: DaemonHealth(
                 t=t,
@@ -74,6 +96,8 @@ class HealthWatch:
                 loop_lag_s=lag_s,
                 published=self._publisher.published,
                 missed_reports=self._missed,
+                waiting_queries=load.waiting,
+                dropped=load.lost,
             )
         }
         for bus in self._rig.buses:
@@ -115,6 +139,7 @@ class HealthWatch:
             rate_wanted_hz=axis.config.rates.position,
             rate_hz=self._granted_hz(name, TelemetryItem.POSITION, period_s),
             faults=len(axis.tracker.active_faults),
+            eeprom_writes=self._eeprom_writes(axis),
             items=tuple(
                 ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(name, item, period_s))
                 for item, hz in asked_hz.items()
@@ -146,5 +171,7 @@ def _lane(service: BusService, lane: Lane) -> LaneHealth:
             "p50_s": latency.quantile_s(0.5),
             "p99_s": latency.quantile_s(0.99),
             "longest_s": latency.longest_s,
+            "total_s": latency.total_s,
+            "counts": tuple(latency.counts),
         }
     )

@@ -11,6 +11,7 @@ from ldcnd.messaging.session import (
     PENDING_QUERIES,
     PENDING_URGENT_QUERIES,
     UNDELIVERED_TOKENS,
+    Load,
     OnQuery,
     OnToken,
     Query,
@@ -23,14 +24,10 @@ COLLECTED_ITEMS = 4096
 
 
 class HandOver(Generic[ItemT]):
-    """Keeps the newest items until the loop has called back with them, in order.
-
-    Attributes:
-        lost: how many items gave way to newer ones.
-    """
+    """Keeps the newest items until the loop has called back with them, in order."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, deliver: Callable[[ItemT], None], capacity: int) -> None:
-        self.lost = 0
+        self._lost = 0
         self._loop = loop
         self._deliver = deliver
         self._capacity = capacity
@@ -47,12 +44,16 @@ class HandOver(Generic[ItemT]):
                 return
             if len(self._items) >= self._capacity:
                 self._items.popleft()
-                self.lost += 1
+                self._lost += 1
             self._items.append(item)
             if self._woken:
                 return
             self._woken = True
         self._loop.call_soon_threadsafe(self._drain)
+
+    def load(self) -> Load:
+        """Return how many items wait, and how many gave way to newer ones."""
+        return Load(len(self._items), self._lost)
 
     def close(self) -> list[ItemT]:
         """Call back no more; return what was not delivered."""
@@ -91,6 +92,7 @@ class Intake:
         self._on_query = on_query
         self._capacity = PENDING_URGENT_QUERIES if urgent else PENDING_QUERIES
         self._pending = 0
+        self._refused = 0
         # re-entrant: a forgotten query may be collected, and so leave, while this very thread counts
         self._lock = threading.RLock()
         # admission bounds it, so nothing ever gives way
@@ -100,6 +102,7 @@ class Intake:
         """Count a query in, if there is room; `leave` counts it out. Any thread, never blocks."""
         with self._lock:
             if self._pending >= self._capacity:
+                self._refused += 1
                 return False
             self._pending += 1
             return True
@@ -111,6 +114,10 @@ class Intake:
             limit=self._capacity,
             remedy="wait for answers before asking more",
         )
+
+    def load(self) -> Load:
+        """Return how many queries are unanswered, and how many were not admitted."""
+        return Load(self._pending, self._refused)
 
     def leave(self) -> None:
         """Count a query out: its answer has left. Any thread."""
@@ -145,6 +152,10 @@ class TokenChanges:
     def offer(self, key: str, *, alive: bool) -> None:
         """Take a report. Any thread, never blocks."""
         self._changes.offer((key, alive))
+
+    def load(self) -> Load:
+        """Return how many changes wait, and how many gave way to newer ones."""
+        return self._changes.load()
 
     def close(self) -> None:
         """Call back no more."""

@@ -19,6 +19,7 @@ from ldcnd.messaging.session import (
     UNDELIVERED_SAMPLES,
     Answer,
     Declaration,
+    Load,
     OnQuery,
     OnSample,
     OnSubscribed,
@@ -164,7 +165,7 @@ class MemorySession(Session):
             queryable.intake.close()
 
         self._broker.queryables.append(queryable)
-        return self._declared(undeclare)
+        return self._declared(undeclare, queryable.intake.load)
 
     async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
         """Take samples."""
@@ -177,7 +178,7 @@ class MemorySession(Session):
             samples.close()
 
         self._broker.add(subscription)
-        return self._declared(undeclare, lambda: samples.lost)
+        return self._declared(undeclare, samples.load)
 
     async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
         """Learn whether anybody subscribes; this session's own subscriptions count as well, as with Zenoh."""
@@ -244,7 +245,7 @@ class MemorySession(Session):
         for token in dict.fromkeys(self._broker.tokens):
             if matches(key, token):
                 watch.changes.offer(token, alive=True)
-        return self._declared(undeclare)
+        return self._declared(undeclare, watch.changes.load)
 
     async def close(self) -> None:
         """Leave the network."""
@@ -258,12 +259,12 @@ class MemorySession(Session):
             if matches(subscription.key, sample.key):
                 subscription.samples.offer(sample)
 
-    def _declared(self, undeclare: Callable[[], None], lost: Callable[[], int] = int) -> Declaration:
+    def _declared(self, undeclare: Callable[[], None], load: Callable[[], Load] = Load) -> Declaration:
         async def take_back() -> None:
             self._declarations.remove(declaration)
             undeclare()
 
-        declaration = Declaration(take_back, lost)
+        declaration = Declaration(take_back, load)
         self._declarations.append(declaration)
         return declaration
 

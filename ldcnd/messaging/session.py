@@ -169,18 +169,31 @@ OnSubscribed = Callable[[bool], None]
 """Learns whether anybody subscribes to a key now."""
 
 
+@dataclass(frozen=True, slots=True)
+class Load:
+    """How a declaration keeps up with what arrives.
+
+    Attributes:
+        waiting: queries that have no answer yet; samples and tokens that the callback has not had.
+        lost: queries that were refused for being too many, samples and tokens that gave way, so far.
+    """
+
+    waiting: int = 0
+    lost: int = 0
+
+
 class Declaration:
     """Something that a session has made known to the network; made by its session."""
 
-    def __init__(self, take_back: Callable[[], Awaitable[None]], lost: Callable[[], int] = int) -> None:
+    def __init__(self, take_back: Callable[[], Awaitable[None]], load: Callable[[], Load] = Load) -> None:
         self._take_back = take_back
-        self._lost = lost
+        self._load = load
         self._closed = False
 
     @property
-    def lost(self) -> int:
-        """How many samples gave way so far because the callback did not take them in time."""
-        return self._lost()
+    def load(self) -> Load:
+        """How it keeps up."""
+        return self._load()
 
     async def close(self) -> None:
         """Take it back; safe to call twice. No callback runs afterwards, undelivered queries are refused."""

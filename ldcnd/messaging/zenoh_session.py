@@ -29,6 +29,7 @@ from ldcnd.messaging.session import (
     UNDELIVERED_SAMPLES,
     Answer,
     Declaration,
+    Load,
     OnQuery,
     OnSample,
     OnSubscribed,
@@ -179,6 +180,7 @@ class ZenohSession(Session):
         return await self._declare(
             lambda: self._session.declare_queryable(key, Callback(take, indirect=False), complete=complete),
             intake.close,
+            intake.load,
         )
 
     async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
@@ -191,7 +193,7 @@ class ZenohSession(Session):
         return await self._declare(
             lambda: self._session.declare_subscriber(key, Callback(take, indirect=False)),
             samples.close,
-            lambda: samples.lost,
+            samples.load,
         )
 
     async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
@@ -275,6 +277,7 @@ class ZenohSession(Session):
         return await self._declare(
             lambda: self._session.liveliness().declare_subscriber(key, Callback(take, indirect=False), history=True),
             changes.close,
+            changes.load,
         )
 
     async def close(self) -> None:
@@ -298,7 +301,7 @@ class ZenohSession(Session):
                 await closer.stop(DRAIN_TIME_S / 10)
 
     async def _declare(
-        self, make: Callable[[], _Undeclarable], stop: Callable[[], object], lost: Callable[[], int] = int
+        self, make: Callable[[], _Undeclarable], stop: Callable[[], object], load: Callable[[], Load] = Load
     ) -> Declaration:
         self._must_be_open()
         try:
@@ -308,7 +311,7 @@ class ZenohSession(Session):
         except TimeoutError:
             raise SessionError(f"cannot declare within {DECLARE_TIME_S:g} s: a peer takes nothing") from None
         self._declared.append(declared := _Declared(entity, stop))
-        return Declaration(partial(self._undeclare, declared), lost)
+        return Declaration(partial(self._undeclare, declared), load)
 
     async def _undeclare(self, declared: _Declared) -> None:
         """Take a declaration back, then stop its callback: what arrives in between is still served."""

@@ -3,14 +3,17 @@
 Names follow the conventions of prometheus.io: base units, `_total` for what only grows.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from ldcnd.model.axes import LinkState
 from ldcnd.model.health import BusHealth, DaemonHealth
 
+SHORTEST_LATENCY_S = 64e-6
+"""Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""
 FRESH_S = 5.0
 """A report counts for so long: what is older says nothing about now."""
 ERRORS = ("timeouts", "corrupt_replies", "rejected_packets", "resynchronisations", "stray_bytes", "losses")
@@ -54,11 +57,15 @@ class HealthCollector(Collector):
         lag = GaugeMetricFamily("ldcnd_loop_lag_seconds", "Longest that a timer came too late lately", labels=["rig"])
         published = CounterMetricFamily("ldcnd_published", "Samples and events published", labels=["rig"])
         missed = CounterMetricFamily("ldcnd_missed_reports", "Health reports that were left out", labels=["rig"])
+        waiting = GaugeMetricFamily("ldcnd_waiting_queries", "Queries without an answer yet", labels=["rig"])
+        dropped = CounterMetricFamily("ldcnd_dropped", "Queries refused for being too many, news lost", labels=["rig"])
         if daemon:
             lag.add_metric([self._rig], daemon.loop_lag_s)
             published.add_metric([self._rig], daemon.published)
             missed.add_metric([self._rig], daemon.missed_reports)
-        yield from (lag, published, missed)
+            waiting.add_metric([self._rig], daemon.waiting_queries)
+            dropped.add_metric([self._rig], daemon.dropped)
+        yield from (lag, published, missed, waiting, dropped)
 
     def _of_buses(self, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "bus"]
@@ -81,18 +88,15 @@ class HealthCollector(Collector):
     def _of_lanes(self, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "bus", "lane"]
         waiting = GaugeMetricFamily("ldcnd_lane_waiting", "Exchanges that wait", labels=labels)
-        exchanges = CounterMetricFamily("ldcnd_lane_exchanges", "Replies", labels=labels)
-        latency = GaugeMetricFamily(
-            "ldcnd_lane_latency_seconds", "From queueing to the reply, since the start", labels=[*labels, "quantile"]
-        )
+        latency = HistogramMetricFamily("ldcnd_lane_latency_seconds", "From queueing to the reply", labels=labels)
+        longest = GaugeMetricFamily("ldcnd_lane_longest_seconds", "The longest latency since the start", labels=labels)
         for bus in buses:
             for lane in bus.lanes:
                 values = [self._rig, bus.bus, lane.lane]
                 waiting.add_metric(values, lane.waiting)
-                exchanges.add_metric(values, lane.exchanges)
-                for quantile, value in (("0.5", lane.p50_s), ("0.99", lane.p99_s), ("1", lane.longest_s)):
-                    latency.add_metric([*values, quantile], value)
-        yield from (waiting, exchanges, latency)
+                latency.add_metric(values, _buckets(lane.counts), lane.total_s)
+                longest.add_metric(values, lane.longest_s)
+        yield from (waiting, latency, longest)
 
     def _of_axes(self, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "bus", "axis"]
@@ -101,6 +105,7 @@ class HealthCollector(Collector):
         wanted = GaugeMetricFamily("ldcnd_axis_rate_wanted_hertz", "Positions asked for", labels=labels)
         rate = GaugeMetricFamily("ldcnd_axis_rate_hertz", "Positions published", labels=labels)
         faults = GaugeMetricFamily("ldcnd_axis_faults", "Faults that stand", labels=labels)
+        wear = CounterMetricFamily("ldcnd_axis_eeprom_writes", "Writes of the drive's EEPROM, ever", labels=labels)
         for bus in buses:
             for axis in bus.axes:
                 values = [self._rig, bus.bus, axis.axis]
@@ -110,4 +115,12 @@ class HealthCollector(Collector):
                 wanted.add_metric(values, axis.rate_wanted_hz)
                 rate.add_metric(values, axis.rate_hz)
                 faults.add_metric(values, axis.faults)
-        yield from (up, age, wanted, rate, faults)
+                if axis.eeprom_writes is not None:
+                    wear.add_metric(values, axis.eeprom_writes)
+        yield from (up, age, wanted, rate, faults, wear)
+
+
+def _buckets(counts: Sequence[int]) -> list[tuple[str, float]]:
+    """Return how many were at most so long, by limit; a daemon that tells no counts has none."""
+    limits = [str(SHORTEST_LATENCY_S * 2.0**bucket) for bucket in range(len(counts) - 1)]
+    return list(zip((*limits, "+Inf"), accumulate(counts or (0,)), strict=True))

@@ -23,6 +23,11 @@ class LaneHealth(Frozen):
     """The same for 99 %."""
     longest_s: float = Field(ge=0)
     """The longest one."""
+    total_s: float = Field(default=0.0, ge=0)
+    """All of them together."""
+    counts: tuple[int, ...] = ()
+    """How many took how long: the first counts those of less than 64 us, each further one those of less than twice the
+    limit before, the last all others."""
 
 
 class ItemHealth(Frozen):
@@ -53,6 +58,8 @@ class AxisHealth(Frozen):
     """Faults that stand now."""
     items: tuple[ItemHealth, ...] = ()
     """What it is asked for; empty for a drive family that paces itself."""
+    eeprom_writes: int | None = Field(default=None, ge=0)
+    """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
 
 
 class BusHealth(Frozen):
@@ -100,6 +107,10 @@ class DaemonHealth(Frozen):
     loop_lag_s: float = Field(ge=0)
     """The longest that a timer of the daemon came too late in the last period, in seconds."""
     published: int = Field(ge=0)
-    """Samples and events handed to the network since the daemon started."""
+    """Samples and events handed to the network since the daemon started; what is lost there, `seq` tells receivers."""
     missed_reports: int = Field(ge=0)
     """Reports that were left out since the daemon started because it was held up for longer than a period."""
+    waiting_queries: int = Field(default=0, ge=0)
+    """Queries that have no answer yet: questions, commands and stops."""
+    dropped: int = Field(default=0, ge=0)
+    """Queries that were refused for being too many, and news of clients that were lost, since the daemon started."""

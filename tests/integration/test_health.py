@@ -2,18 +2,24 @@
 
 import asyncio
 import json
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import pytest
 
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.statistics import bucket_limit_s
+from ldcnd.config import load_config
+from ldcnd.daemon.smartstep_line import LEDGER_FILE
+from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import SampleKind
+from ldcnd.messaging.session import PENDING_QUERIES, SampleKind
 from ldcnd.model.axes import LinkState
 from ldcnd.model.health import BusHealth, DaemonHealth
-from tests.support.rig import running_rig
+from tests.support.rig import SIMULATED, running_rig
 
 KEYS = Keys("sim")
+MIXED = SIMULATED.with_name("mixed.toml")
 
 
 async def bus_health(rig) -> BusHealth:
@@ -56,19 +62,90 @@ async def test_a_line_at_work_is_busy_and_its_axes_get_the_rates_they_asked_for(
             assert axis.sample_age_s < 2 / axis.rate_wanted_hz
 
 
-async def test_samples_grow_old_while_nobody_polls():
-    async with running_rig() as rig:
+async def test_samples_grow_old_while_the_adapter_is_unplugged():
+    chain = build_chain(load_config(SIMULATED).sim[0].spec(starts_at_s=0.0))
+    async with running_rig(chains={"line0": chain}) as rig:
         await asyncio.sleep(2.0)
-        service = rig.daemon.rig.buses[0]
         before = await bus_health(rig)
 
-        for poller in tuple(service._pollers.values()):
-            service.bus.remove_poller(poller)
-        await asyncio.sleep(3.0)
+        chain.unplug(asyncio.get_running_loop().time())
+        await asyncio.sleep(4.0)
 
         after = await bus_health(rig)
+        assert (before.up, after.up) == (True, False)
+        assert after.losses == before.losses + 1
         assert all(axis.rate_hz == 0 and axis.sample_age_s > 1.5 for axis in after.axes)
+        assert all(axis.link is LinkState.DOWN for axis in after.axes)
         assert after.utilisation < before.utilisation / 2
+
+
+async def daemon_health(rig) -> DaemonHealth:
+    (answer,) = await rig.session.query(KEYS.health)
+    return decode_received(DaemonHealth, answer.payload, answer.encoding)
+
+
+async def test_a_loop_that_is_held_up_says_for_how_long_and_what_it_left_out():
+    loop = asyncio.get_running_loop()
+    async with running_rig() as rig:
+        await asyncio.sleep(5.0)
+        calm = await daemon_health(rig)
+
+        loop.call_later(0.55, loop.hold_up, 0.3)
+        await asyncio.sleep(1.5)
+        held_up = await daemon_health(rig)
+        loop.call_later(0.55, loop.hold_up, 2.5)
+        await asyncio.sleep(6.0)
+        left_out = await daemon_health(rig)
+
+        assert (calm.loop_lag_s, calm.missed_reports) == (pytest.approx(0.0, abs=1e-6), 0)
+        assert held_up.loop_lag_s == pytest.approx(0.3, abs=0.1)
+        assert held_up.missed_reports == 0
+        assert left_out.missed_reports == 2
+        assert left_out.loop_lag_s == pytest.approx(0.0, abs=1e-6)  # and that is over
+
+
+async def test_the_latencies_of_a_lane_add_up():
+    async with running_rig() as rig:
+        await asyncio.sleep(5.0)
+
+        polls = (await bus_health(rig)).lanes[Lane.POLL]
+
+        assert sum(polls.counts) == polls.exchanges > 100
+        assert polls.total_s / polls.exchanges <= polls.longest_s
+        shares = list(accumulate(polls.counts))
+        middle = next(bucket for bucket, share in enumerate(shares) if share >= polls.exchanges / 2)
+        assert polls.p50_s == min(bucket_limit_s(middle), polls.longest_s)
+
+
+async def test_queries_that_are_too_many_are_counted():
+    async with running_rig() as rig:
+        before = await daemon_health(rig)
+        key, many = KEYS.command("_", "holders"), PENDING_QUERIES + 10
+
+        async with asyncio.TaskGroup() as group:
+            for number in range(many):
+                group.create_task(rig.session.query(key), name=f"query {number}")
+        await asyncio.sleep(2.0)
+
+        assert before.dropped == 0
+        after = await daemon_health(rig)
+        assert (after.dropped, after.waiting_queries) == (10, 0)
+
+
+async def test_the_wear_of_an_eeprom_is_reported_for_the_drives_that_have_one(tmp_path):
+    (tmp_path / LEDGER_FILE).write_text(json.dumps({"feed": {"Pn100": 7, "Pn101": 5}}))
+    config = load_config(MIXED).model_copy(update={"state_dir": tmp_path})
+    async with running_rig(config) as rig:
+        await asyncio.sleep(2.0)
+
+        answers = await rig.session.query(Keys(config.rig).bus_health("*"))
+
+        axes = {
+            axis.axis: axis.eeprom_writes
+            for answer in answers
+            for axis in decode_received(BusHealth, answer.payload, answer.encoding).axes
+        }
+        assert axes == {"x": None, "feed": 12, "spool": 0}
 
 
 async def test_reports_leave_the_network_with_the_daemon():

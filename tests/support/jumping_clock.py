@@ -36,6 +36,10 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         """Return virtual seconds since the loop was made."""
         return self._jumping.now_s
 
+    def hold_up(self, duration_s: float) -> None:
+        """Let time pass as if the callback that runs now had taken so long."""
+        self._jumping.now_s += duration_s
+
     def run_in_executor(self, _executor: Any, func: Any, *args: Any) -> "asyncio.Future[Any]":  # type: ignore[override]
         """Run at once: a thread's work takes no virtual time."""
         future: asyncio.Future[Any] = self.create_future()

@@ -6,6 +6,7 @@ import threading
 import pytest
 
 from ldcnd.messaging.hand_over import HandOver, TokenChanges
+from ldcnd.messaging.session import Load
 from ldcnd.messaging.workers import Workers
 
 pytestmark = pytest.mark.real_time
@@ -22,7 +23,7 @@ async def test_items_of_a_thread_arrive_in_order_and_the_oldest_are_lost_and_cou
 
     async with asyncio.timeout(2):
         assert [await arrived.get() for _ in range(10)] == list(range(15, 25))
-    assert hand_over.lost == 15
+    assert hand_over.load() == Load(waiting=0, lost=15)
 
 
 async def test_a_closed_hand_over_delivers_nothing_and_returns_what_was_left() -> None:

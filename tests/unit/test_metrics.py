@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import promql_parser
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
@@ -12,13 +13,19 @@ from ldcnd.model.axes import LinkState
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
-DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=0)
+DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9)
 BUS = BusHealth(
     t=1, seq=0, bus="line0", up=True, utilisation=0.25, exchanges=1000, timeouts=3, corrupt_replies=2,
     rejected_packets=0, resent=4, resynchronisations=5, stray_bytes=6, losses=1,
-    lanes=(LaneHealth(lane="poll", waiting=0, exchanges=900, p50_s=0.002, p99_s=0.008, longest_s=0.02),),
+    lanes=(
+        LaneHealth(
+            lane="poll", waiting=7, exchanges=900, p50_s=0.002, p99_s=0.008, longest_s=0.02,
+            total_s=1.8, counts=(0,) * 5 + (500, 390, 10) + (0,) * 12,
+        ),
+    ),
     axes=(
-        AxisHealth(axis="x", link=LinkState.UP, sample_age_s=0.04, rate_wanted_hz=20.0, rate_hz=19.5, faults=2),
+        AxisHealth(axis="x", link=LinkState.UP, sample_age_s=0.04, rate_wanted_hz=20.0, rate_hz=19.5, faults=2,
+                   eeprom_writes=12),
         AxisHealth(axis="y", link=LinkState.DOWN, sample_age_s=None, rate_wanted_hz=20.0, rate_hz=0.0, faults=0),
     ),
 )  # fmt: skip
@@ -57,7 +64,19 @@ def registry(clock) -> CollectorRegistry:
         ("ldcnd_bus_resent_total", {"bus": "line0"}, 4.0),
         ("ldcnd_bus_errors_total", {"bus": "line0", "kind": "timeouts"}, 3.0),
         ("ldcnd_bus_errors_total", {"bus": "line0", "kind": "stray_bytes"}, 6.0),
-        ("ldcnd_lane_latency_seconds", {"bus": "line0", "lane": "poll", "quantile": "0.99"}, 0.008),
+        ("ldcnd_missed_reports_total", {}, 8.0),
+        ("ldcnd_waiting_queries", {}, 3.0),
+        ("ldcnd_dropped_total", {}, 9.0),
+        ("ldcnd_lane_waiting", {"bus": "line0", "lane": "poll"}, 7.0),
+        ("ldcnd_lane_latency_seconds_bucket", {"bus": "line0", "lane": "poll", "le": "6.4e-05"}, 0.0),
+        ("ldcnd_lane_latency_seconds_bucket", {"bus": "line0", "lane": "poll", "le": "0.002048"}, 500.0),
+        ("ldcnd_lane_latency_seconds_bucket", {"bus": "line0", "lane": "poll", "le": "0.004096"}, 890.0),
+        ("ldcnd_lane_latency_seconds_bucket", {"bus": "line0", "lane": "poll", "le": "+Inf"}, 900.0),
+        ("ldcnd_lane_latency_seconds_count", {"bus": "line0", "lane": "poll"}, 900.0),
+        ("ldcnd_lane_latency_seconds_sum", {"bus": "line0", "lane": "poll"}, 1.8),
+        ("ldcnd_lane_longest_seconds", {"bus": "line0", "lane": "poll"}, 0.02),
+        ("ldcnd_axis_eeprom_writes_total", {"bus": "line0", "axis": "x"}, 12.0),
+        ("ldcnd_axis_eeprom_writes_total", {"bus": "line0", "axis": "y"}, None),
         ("ldcnd_axis_up", {"bus": "line0", "axis": "x"}, 1.0),
         ("ldcnd_axis_up", {"bus": "line0", "axis": "y"}, 0.0),
         ("ldcnd_axis_sample_age_seconds", {"bus": "line0", "axis": "x"}, 0.04),
@@ -87,6 +106,47 @@ def test_every_metric_that_a_file_names_exists(registry, name):
 
     assert len(named) > 5
     assert named <= exists
+
+
+def expressions(name):
+    text = (GRAFANA / name).read_text()
+    if name.endswith(".yml"):
+        return re.findall(r"^ +expr: (.+)$", text, re.MULTILINE)
+    return [target["expr"] for panel in json.loads(text)["panels"] for target in panel["targets"]]
+
+
+def selected(expression):
+    """Return metric and label names of each selector of an expression."""
+    found = []
+
+    def visit(node):
+        selector = node.vector_selector if isinstance(node, promql_parser.MatrixSelector) else node
+        if isinstance(selector, promql_parser.VectorSelector):
+            found.append((selector.name, {matcher.name for matcher in selector.matchers.matchers}))
+
+    promql_parser.walk(promql_parser.parse(expression), visit)
+    return found
+
+
+@pytest.mark.parametrize("name", ["alerts.yml", "dashboard.json"])
+def test_every_expression_is_promql_and_selects_by_labels_that_exist(registry, name):
+    labels = {sample.name: set(sample.labels) for metric in registry.collect() for sample in metric.samples}
+
+    found = [selector for expression in expressions(name) for selector in selected(expression)]
+
+    assert len(found) >= len(expressions(name)) > 8
+    for metric, used in found:
+        assert used <= labels[metric], metric
+
+
+def test_every_alert_has_a_severity_and_a_summary():
+    text = (GRAFANA / "alerts.yml").read_text()
+
+    alerts = text.split("- alert: ")[1:]
+    assert len(alerts) == len(expressions("alerts.yml"))
+    for alert in alerts:
+        assert re.search(r"labels: \{severity: (warning|critical)\}", alert)
+        assert re.search(r"annotations: \{summary: \".+\"\}", alert)
 
 
 def test_the_dashboard_is_a_document_whose_panels_do_not_overlap():
