@@ -119,6 +119,7 @@ async def test_the_latencies_of_a_lane_add_up():
 
 async def test_queries_that_are_too_many_are_counted():
     async with running_rig() as rig:
+        await asyncio.sleep(2.0)
         before = await daemon_health(rig)
         key, many = KEYS.command("_", "holders"), PENDING_QUERIES + 10
 

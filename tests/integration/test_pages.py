@@ -102,7 +102,7 @@ async def test_the_tutorials_can_be_followed(tmp_path) -> None:
     assert "nearest: 100.0" in reader.printed
     assert "killed" in reader.printed
     assert (tmp_path / "move.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "run.csv").read_text().count("\n") > 100
+    assert " positions, from " in reader.printed
 
 
 @pytest.mark.real_time
