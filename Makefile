@@ -3,7 +3,7 @@ PY := .venv/bin/python
 CONFIG ?= config/simulated.toml
 PYTHON ?= python3
 
-.PHONY: run test check fix docs soak bench clean
+.PHONY: run test check fix docs dist soak bench clean
 
 run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
@@ -23,11 +23,18 @@ fix: .venv/ready
 	.venv/bin/ruff format .
 	.venv/bin/ldcnd schema write
 	.venv/bin/ldcnd schema configuration
+	.venv/bin/ldcnd schema cli
 
 # the site in build/docs, warnings as errors, and its tutorials followed; apart from `make test`, whose time it would eat up
 docs: .venv/docs-ready
 	.venv/bin/sphinx-build -W --keep-going -q -b html -d build/doctrees docs build/docs
 	$(PY) -m pytest tests/integration/test_pages.py -m pages
+
+# wheel, sdist and the bill of materials, the same bytes from the same commit
+dist: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct)
+dist: .venv/ready
+	$(PY) -m hatchling build -d dist
+	$(PY) deploy/sbom.py > dist/sbom.cdx.json
 
 # properties on cases that were never tried, for as long as an hour, and what takes minutes
 soak: .venv/ready

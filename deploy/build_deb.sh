@@ -20,7 +20,7 @@ opt=$root/opt/ldcnd
 units=$root/usr/lib/systemd/system
 doc=$root/usr/share/doc/ldcnd
 
-"$uv" build --quiet --wheel --python "$python" --out-dir "$stage" "$source"
+"$uv" build --quiet --wheel --build-constraints "$source/constraints.txt" --python "$python" --out-dir "$stage" "$source"
 wheel=$(echo "$stage"/*.whl)
 version=$(basename "$wheel" | cut -d- -f2)
 
@@ -46,6 +46,9 @@ install -Dm644 "$here/modules-load.d/ldcnd.conf" "$root/usr/lib/modules-load.d/l
 install -Dm644 -t "$doc/examples" "$here/drop-ins/realtime.conf" "$here/drop-ins/lan.conf" "$source"/config/*.toml
 install -Dm644 "$here/INSTALL.md" "$doc/INSTALL.md"
 install -Dm644 "$source/LICENSE" "$doc/copyright"
+"$opt/bin/python" "$here/sbom.py" ${extras//,/ } > "$doc/sbom.cdx.json"
+"$opt/bin/ldcnd" schema man "$root/usr/share/man/man1" >/dev/null
+gzip -9n "$root"/usr/share/man/man1/*.1
 mkdir -p "$root/etc/ldcnd" "$root/usr/bin" "$root/DEBIAN"
 ln -s /opt/ldcnd/bin/ldcnd "$root/usr/bin/ldcnd"
 

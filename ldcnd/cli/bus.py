@@ -37,7 +37,13 @@ def list_buses(target: Target) -> None:
 
 @command.command("wire-log")
 @click.argument("bus")
-@click.option("--seconds", type=click.FloatRange(0, 3600, min_open=True), default=10.0, show_default=True)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, 3600, min_open=True),
+    default=10.0,
+    show_default=True,
+    help="How far back.",
+)
 @click.option("--decode", is_flag=True, help="Say in words what each packet means.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Text file, or pcapng by that suffix.")
 @with_target

@@ -18,6 +18,8 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.frozen import Frozen
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+TARGET_OPTIONS = frozenset({"--connect", "--listen", "--config", "--rig", "--json"})
+"""What `with_target` gives to a command."""
 ResultT = TypeVar("ResultT")
 CommandT = TypeVar("CommandT", bound=Callable[..., object])
 

@@ -6,14 +6,8 @@ from pathlib import Path
 
 import click
 
+from ldcnd.errors import ConfigError
 from ldcnd.pki.access import Role
-
-try:
-    from ldcnd.pki.site import Site, new_login, set_up
-except ModuleNotFoundError as error:
-    if error.name is None or not error.name.startswith("cryptography"):
-        raise
-    raise click.ClickException("certificates need another library: pip install 'ldcnd[pki]'") from None
 
 FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 DAYS = 730
@@ -32,6 +26,9 @@ def command() -> None:
 @click.option("--name", default="ldcnd site", show_default=True, help="Common name of the authority.")
 def init(folder: Path, name: str) -> None:
     """Make the site's authority in FOLDER."""
+    _require_cryptography()
+    from ldcnd.pki.site import set_up  # noqa: PLC0415 - needs an optional package
+
     set_up(folder, name, _now())
     click.echo(f"{folder}: authority made; next: ldcnd pki add {folder} NAME --role daemon --ip ADDRESS")
 
@@ -45,6 +42,9 @@ def init(folder: Path, name: str) -> None:
 @click.option("--days", type=click.IntRange(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
 def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
     """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
+    _require_cryptography()
+    from ldcnd.pki.site import Site, new_login  # noqa: PLC0415 - needs an optional package
+
     login = new_login(name, Role(role), (*hosts, *addresses))
     site = Site(folder)
     file = site.add(login, _now(), days)
@@ -63,10 +63,20 @@ def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: t
 @click.argument("name")
 def revoke(folder: Path, name: str) -> None:
     """Take the rights of a viewer or operator back."""
+    _require_cryptography()
+    from ldcnd.pki.site import Site  # noqa: PLC0415 - needs an optional package
+
     site = Site(folder)
     site.revoke(name)
     click.echo(f"{name}: revoked")
     _say_restart(site.listener_files())
+
+
+def _require_cryptography() -> None:
+    try:
+        import cryptography  # noqa: F401, PLC0415 - an optional package
+    except ImportError as error:
+        raise ConfigError("cryptography is not installed: pip install 'ldcnd[pki]'") from error
 
 
 def _say_restart(files: Iterable[Path]) -> None:

@@ -23,7 +23,13 @@ log = get_logger("run")
 @click.option("--listen", "-l", multiple=True, help="Listen here instead of the configured endpoints; may be repeated.")
 @click.option("--connect", "-e", multiple=True, help="Connect here too; may be repeated.")
 @click.option("--log-json", is_flag=True, help="Log JSON lines instead of text.")
-@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="info")
+@click.option(
+    "--log-level",
+    type=click.Choice(["debug", "info", "warning", "error"]),
+    default="info",
+    show_default=True,
+    help="Log nothing below this.",
+)
 def command(config: Path, listen: tuple[str, ...], connect: tuple[str, ...], *, log_json: bool, log_level: str) -> None:
     """Own the lines of a rig and serve its drives until SIGTERM or SIGINT; moving axes are stopped first.
 

@@ -1,9 +1,11 @@
-"""`ldcnd schema`: the generated files in `schemas/`."""
+"""`ldcnd schema`: what is generated from models, keys, configuration and commands."""
 
 from pathlib import Path
 
 import click
 
+from ldcnd.cli.manual import as_markdown as as_reference
+from ldcnd.cli.manual import man_pages
 from ldcnd.config_reference import config_reference
 from ldcnd.daemon.asyncapi import asyncapi_text
 from ldcnd.daemon.contract import all_schemas, as_markdown
@@ -47,6 +49,25 @@ def configuration(page: Path) -> None:
     """Write the reference of the configuration file to PAGE."""
     page.write_text(config_reference(), encoding="utf-8")
     click.echo(str(page))
+
+
+@command.command("cli")
+@click.argument("page", type=click.Path(path_type=Path), default=Path("docs/reference/cli.md"))
+def command_line(page: Path) -> None:
+    """Write the reference of the command line to PAGE."""
+    page.write_text(as_reference(), encoding="utf-8")
+    click.echo(str(page))
+
+
+@command.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+def man(folder: Path) -> None:
+    """Write the man pages into FOLDER."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pages = man_pages()
+    for name, text in pages.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    click.echo(f"{len(pages)} man pages in {folder}")
 
 
 @command.command()

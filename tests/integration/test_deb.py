@@ -1,6 +1,7 @@
 """The Debian package and the guide that says how to install it."""
 
 import hashlib
+import json
 import re
 import shutil
 import subprocess
@@ -14,7 +15,14 @@ from tests.support.package import ROOT, build, package, snapshot, why_no_package
 DEPLOY = ROOT / "deploy"
 EXPOSURE_LIMIT = "15"
 """In tenths, as `--threshold` takes it."""
-OURS = ("./opt/ldcnd/", "./etc/ldcnd/", "./usr/bin/ldcnd", "./usr/share/doc/ldcnd/", "./usr/lib/")
+OURS = (
+    "./opt/ldcnd/",
+    "./etc/ldcnd/",
+    "./usr/bin/ldcnd",
+    "./usr/share/doc/ldcnd/",
+    "./usr/share/man/man1/ldcnd",
+    "./usr/lib/",
+)
 COMMANDS = re.compile(r"(?ms)^```sh\n(.*?)^```$")
 
 pytestmark = pytest.mark.real_time
@@ -50,6 +58,9 @@ def test_package_holds_what_the_service_needs_and_touches_nothing_else(deb: Path
         "./usr/share/doc/ldcnd/INSTALL.md",
         "./usr/share/doc/ldcnd/copyright",
         "./usr/share/doc/ldcnd/examples/simulated.toml",
+        "./usr/share/doc/ldcnd/sbom.cdx.json",
+        "./usr/share/man/man1/ldcnd.1.gz",
+        "./usr/share/man/man1/ldcnd-axis.1.gz",
     } <= set(files)
     assert "./etc/ldcnd/" in paths  # and no configuration: nothing runs unless somebody wrote one
 
@@ -65,6 +76,9 @@ def test_program_runs_wherever_the_package_is_unpacked(deb: Path, tmp_path: Path
     )
 
     assert "axes x, y, z, c: valid" in checked
+    parts = json.loads((tmp_path / "usr/share/doc/ldcnd/sbom.cdx.json").read_text())["components"]
+    installed = {path.name.partition("-")[0] for path in (tmp_path / "opt/ldcnd/lib").rglob("*.dist-info")}
+    assert {part["name"].replace("-", "_") for part in parts} == {name.lower() for name in installed} - {"ldcnd"}
     compiled = (tmp_path / "opt/ldcnd/lib").rglob("ldcnd/__pycache__/config.*.pyc")
     assert all(str(tmp_path) not in code.read_bytes().decode("latin-1") for code in compiled)
 
@@ -77,6 +91,7 @@ def test_same_source_gives_the_same_package(deb: Path, tmp_path: Path):
 
 
 @booted
+@pytest.mark.timeout(180)
 def test_every_command_of_the_guide_works(deb: Path):
     commands = COMMANDS.findall((DEPLOY / "INSTALL.md").read_text(encoding="utf-8"))
     assert len(commands) >= 8

@@ -140,6 +140,8 @@ def _overlay(place: Path, stack: ExitStack) -> Path:
         "-t", "overlay", "-o", f"lowerdir=/,upperdir={above / 'changed'},workdir={above / 'work'}", "overlay", str(root)
     )
     mount("-t", "tmpfs", "ldcnd-test", str(root / "etc/systemd/system"))
+    # a package with manuals would have this machine's man-db, if it has one, look through all manuals that it knows
+    (root / "var/lib/man-db/auto-update").unlink(missing_ok=True)
     return root
 
 

@@ -1,0 +1,130 @@
+"""What is handed out: the same bytes from the same source, with everything in it, and a list of what it needs."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
+
+from ldcnd.fault_pages import codes
+from tests.support.pages import ROOT
+
+NOT_SOURCE = shutil.ignore_patterns(".git", ".venv", "build", "dist", "state", "__pycache__", ".*_cache", ".hypothesis")
+EPOCH = "1700000000"
+RUNTIME_EXTRAS = {"fast", "foxglove", "journal", "metrics", "pki", "plot", "record", "tui"}
+PINS = set(re.findall(r"(?m)^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text()))
+
+
+def built(source: Path, out: Path) -> dict[str, Path]:
+    """Build a wheel and an sdist without fetching anything."""
+    wheel, *_ = WheelBuilder(str(source)).build(directory=str(out), versions=["standard"])
+    sdist, *_ = SdistBuilder(str(source)).build(directory=str(out), versions=["standard"])
+    return {"wheel": Path(wheel), "sdist": Path(sdist)}
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Path]]:
+    """Build from two copies of the source, in other places, of other ages and with other rights."""
+    results = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", EPOCH)
+        for age_s, mode in ((0, 0o644), (86400, 0o664)):
+            place = tmp_path_factory.mktemp("build")
+            source = place / f"source{age_s}"
+            shutil.copytree(ROOT, source, ignore=NOT_SOURCE)
+            for path in source.rglob("*"):
+                if path.is_file():
+                    path.chmod(mode | (path.stat().st_mode & 0o111))
+                    os.utime(path, (1.6e9 + age_s, 1.6e9 + age_s))
+            results.append(built(source, place / "dist"))
+    return results
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_the_same_source_gives_the_same_bytes(twice: list[dict[str, Path]], kind: str) -> None:
+    one, other = (build[kind] for build in twice)
+
+    assert one.name == other.name
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_the_wheel_has_the_pages_and_no_tests(twice: list[dict[str, Path]]) -> None:
+    with zipfile.ZipFile(twice[0]["wheel"]) as wheel:
+        names = set(wheel.namelist())
+        metadata = wheel.read(next(name for name in names if name.endswith("METADATA"))).decode()
+
+    assert {f"ldcnd/fault_pages/{code}.md" for code in codes()} <= names
+    assert "ldcnd/py.typed" in names
+    assert {name.partition("/")[0].partition("-")[0] for name in names} == {"ldcnd"}
+    assert set(re.findall(r"(?m)^Provides-Extra: (\S+)", metadata)) >= RUNTIME_EXTRAS
+
+
+def test_the_sdist_has_what_building_testing_and_reading_takes(twice: list[dict[str, Path]]) -> None:
+    with tarfile.open(twice[0]["sdist"]) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+
+    assert {
+        "pyproject.toml",
+        "constraints.txt",
+        "Makefile",
+        "CONTRIBUTING.md",
+        "deploy/sbom.py",
+        "docs/conf.py",
+        "docs/tutorials/first-rig.md",
+        "examples/move_and_watch.py",
+        "schemas/fault_sample.json",
+        "tests/unit/test_packaging.py",
+    } <= names
+    assert not [name for name in names if name.startswith(("docs/faults/", "build/", ".venv/"))]
+
+
+def bill(*extras: str) -> dict[str, Any]:
+    """Return the bill of materials of this environment."""
+    done = subprocess.run(  # noqa: S603 - our own script
+        [sys.executable, str(ROOT / "deploy" / "sbom.py"), *extras],
+        env=os.environ | {"SOURCE_DATE_EPOCH": EPOCH},
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=True,
+    )
+    document: dict[str, Any] = json.loads(done.stdout)
+    assert "://" not in done.stdout  # no address of anything
+    return document
+
+
+def test_the_bill_of_materials_has_what_is_pinned_and_nothing_dangling() -> None:
+    document = bill()
+    parts = {part["name"]: part for part in document["components"]}
+    refs = {part["bom-ref"] for part in parts.values()} | {document["metadata"]["component"]["bom-ref"]}
+
+    assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
+    assert document["metadata"]["timestamp"] == "2023-11-14T22:13:20+00:00"
+    assert {"pydantic", "eclipse-zenoh", "mcap", "prometheus-client", "matplotlib"} <= set(parts)
+    assert not {"pytest", "mypy", "sphinx", "hypothesis"} & set(parts)
+    assert all(part["licenses"] for part in parts.values())
+    assert len(refs) == len(parts) + 1
+    for link in document["dependencies"]:
+        assert {link["ref"], *link["dependsOn"]} <= refs
+    assert {(name, part["version"]) for name, part in parts.items()} <= PINS
+
+
+def test_an_extra_that_is_not_asked_for_is_not_on_the_bill() -> None:
+    names = {part["name"] for part in bill("fast", "journal")["components"]}
+
+    assert "uvloop" in names
+    assert "matplotlib" not in names
+
+
+def test_an_extra_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(subprocess.CalledProcessError):
+        bill("nonsense")
