@@ -86,7 +86,7 @@ def test_every_link_leads_somewhere(page) -> None:
 
 @pytest.mark.pages
 @pytest.mark.real_time
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 async def test_the_tutorials_can_be_followed(tmp_path) -> None:
     async with PageReader(tmp_path) as reader:
         await reader.follow(ROOT / FIRST_RIG, NOT_RUN)

@@ -16,7 +16,7 @@ from ldcnd.model.traces import TracePhase
 from tests.support.pages import Block, blocks_of
 from tests.support.process import END_TIME_S, START_TIME_S, answering, client, free_port
 
-COMMAND_TIME_S = 60.0
+COMMAND_TIME_S = 120.0
 FILE_NAME = re.compile(r"# (\S+\.(?:py|toml))\n")
 PORT_OF_THE_PAGES = "7447"
 
@@ -56,6 +56,7 @@ class PageReader:
                 await self._interrupt()
             if (block.page, block.first_line) not in left_out:
                 await self._do(block)
+            assert all(process.returncode is None for process in self._running), f"{block}: what should serve has ended"
 
     async def start_daemon(self, config: str) -> None:
         """Start a daemon on a file that an earlier page has had written."""
@@ -74,6 +75,8 @@ class PageReader:
         ready = self._serves(shlex.split(last, comments=True))
         if ready is None:
             at_once.append(last)
+        if last.startswith("ldcnd sim") and self._running:
+            await self._interrupt()  # its link is wanted again
         if at_once:
             await self._run("\n".join(at_once), block)
         if ready is not None:
