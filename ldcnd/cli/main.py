@@ -30,6 +30,8 @@ COMMANDS = {
     "bus": ("ldcnd.cli.bus", "Look at the lines of a running daemon."),
     "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),
     "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),
+    "plot": ("ldcnd.cli.plot", "Draw an axis of a recording."),
+    "foxglove": ("ldcnd.cli.foxglove", "Show a running rig live in Foxglove, read-only."),
     "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
     "trace": ("ldcnd.cli.trace", "Record an axis against time, look at the result, draw it."),
     "doctor": ("ldcnd.cli.doctor", "Examine a line by reading only, before a daemon uses it."),

@@ -5,6 +5,7 @@ import signal
 
 import click
 
+from ldcnd.cli.address import Address, parse_address
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
@@ -13,17 +14,16 @@ DEFAULT_ADDRESS = "127.0.0.1:9464"
 
 
 @click.command()
-@click.option("--address", default=DEFAULT_ADDRESS, show_default=True, help="Where to serve HTTP, as HOST:PORT.")
+@click.option(
+    "--address", callback=parse_address, default=DEFAULT_ADDRESS, show_default=True, help="Where to serve, HOST:PORT."
+)
 @with_target
-def command(target: Target, address: str) -> None:
+def command(target: Target, address: Address) -> None:
     """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for whoever reads them."""
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal():
-        raise click.BadParameter(f"{address!r} is not HOST:PORT", param_hint="--address")
-    target.run(lambda client: _serve(client, host.strip("[]"), int(port)))
+    target.run(lambda client: _serve(client, address))
 
 
-async def _serve(client: RigClient, host: str, port: int) -> None:
+async def _serve(client: RigClient, address: Address) -> None:
     try:
         from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415 - an optional package
 
@@ -39,10 +39,11 @@ async def _serve(client: RigClient, host: str, port: int) -> None:
         loop.add_signal_handler(number, ending.set)
     async with client.health(collector.take):
         try:
-            server, thread = start_http_server(port, host, registry)
+            server, thread = start_http_server(address.port, address.host, registry)
         except OSError as error:
-            raise ConfigError(f"cannot serve on {host}:{port}: {error.strerror}", value=port) from error
-        click.echo(f"metrics on http://{host}:{server.server_port}/metrics")
+            where = f"{address.host}:{address.port}"
+            raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+        click.echo(f"metrics on http://{address.host}:{server.server_port}/metrics")
         try:
             await ending.wait()
         finally:

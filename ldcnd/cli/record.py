@@ -4,18 +4,15 @@ import asyncio
 import signal
 import sys
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
 
 FILE = click.Path(path_type=Path, dir_okay=False)
-EXISTING_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
-EXIT_INCOMPLETE = 1
 
 
 @click.group(invoke_without_command=True)
@@ -28,7 +25,7 @@ def command(target: Target, out: Path | None, rotate_mb: int) -> None:
         return
     if out is None:
         raise click.UsageError("--out is missing")
-    _require_mcap()
+    require_mcap()
     try:
         target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
     except OSError as error:
@@ -36,31 +33,31 @@ def command(target: Target, out: Path | None, rotate_mb: int) -> None:
 
 
 @command.command("recover")
-@click.argument("damaged", type=EXISTING_FILE)
+@click.argument("damaged", type=RECORDING)
 @click.argument("whole", type=FILE)
 def recover_file(damaged: Path, whole: Path) -> None:
     """Copy what can be read of DAMAGED, such as NAME.mcap.part after a power cut, into WHOLE."""
-    _require_mcap()
+    require_mcap()
     from ldcnd.recording.recovery import recover  # noqa: PLC0415 - needs an optional package
 
     saved = recover(damaged, whole)
-    _tell_damages(damaged, [str(damage) for damage in saved.damages])
-    until = f", the last of {_utc(saved.last_ns)}" if saved.messages else ""
+    tell_damages(damaged, saved.damages)
+    until = f", the last of {utc(saved.last_ns)}" if saved.messages else ""
     click.echo(f"{saved.messages} messages recovered{until}; {saved.losses.missing.total()} missing in between")
 
 
 @command.command("export")
-@click.argument("recording", type=EXISTING_FILE)
+@click.argument("recording", type=RECORDING)
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 def export(recording: Path, folder: Path) -> None:
     """Write RECORDING into FOLDER as CSV: a table for each topic, a row for each message, a column for each value."""
-    _require_mcap()
+    require_mcap()
     from ldcnd.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
 
     done = export_tables(recording, folder)
     click.echo(f"{done.rows} messages in {len(done.tables)} tables in {folder}")
     if done.damages:
-        _tell_damages(recording, [str(damage) for damage in done.damages])
+        tell_damages(recording, done.damages)
         sys.exit(EXIT_INCOMPLETE)
 
 
@@ -78,19 +75,3 @@ async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
                 await recorder.run(gave_way)
             finally:
                 click.echo(recorder.summary, err=True)
-
-
-def _tell_damages(path: Path, damages: list[str]) -> None:
-    for damage in damages:
-        click.echo(f"{path}, {damage}", err=True)
-
-
-def _utc(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-
-
-def _require_mcap() -> None:
-    try:
-        import mcap  # noqa: F401, PLC0415 - an optional package
-    except ImportError as error:
-        raise ConfigError("mcap is not installed", remedy="install ldcnd[record]") from error

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader, breakup_chunk
 from zstandard import ZstdError
@@ -14,6 +14,8 @@ from ldcnd.errors import ConfigError
 
 _UNREADABLE = (McapError, ZstdError, struct.error, ValueError)
 """What the package raises on bytes that make no sense; wrong checksums are a ValueError."""
+_SHORT = (EndOfFile, struct.error)
+"""What it raises on bytes that are not there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,8 @@ class Recording:
                 except _UNREADABLE as error:
                     if at == 0:
                         raise ConfigError(f"{self.path}: not an MCAP file", value=str(self.path)) from error
-                    self._damaged(at, _reason(error))
+                    short = isinstance(error, _SHORT)
+                    self._damaged(at, "the file was cut short here" if short else str(error))
                     return
                 if record is None:
                     return
@@ -74,13 +77,9 @@ class Recording:
         try:
             parts = breakup_chunk(chunk, validate_crc=True)
         except _UNREADABLE as error:
-            self._damaged(at, f"a chunk of {len(chunk.data)} bytes is damaged: {_reason(error)}")
+            self._damaged(at, f"a chunk of {len(chunk.data)} bytes is damaged: {error}")
             return
         yield from parts
 
     def _damaged(self, at: int, reason: str) -> None:
         self.damages.append(Damage(at, reason))
-
-
-def _reason(error: Exception) -> str:
-    return str(error) or "the file was cut short here"

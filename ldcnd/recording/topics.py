@@ -1,6 +1,7 @@
 """Which model travels on which telemetry key."""
 
 from ldcnd.messaging.codec import decode_received
+from ldcnd.messaging.keys import ROOT
 from ldcnd.messaging.session import Sample
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.health import BusHealth, DaemonHealth
@@ -32,6 +33,14 @@ def model_of(key: str) -> type[Published] | None:
             return DaemonHealth
         case "meta", ["health", _]:
             return BusHealth
+    return None
+
+
+def axis_of(key: str) -> str | None:
+    """Return whose telemetry a key carries, or None for what belongs to no axis."""
+    match key.split("/"):
+        case [root, _, "tele", axis, *_] if root == ROOT:
+            return axis
     return None
 
 

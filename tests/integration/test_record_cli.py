@@ -1,24 +1,27 @@
 """`ldcnd record` against a daemon in its own process over loopback TCP."""
 
 import asyncio
+import re
 import signal
 from asyncio.subprocess import PIPE
 
 import pytest
+from click.testing import CliRunner
 
+from ldcnd.cli.main import cli
+from ldcnd.messaging.codec import Encoding, encode
+from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.model.samples import PositionSample
+from ldcnd.recording.recorder import Recorder
 from tests.support.process import LDCND, ROOT, daemon
 
-pytestmark = pytest.mark.real_time
+VALUE = PositionSample(
+    t=1, t_error_ns=0, seq=0, quality="good", value=1.5, unit="mm", counts=1500, following_error=None
+)
+POSITION = Sample("ldcn/sim/tele/x/position", *encode(VALUE, Encoding.JSON), SampleKind.PUT, VALUE.t)
 
 
-async def ldcnd(*arguments):
-    """Run `ldcnd ARGUMENTS` and return its exit code and what it printed, errors last."""
-    running = await asyncio.create_subprocess_exec(*LDCND, *arguments, stdout=PIPE, stderr=PIPE)
-    async with asyncio.timeout(45):
-        printed, errors = await running.communicate()
-    return running.returncode, printed.decode(), errors.decode()
-
-
+@pytest.mark.real_time
 async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
     path, whole, tables = tmp_path / "run.mcap", tmp_path / "whole.mcap", tmp_path / "tables"
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
@@ -32,10 +35,27 @@ async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
             recording.send_signal(signal.SIGTERM)
             _, told = await recording.communicate()
 
-    exported = await ldcnd("record", "export", str(path), str(tables))
-    recovered = await ldcnd("record", "recover", str(path), str(whole))
+    exported = CliRunner().invoke(cli, ["record", "export", str(path), str(tables)])
+    recovered = CliRunner().invoke(cli, ["record", "recover", str(path), str(whole)])
+    count = told.decode().split()[0]
     assert recording.returncode == 0
-    assert "none missing" in told.decode()
-    assert exported[0] == 0, exported[2]
+    assert int(count) > 0
+    assert (exported.exit_code, exported.output.split()[0]) == (0, count)
     assert (tables / "ldcn.sim.tele.x.position.csv").read_text().startswith("t_ns,received_ns,")
-    assert (recovered[0], recovered[1].split()[0]) == (0, told.decode().split()[0])
+    assert (recovered.exit_code, recovered.output.split()[0]) == (0, count)
+
+
+async def test_a_damaged_recording_is_recovered_and_exported_as_far_as_it_goes_and_says_where_it_ends(tmp_path):
+    path, cut, whole, tables = (tmp_path / name for name in ("run.mcap", "cut.mcap", "whole.mcap", "tables"))
+    with Recorder(path, {}, lambda: 0, 1 << 30) as recorder:
+        recorder.take(POSITION)
+    cut.write_bytes(path.read_bytes()[:-30])
+
+    recovered = CliRunner().invoke(cli, ["record", "recover", str(cut), str(whole)])
+    exported = CliRunner().invoke(cli, ["record", "export", str(cut), str(tables)])
+
+    assert (recovered.exit_code, exported.exit_code) == (0, 1)
+    assert re.search(r"cut\.mcap, byte \d+: the file was cut short here", recovered.stderr)
+    assert recovered.stdout.startswith("1 messages recovered, the last of 1970-01-01T00:00:00")
+    assert exported.stdout.startswith("1 messages in 1 tables")
+    assert "cut short" in exported.stderr

@@ -3,10 +3,11 @@
 import asyncio
 import json
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jsonschema_rs
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 from ldcnd.config import RigConfig, load_config
 from ldcnd.messaging.session import Sample
 from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder
+from ldcnd.sim.chain import Chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 LARGE = 1 << 40
@@ -37,10 +39,15 @@ class RecordedRig:
 
 @asynccontextmanager
 async def recorded_rig(
-    path: Path, config: RigConfig | None = None, *, rotate_bytes: int = LARGE, kept: int = KEPT_SAMPLES
+    path: Path,
+    config: RigConfig | None = None,
+    *,
+    rotate_bytes: int = LARGE,
+    kept: int = KEPT_SAMPLES,
+    chains: Mapping[str, Chain] = MappingProxyType({}),
 ) -> AsyncIterator[RecordedRig]:
     """Record a rig until the context ends."""
-    async with running_rig(config) as rig:
+    async with running_rig(config, chains) as rig:
         loop = asyncio.get_running_loop()
         counts: Counter[str] = Counter()
         descriptions = await rig.client.descriptions()

@@ -1,0 +1,38 @@
+"""`ldcnd foxglove`: a running rig, live in the Foxglove app."""
+
+import asyncio
+import signal
+
+import click
+
+from ldcnd.cli.address import Address, parse_address
+from ldcnd.cli.connection import Target, with_target
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import ConfigError
+
+DEFAULT_ADDRESS = "127.0.0.1:8765"
+
+
+@click.command()
+@click.option(
+    "--address", callback=parse_address, default=DEFAULT_ADDRESS, show_default=True, help="Where to serve, HOST:PORT."
+)
+@with_target
+def command(target: Target, address: Address) -> None:
+    """Show a rig in Foxglove until SIGTERM or SIGINT; read-only, and open to whoever reaches the address."""
+    target.run(lambda client: _serve(client, address))
+
+
+async def _serve(client: RigClient, address: Address) -> None:
+    try:
+        from ldcnd.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
+    except ImportError as error:
+        raise ConfigError("foxglove-sdk is not installed", remedy="install ldcnd[foxglove]") from error
+    ending = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ending.set)
+    with LiveView(f"ldcnd {client.rig}", address.host, address.port) as view:
+        async with client.published(view.take):
+            click.echo(f"rig {client.rig} on ws://{address.host}:{view.port}")
+            await ending.wait()

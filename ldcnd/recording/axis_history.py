@@ -1,0 +1,111 @@
+"""One axis of a recording against time: what a picture of it needs."""
+
+import math
+from dataclasses import dataclass, field
+
+from mcap.records import Channel, Message
+
+from ldcnd.errors import UnknownAxis
+from ldcnd.model.axes import Quality
+from ldcnd.model.events import CommandEvent
+from ldcnd.model.monitors import MonitorSample
+from ldcnd.model.samples import AdcSample, FaultSample, PositionSample, Sample, VelocitySample
+from ldcnd.recording.messages import LogMessage
+from ldcnd.recording.reading import Recording
+from ldcnd.recording.topics import axis_of, model_of
+
+
+@dataclass(slots=True)
+class Series:
+    """One quantity.
+
+    Attributes:
+        title: what it is.
+        unit: its unit; empty without one.
+        t_ns: when each value was true, UTC in ns since 1970.
+        values: as many; NaN where the value was worth nothing.
+    """
+
+    title: str
+    unit: str
+    t_ns: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+
+class AxisHistory:
+    """What is known of one axis.
+
+    Attributes:
+        axis: its name.
+        series: the quantities, in the order in which they were first published.
+        events: what became of its commands, in order.
+        faults: from when to when a fault stood that stops the motor, UTC in ns since 1970; an end of None is not known.
+    """
+
+    def __init__(self, axis: str) -> None:
+        self.axis = axis
+        self.series: list[Series] = []
+        self.events: list[CommandEvent] = []
+        self.faults: list[tuple[int, int | None]] = []
+
+    def add(self, key: str, data: bytes) -> None:
+        """Take a message of the axis, in JSON."""
+        model = model_of(key)
+        if model is None:
+            return
+        recorded = LogMessage if model is CommandEvent else model
+        match recorded.model_validate_json(data, extra="ignore"):
+            case LogMessage() as log:
+                self.events.append(log.event)
+            case FaultSample() as sample:
+                self._fault(sample.t, stands=any(fault.stops for fault in sample.active))
+            case PositionSample() as sample:
+                self._value(sample, "position", sample.unit, sample.value)
+                if sample.following_error is not None:
+                    self._value(sample, "following error", sample.unit, sample.following_error)
+            case VelocitySample() as sample:
+                self._value(sample, "velocity", sample.unit, sample.value)
+            case AdcSample() as sample:
+                self._value(sample, "analog input", "V", sample.volts)
+            case MonitorSample() as sample:
+                self._value(sample, sample.title, sample.unit, sample.value)
+
+    def _fault(self, t_ns: int, *, stands: bool) -> None:
+        open_since = self.faults[-1][0] if self.faults and self.faults[-1][1] is None else None
+        if stands and open_since is None:
+            self.faults.append((t_ns, None))
+        elif not stands and open_since is not None:
+            self.faults[-1] = (open_since, t_ns)
+
+    def _value(self, sample: Sample, title: str, unit: str, value: float) -> None:
+        series = next((series for series in self.series if series.title == title), None)
+        if series is None:
+            series = Series(title, unit)
+            self.series.append(series)
+        series.t_ns.append(sample.t)
+        series.values.append(math.nan if sample.quality is Quality.BAD else value)
+
+
+def axis_history(recording: Recording, axis: str) -> AxisHistory:
+    """Read one axis of a recording.
+
+    Raises:
+        ConfigError: the file is no recording.
+        UnknownAxis: it has no such axis; names those that it has.
+    """
+    history = AxisHistory(axis)
+    axes: set[str] = set()
+    keys: dict[int, str] = {}
+    for record in recording.records():
+        if isinstance(record, Channel):
+            name = axis_of(key := record.topic.removeprefix("/"))
+            if name is not None:
+                axes.add(name)
+            if name == axis:
+                keys[record.id] = key
+        elif isinstance(record, Message) and record.channel_id in keys:
+            history.add(keys[record.channel_id], record.data)
+    if axis not in axes:
+        known = ", ".join(sorted(axes)) or "none"
+        raise UnknownAxis(f"{recording.path} has no axis {axis!r}; it has {known}", axis=axis, value=axis)
+    return history

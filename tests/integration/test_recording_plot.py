@@ -1,0 +1,58 @@
+"""An axis of a recording as a picture."""
+
+import asyncio
+import math
+
+import pytest
+from click.testing import CliRunner
+
+from ldcnd.cli.main import cli
+from ldcnd.config import load_config
+from ldcnd.drivers.ldcn.simulator import build_chain
+from ldcnd.model.axes import AxisState
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.recording.axis_history import axis_history
+from ldcnd.recording.reading import Recording
+from tests.support.recordings import recorded_rig
+from tests.support.rig import SIMULATED
+
+
+async def record_a_move_and_an_outage(path):
+    chain = build_chain(load_config(SIMULATED).sim[0].spec(starts_at_s=0.0))
+    async with recorded_rig(path, chains={"line0": chain}) as recorded:
+        rig = recorded.rig
+        await rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await asyncio.sleep(3.0)
+        chain.unplug(asyncio.get_running_loop().time(), for_s=1.0)
+        await asyncio.sleep(4.0)
+
+
+async def test_a_recorded_axis_is_drawn_with_its_commands_and_without_what_nobody_measured(tmp_path):
+    path, picture = tmp_path / "run.mcap", tmp_path / "x.png"
+    await record_a_move_and_an_outage(path)
+
+    history = axis_history(Recording(path), "x")
+    drawn = CliRunner().invoke(cli, ["plot", str(path), "x", "-o", str(picture)])
+
+    quantities = {series.title: series for series in history.series}
+    position = quantities["position"]
+    assert set(quantities) == {"position", "following error", "velocity", "analog input"}
+    assert position.unit == "mm"
+    assert max(value for value in position.values if not math.isnan(value)) == pytest.approx(5.0, abs=0.1)
+    assert any(map(math.isnan, position.values))
+    assert [event.verb for event in history.events if event.status is CommandStatus.DONE] == ["power", "move_absolute"]
+    assert drawn.exit_code == 0, drawn.output
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+async def test_an_axis_that_is_not_in_the_recording_is_named_with_those_that_are(tmp_path):
+    path = tmp_path / "run.mcap"
+    async with recorded_rig(path):
+        await asyncio.sleep(2.0)
+
+    refused = CliRunner().invoke(cli, ["plot", str(path), "q", "-o", str(tmp_path / "q.png")])
+
+    assert "no axis 'q'; it has c, x, y, z" in str(refused.exception)
