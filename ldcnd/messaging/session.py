@@ -37,7 +37,7 @@ class Qos(StrEnum):
     TELEMETRY = "telemetry"
     """Periodic values: dropped when the network is full, the next one is on its way."""
     EVENT = "event"
-    """State changes and faults: overtake telemetry, sent at once."""
+    """State changes and faults: overtake telemetry."""
     BULK = "bulk"
     """Traces: only what bandwidth is left."""
 

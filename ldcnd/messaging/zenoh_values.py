@@ -20,7 +20,8 @@ class Travel(TypedDict):
 _DROP = zenoh.CongestionControl.DROP
 TRAVEL: Mapping[Qos, Travel] = {
     Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
-    Qos.EVENT: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True},
+    # not express: each sample would take a batch for itself, and of a burst all but two would be dropped
+    Qos.EVENT: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": False},
     Qos.BULK: {"congestion_control": _DROP, "priority": zenoh.Priority.BACKGROUND, "express": False},
 }
 

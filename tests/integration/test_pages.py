@@ -10,6 +10,7 @@ from tests.support.page_reader import PageReader
 from tests.support.pages import ROOT, Block, blocks_of, command_lines, pages, require_command_line
 
 FIRST_RIG = "docs/tutorials/first-rig.md"
+MONITOR = "docs/how-to/monitor-a-rig.md"
 NEXT = (
     "docs/tutorials/move-from-python.md",
     "docs/tutorials/take-a-trace.md",
@@ -30,6 +31,8 @@ NOT_RUN = {
         "test_the_example_follows_a_moving_axis_to_its_target"
     ),
     (FIRST_RIG, "python3 -m venv ldcnd-env"): "fetches packages",
+    (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
+    (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",
     ("docs/how-to/secure-a-rig.md", "ldcnd axis move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (
         "needs the socket of the service"
     ),
@@ -103,6 +106,7 @@ async def test_the_tutorials_can_be_followed(tmp_path) -> None:
     assert "killed" in reader.printed
     assert (tmp_path / "move.png").read_bytes().startswith(b"\x89PNG")
     assert " positions, from " in reader.printed
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.real_time

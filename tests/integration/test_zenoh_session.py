@@ -16,7 +16,7 @@ from ldcnd.messaging.session import Qos, Query, Session
 from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts
-from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, until
+from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, subscribed, until
 
 pytestmark = pytest.mark.real_time
 
@@ -150,6 +150,19 @@ async def test_a_frozen_client_holds_up_neither_publishing_nor_stops_nor_closing
     assert published_s < 2
     assert (len(answers), stopped_s < 1) == (1, True)
     assert closed_s < 3
+
+
+async def test_state_changes_of_a_whole_rig_at_once_all_arrive(pair: Pair) -> None:
+    """A stop or a lost line changes the states and faults of all axes in one turn of the loop."""
+    burst = [f"{KEYS.telemetry('x', 'state')}/{number}" for number in range(2 * 31)]
+    samples = await subscribed(pair.server, pair.client)
+
+    for key in burst:
+        pair.server.publish(key, b"x" * 300, encoding=JSON, qos=Qos.EVENT)
+
+    async with asyncio.timeout(10):
+        arrived = [(await samples.get()).key for _ in burst]
+    assert arrived == burst
 
 
 async def test_a_subscriber_that_never_drains_does_not_delay_a_stop(pair: Pair, endpoint: str) -> None:
