@@ -162,8 +162,10 @@ class Line:
                 # not believed before no other reply can come
                 self.phase, self._kept = Phase.LINGER, (reply, now_s)
                 self._watchdog.set(until_s)
+            elif verdict is ReplyVerdict.REJECTED:
+                self._rejected(turn, reply)
             else:
-                self._settle(turn, reply, now_s)
+                self._complete(turn, reply, now_s)
             return
 
     def _true_reply_by_s(self, turn: Turn) -> float:
@@ -182,7 +184,7 @@ class Line:
 
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
-        self._note(WireEvent.RECEIVED, reply)
+        self._wire_log.add(now_s, WireEvent.RECEIVED, reply)
         request_s = len(turn.exchange.request) * self._byte_s
         reply_s = len(reply) * self._byte_s
         sent_s = self._sent_at_s + request_s

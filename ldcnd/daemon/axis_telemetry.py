@@ -34,6 +34,17 @@ class AxisTelemetry:
         self._scale = scale
         self._adc_full_scale = adc_full_scale
         self._adc_volts = adc_volts
+        self._velocity_unit = f"{tracker.unit}/s"
+        self._position, self._velocity, self._adc, self._state, self._faults = (
+            publisher.item(tracker.name, item)
+            for item in (
+                TelemetryItem.POSITION,
+                TelemetryItem.VELOCITY,
+                TelemetryItem.ADC,
+                TelemetryItem.STATE,
+                TelemetryItem.FAULT,
+            )
+        )
         self._last_state: StateKey | None = None
         self._last_faults: FaultKey | None = None
 
@@ -44,54 +55,49 @@ class AxisTelemetry:
     def reading(self, reading: AxisReading, asked: frozenset[TelemetryItem], t: int, t_error_ns: int) -> None:
         """Publish what was asked for, and the state if it changed."""
         tracker, scale = self._tracker, self._scale
-        axis, unit, quality = tracker.name, tracker.unit, tracker.quality
+        quality = tracker.quality
         counts, velocity, adc = reading.position_counts, reading.velocity_counts_per_s, reading.adc_counts
         if TelemetryItem.POSITION in asked:
             lag = reading.following_error_counts
-            sample_lag = None if lag is None else scale.to_units(lag)
-            value = self.position(counts)
-            self._publisher.publish(
-                axis,
-                TelemetryItem.POSITION,
-                lambda seq: PositionSample(
+            topic = self._position
+            topic.publish(
+                PositionSample(
                     t=t,
                     t_error_ns=t_error_ns,
-                    seq=seq,
+                    seq=topic.seq,
                     quality=quality,
-                    value=value,
-                    unit=unit,
+                    value=self.position(counts),
+                    unit=tracker.unit,
                     counts=counts,
-                    following_error=sample_lag,
-                ),
+                    following_error=None if lag is None else scale.to_units(lag),
+                )
             )
         if TelemetryItem.VELOCITY in asked:
-            self._publisher.publish(
-                axis,
-                TelemetryItem.VELOCITY,
-                lambda seq: VelocitySample(
+            topic = self._velocity
+            topic.publish(
+                VelocitySample(
                     t=t,
                     t_error_ns=t_error_ns,
-                    seq=seq,
+                    seq=topic.seq,
                     quality=quality,
                     value=scale.to_units(velocity),
-                    unit=f"{unit}/s",
+                    unit=self._velocity_unit,
                     counts_per_s=velocity,
-                ),
+                )
             )
         if TelemetryItem.ADC in asked and adc is not None and self._adc_full_scale:
             full_scale = self._adc_full_scale
-            self._publisher.publish(
-                axis,
-                TelemetryItem.ADC,
-                lambda seq: AdcSample(
+            topic = self._adc
+            topic.publish(
+                AdcSample(
                     t=t,
                     t_error_ns=t_error_ns,
-                    seq=seq,
+                    seq=topic.seq,
                     quality=quality,
                     counts=adc,
                     full_scale=full_scale,
                     volts=adc / full_scale * self._adc_volts,
-                ),
+                )
             )
         self.state(t, t_error_ns, due=TelemetryItem.STATE in asked)
 
@@ -101,23 +107,19 @@ class AxisTelemetry:
         state = _state_of(tracker)
         if due or state != self._last_state:
             self._last_state = state
-            self._publisher.publish(
-                tracker.name, TelemetryItem.STATE, lambda seq: _state_sample(tracker, t, t_error_ns, seq)
-            )
+            self._state.publish(_state_sample(tracker, t, t_error_ns, self._state.seq))
         faults = (tracker.active_faults, tracker.first_fault)
         if due or faults != self._last_faults:
             self._last_faults = faults
-            self._publisher.publish(
-                tracker.name,
-                TelemetryItem.FAULT,
-                lambda seq: FaultSample(
+            self._faults.publish(
+                FaultSample(
                     t=t,
                     t_error_ns=t_error_ns,
-                    seq=seq,
+                    seq=self._faults.seq,
                     quality=tracker.quality,
                     active=tracker.active_faults,
                     first=tracker.first_fault,
-                ),
+                )
             )
 
     def monitor(self, value: MonitorValue, t: int, t_error_ns: int) -> None:
@@ -125,25 +127,24 @@ class AxisTelemetry:
         quality = self._tracker.quality
         if value.resolved and quality is Quality.GOOD:
             quality = Quality.UNCERTAIN
-        self._publisher.publish_monitor(
-            self._tracker.name,
-            value.name,
-            lambda seq: MonitorSample(
+        topic = self._publisher.monitor(self._tracker.name, value.name)
+        topic.publish(
+            MonitorSample(
                 t=t,
                 t_error_ns=t_error_ns,
-                seq=seq,
+                seq=topic.seq,
                 quality=quality,
                 value=value.value,
                 unit=value.unit,
                 title=value.title,
                 high=value.high,
-            ),
+            )
         )
 
     def stale(self, t: int) -> None:
         """Publish the last values once more as what they are now: not measurements any more."""
-        for item in (TelemetryItem.POSITION, TelemetryItem.VELOCITY, TelemetryItem.ADC):
-            self._publisher.publish_stale(self._tracker.name, item, self._tracker.quality)
+        for topic in (self._position, self._velocity, self._adc):
+            topic.publish_again(self._tracker.quality)
         self.state(t)
 
 

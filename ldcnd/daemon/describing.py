@@ -54,8 +54,8 @@ class Describing:
         encoding = _wanted_encoding(query)
         for key, last in self._publisher.last.items():
             if matches(query.key, key):
-                payload, name = encode(last.sample, encoding)
-                query.reply(payload, name, key=key, measured_at_ns=last.measured_at_ns)
+                payload, name = encode(last, encoding)
+                query.reply(payload, name, key=key, measured_at_ns=last.t)
         query.finish()
 
     def on_meta(self, query: Query) -> None:

@@ -135,7 +135,7 @@ class HealthWatch:
         return AxisHealth(
             axis=name,
             link=axis.tracker.link,
-            sample_age_s=max(0.0, (t - last.measured_at_ns) / 1e9) if last else None,
+            sample_age_s=max(0.0, (t - last.t) / 1e9) if last else None,
             rate_wanted_hz=axis.config.rates.position,
             rate_hz=self._granted_hz(name, TelemetryItem.POSITION, period_s),
             faults=len(axis.tracker.active_faults),
@@ -154,7 +154,7 @@ class HealthWatch:
     def _count(self, axis: str, item: TelemetryItem) -> int:
         """Return how many samples of an item were published so far."""
         last = self._publisher.last.get(self._keys.telemetry(axis, item))
-        return last.sample.seq + 1 if last else 0
+        return last.seq + 1 if last else 0
 
     def _note_counters(self) -> None:
         self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}

@@ -1,8 +1,5 @@
 """Samples on their way out: numbers them, keeps the last of each, hands them to the session without waiting."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.session import Qos, Session
@@ -22,12 +19,31 @@ QOS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class LastValue:
-    """The newest sample of one key, and when it was true."""
+class Topic:
+    """One key's samples on their way out; made by `Publisher`.
 
-    sample: Sample
-    measured_at_ns: int
+    Attributes:
+        seq: number of the next sample.
+    """
+
+    __slots__ = ("_key", "_publisher", "_qos", "seq")
+
+    def __init__(self, publisher: "Publisher", key: str, qos: Qos) -> None:
+        self.seq = 0
+        self._publisher = publisher
+        self._key = key
+        self._qos = qos
+
+    def publish(self, sample: Sample) -> None:
+        """Publish a sample that has the number `seq`."""
+        self.seq += 1
+        self._publisher.send(self._key, sample, self._qos)
+
+    def publish_again(self, quality: Quality) -> None:
+        """Publish the last sample with what it is worth now; it keeps the instant at which it was true."""
+        last = self._publisher.last.get(self._key)
+        if last and last.quality is not quality:
+            self.publish(last.model_copy(update={"seq": self.seq, "quality": quality}))
 
 
 class Publisher:
@@ -39,31 +55,25 @@ class Publisher:
     """
 
     def __init__(self, session: Session, keys: Keys, encoding: Encoding) -> None:
-        self.last: dict[str, LastValue] = {}
+        self.last: dict[str, Sample] = {}
         self.published = 0
         self._session = session
         self._keys = keys
         self._encoding = encoding
-        self._sequence: dict[str, int] = {}
-        self._item_keys: dict[tuple[str, TelemetryItem], str] = {}  # spelling a key checks its chunks
+        self._topics: dict[str, Topic] = {}
 
-    def publish(self, axis: str, item: TelemetryItem, make: Callable[[int], Sample]) -> None:
-        """Publish the sample that `make` builds for its sequence number."""
-        key = self._item_keys.get((axis, item))
-        if key is None:
-            key = self._item_keys[axis, item] = self._keys.telemetry(axis, item)
-        self._publish(key, make, QOS[item])
+    def item(self, axis: str, item: TelemetryItem) -> Topic:
+        """Return the topic of one item of an axis."""
+        return self._topic(self._keys.telemetry(axis, item), QOS[item])
 
-    def publish_monitor(self, axis: str, name: MonitorName, make: Callable[[int], Sample]) -> None:
-        """Publish one monitor of a drive."""
-        self._publish(self._keys.monitor(axis, name), make, Qos.TELEMETRY)
+    def monitor(self, axis: str, name: MonitorName) -> Topic:
+        """Return the topic of one monitor of a drive."""
+        return self._topic(self._keys.monitor(axis, name), Qos.TELEMETRY)
 
-    def _publish(self, key: str, make: Callable[[int], Sample], qos: Qos) -> None:
-        seq = self._sequence.get(key, 0)
-        self._sequence[key] = seq + 1
+    def send(self, key: str, sample: Sample, qos: Qos) -> None:
+        """Hand a sample to the network and keep it as the last one of its key."""
         self.published += 1
-        sample = make(seq)
-        self.last[key] = LastValue(sample, sample.t)
+        self.last[key] = sample
         payload, encoding = encode(sample, self._encoding)
         self._session.publish(key, payload, encoding=encoding, qos=qos, measured_at_ns=sample.t)
 
@@ -86,12 +96,13 @@ class Publisher:
 
     def publish_trace(self, axis: str, header: TraceHeader) -> None:
         """Publish how far a trace is."""
-        self._publish(self._keys.trace(axis), lambda seq: header.model_copy(update={"seq": seq}), Qos.BULK)
+        topic = self._topic(self._keys.trace(axis), Qos.BULK)
+        topic.publish(header.model_copy(update={"seq": topic.seq}))
 
     def publish_trace_chunk(self, axis: str, index: int, chunk: TraceChunk) -> None:
         """Publish samples of the last trace."""
-        key = self._keys.trace_chunk(axis, index)
-        self._publish(key, lambda seq: chunk.model_copy(update={"seq": seq}), Qos.BULK)
+        topic = self._topic(self._keys.trace_chunk(axis, index), Qos.BULK)
+        topic.publish(chunk.model_copy(update={"seq": topic.seq}))
 
     def withdraw_trace_chunks(self, axis: str) -> None:
         """Take the samples of the last trace off the network."""
@@ -99,12 +110,6 @@ class Publisher:
         for key in [key for key in self.last if key.startswith(below)]:
             del self.last[key]
             self._session.delete(key)
-
-    def publish_stale(self, axis: str, item: TelemetryItem, quality: Quality) -> None:
-        """Publish the last sample again with what it is worth now; it keeps the instant at which it was true."""
-        last = self.last.get(self._keys.telemetry(axis, item))
-        if last and last.sample.quality is not quality:
-            self.publish(axis, item, lambda seq: last.sample.model_copy(update={"seq": seq, "quality": quality}))
 
     def withdraw(self, axis: str) -> None:
         """Take an axis off the network: its last values must not look alive."""
@@ -115,3 +120,9 @@ class Publisher:
         for key in keys:
             if self.last.pop(key, None):
                 self._session.delete(key)
+
+    def _topic(self, key: str, qos: Qos) -> Topic:
+        topic = self._topics.get(key)
+        if topic is None:
+            topic = self._topics[key] = Topic(self, key, qos)
+        return topic

@@ -9,6 +9,7 @@ import math
 import sys
 from collections.abc import Mapping
 from enum import StrEnum
+from functools import cache
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -95,7 +96,7 @@ def encode(model: Frozen, encoding: Encoding) -> tuple[bytes, str]:
     """Return a model's payload and the name of its encoding on the wire."""
     if encoding is Encoding.JSON:
         return model.model_dump_json().encode(), encoding.value
-    return msgpack.packb(model.model_dump(mode="json")), f"{encoding.value};{schema_name(type(model))}"
+    return msgpack.packb(vars(model), default=_packable), _msgpack_name(type(model))
 
 
 def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
@@ -176,6 +177,16 @@ def rebuild_error(reply: ReceivedError) -> LdcndError:
         nearest=reply.nearest,
         remedy=reply.remedy,
     )
+
+
+@cache
+def _msgpack_name(model: type[Frozen]) -> str:
+    return f"{Encoding.MSGPACK.value};{schema_name(model)}"
+
+
+def _packable(value: object) -> object:
+    """Return what JSON would say of a value that msgpack does not know; fields that it knows need no detour."""
+    return vars(value) if isinstance(value, Frozen) else pydantic_core.to_jsonable_python(value)
 
 
 def _text(payload: bytes, encoding: str) -> bytes:

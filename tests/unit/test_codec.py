@@ -23,7 +23,7 @@ from ldcnd.messaging.codec import (
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.errors import ErrorReply
 from ldcnd.model.requests import REQUEST_MODELS, HomeRequest, MoveAbsoluteRequest, PowerRequest, ResetRequest
-from ldcnd.model.samples import StateSample
+from ldcnd.model.samples import CurrentCommand, FaultEntry, FaultSample, StateSample
 
 STATE = StateSample(
     t=1_700_000_000_123_456_789, t_error_ns=5, seq=3, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True,
@@ -50,6 +50,16 @@ def test_a_sample_survives_either_encoding(encoding: Encoding) -> None:
 def test_encodings_are_named_as_stock_tools_expect() -> None:
     assert encode(STATE, Encoding.JSON)[1] == "application/json"
     assert encode(STATE, Encoding.MSGPACK)[1] == "application/msgpack;state_sample"
+
+
+def test_both_encodings_say_the_same_of_models_within_models() -> None:
+    fault = FaultEntry(code="overheat", text="too hot", since=1, source="drive")
+    command = CurrentCommand(command_id="c-1", verb="home", since=1, target=-0.5)
+    for model in (
+        STATE.model_copy(update={"command": command}),
+        FaultSample(t=1, t_error_ns=0, seq=0, quality=Quality.BAD, active=(fault, fault), first=fault),
+    ):
+        assert msgpack.unpackb(encode(model, Encoding.MSGPACK)[0]) == json.loads(encode(model, Encoding.JSON)[0])
 
 
 @given(moves, st.sampled_from(list(Encoding)))

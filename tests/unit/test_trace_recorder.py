@@ -83,7 +83,7 @@ async def recording(tracer) -> AsyncIterator[tuple[TraceRecorder, Publisher]]:
 
 
 def header(publisher):
-    return publisher.last["ldcn/rig/tele/x/trace"].sample
+    return publisher.last["ldcn/rig/tele/x/trace"]
 
 
 async def until(publisher, phase):
@@ -100,11 +100,11 @@ async def test_the_longest_trace_of_the_longest_numbers_fits_into_payloads():
         await until(publisher, TracePhase.COMPLETE)
         last = dict(publisher.last)
 
-    chunks = [last[f"ldcn/rig/tele/x/trace/{index}"].sample for index in range(header(publisher).chunks)]
+    chunks = [last[f"ldcn/rig/tele/x/trace/{index}"] for index in range(header(publisher).chunks)]
     assert sum(len(chunk.offsets_ns) for chunk in chunks) == MOST_SAMPLES
     assert [chunk.first for chunk in chunks] == [index * len(chunks[0].offsets_ns) for index in range(len(chunks))]
     for encoding in Encoding:
-        assert max(len(encode(each.sample, encoding)[0]) for each in last.values()) <= MAX_PAYLOAD_BYTES
+        assert max(len(encode(each, encoding)[0]) for each in last.values()) <= MAX_PAYLOAD_BYTES
 
 
 async def test_a_shorter_trace_leaves_no_chunk_of_the_longer_one_before():

@@ -81,6 +81,10 @@ class Status:
     bit7: int | None = None
 
 
+_STATUS_FLAGS = tuple(map(StatusFlag, range(256)))
+_AUX_FLAGS = tuple(map(AuxFlag, range(256)))
+"""By the byte: to make a flag costs as much as to decode all other items."""
+
 _POSITION, _ADC, _VELOCITY, _AUX, _HOME, _IDENTITY, _POSITION_ERROR, _BIT7 = map(int, StatusItem)
 """As numbers: arithmetic with flags costs ten times as much, and every reply needs it."""
 
@@ -166,7 +170,7 @@ def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
         velocity = -int.from_bytes(data[at : at + 2], "little", signed=True)
         at += 2
     if mask & _AUX:
-        aux = AuxFlag(data[at])
+        aux = _AUX_FLAGS[data[at]]
         at += 1
     if mask & _HOME:
         home = int.from_bytes(data[at : at + 4], "little", signed=True)
@@ -180,7 +184,7 @@ def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
     if mask & _BIT7 and profile.bit7_bytes:
         bit7 = data[at]
     return Status(
-        StatusFlag(data[0]),
+        _STATUS_FLAGS[data[0]],
         position,
         adc,
         velocity,
