@@ -6,7 +6,8 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from ldcnd.bus_config import BusConfig
-from ldcnd.config_names import Name, refuse_duplicates
+from ldcnd.config_names import NAME_CHARACTERS, Name, refuse_duplicates
+from ldcnd.errors import ConfigError
 from ldcnd.model.frozen import Frozen
 from ldcnd.simulation_config import SimulatedChainConfig
 from ldcnd.smartstep_config import SimulatedUnitConfig
@@ -103,6 +104,26 @@ class RigConfig(Frozen):
             if bus.port.startswith("sim:") and (bus.family == "smartstep") is not (bus.port[4:] in units):
                 raise ValueError(f"bus {bus.name}: SmartSteps are simulated by units, other drives by modules")
         return self
+
+
+def single_line(rig: RigConfig, name: str) -> RigConfig:
+    """Return the rig that one line is by itself: `<rig>_<line>`, with a state directory of its own below the rig's.
+
+    Raises:
+        ConfigError: there is no such line, or the name becomes too long.
+    """
+    lines = tuple(bus for bus in rig.bus if bus.name == name)
+    if not lines:
+        raise ConfigError(f"rig {rig.rig} has no bus {name!r}", value=name, remedy=f"one of {_names(rig)}")
+    alone = f"{rig.rig}_{name}"
+    if len(alone) > NAME_CHARACTERS:
+        raise ConfigError(f"{alone} is too long for a rig's name", value=len(alone), limit=NAME_CHARACTERS)
+    state_dir = rig.state_dir / name if rig.state_dir else None
+    return rig.model_copy(update={"rig": alone, "bus": lines, "state_dir": state_dir})
+
+
+def _names(rig: RigConfig) -> str:
+    return ", ".join(bus.name for bus in rig.bus)
 
 
 def load_config(path: Path) -> RigConfig:

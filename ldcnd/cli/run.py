@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config import RigConfig, load_config, single_line
 from ldcnd.daemon.assembly import open_daemon
 from ldcnd.daemon.planning import require_plan
 from ldcnd.daemon.process import held_awake, loop_factory, settle_heap
@@ -22,6 +22,7 @@ log = get_logger("run")
 @click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
 @click.option("--listen", "-l", multiple=True, help="Listen here instead of the configured endpoints; may be repeated.")
 @click.option("--connect", "-e", multiple=True, help="Connect here too; may be repeated.")
+@click.option("--bus", help="Serve this line only, as the rig RIG_BUS: one process for each line.")
 @click.option("--log-json", is_flag=True, help="Log JSON lines instead of text.")
 @click.option(
     "--log-level",
@@ -30,7 +31,9 @@ log = get_logger("run")
     show_default=True,
     help="Log nothing below this.",
 )
-def command(config: Path, listen: tuple[str, ...], connect: tuple[str, ...], *, log_json: bool, log_level: str) -> None:
+def command(
+    config: Path, listen: tuple[str, ...], connect: tuple[str, ...], bus: str | None, *, log_json: bool, log_level: str
+) -> None:
     """Own the lines of a rig and serve its drives until SIGTERM or SIGINT; moving axes are stopped first.
 
     SIGHUP reads CONFIG again: limits, default speeds and rates change at once, the log names what needs a restart.
@@ -39,6 +42,8 @@ def command(config: Path, listen: tuple[str, ...], connect: tuple[str, ...], *, 
 
     def load() -> RigConfig:
         rig = load_config(config)
+        if bus:
+            rig = single_line(rig, bus)
         require_plan(rig)
         zenoh = rig.zenoh.model_copy(
             update={"listen": listen or rig.zenoh.listen, "connect": (*rig.zenoh.connect, *connect)}

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config import load_config, single_line
 from ldcnd.errors import ConfigError
 
 GOOD = """
@@ -102,3 +102,35 @@ def test_all_complaints_come_at_once(tmp_path):
         load(tmp_path, GOOD.replace("address = 1", "address = 0").replace("acceleration = 100", "acceleration = -1"))
 
     assert len(error.value.message.splitlines()) == 2
+
+
+TWO_LINES = (
+    'state_dir = "/var/lib/ldcnd"\n'
+    + GOOD
+    + GOOD.replace('rig = "bench"', "")
+    .replace('name = "a"', 'name = "b"')
+    .replace('name = "x"', 'name = "y"')
+    .replace("USB0", "USB1")
+)
+
+
+def test_lines_that_are_served_by_processes_of_their_own_share_no_key_and_no_file(tmp_path):
+    rig = load(tmp_path, TWO_LINES)
+
+    a, b = (single_line(rig, name) for name in "ab")
+
+    assert [[bus.name for bus in line.bus] for line in (a, b)] == [["a"], ["b"]]
+    assert (a.rig, b.rig) == ("bench_a", "bench_b")
+    assert (a.state_dir, b.state_dir) == (Path("/var/lib/ldcnd/a"), Path("/var/lib/ldcnd/b"))
+
+
+def test_a_line_that_is_not_there_cannot_be_served_alone(tmp_path):
+    with pytest.raises(ConfigError, match="rig bench has no bus 'c'"):
+        single_line(load(tmp_path, TWO_LINES), "c")
+
+
+def test_the_name_of_a_line_that_is_served_alone_must_fit_into_a_key(tmp_path):
+    rig = load(tmp_path, TWO_LINES.replace("bench", "b" * 63))
+
+    with pytest.raises(ConfigError, match="too long"):
+        single_line(rig, "a")
