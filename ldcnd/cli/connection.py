@@ -1,8 +1,7 @@
 """How commands find a running daemon: Zenoh's usual flags, a session, a rig."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -10,8 +9,8 @@ from typing import TypeVar
 
 import click
 
-from ldcnd.client.rig_client import RigClient, find_rigs
-from ldcnd.errors import SessionError, UnknownAxis
+from ldcnd.client.connecting import open_rig
+from ldcnd.client.rig_client import RigClient
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
@@ -46,7 +45,7 @@ class Target:
         """Open a session, find the rig, do the work, and close."""
 
         async def within() -> ResultT:
-            async with self._client() as client:
+            async with open_rig(self._settings(), self.rig) as client:
                 return await work(client)
 
         return asyncio.run(within())
@@ -63,26 +62,6 @@ class Target:
     def show(self, model: Frozen, text: str) -> None:
         """Print one result."""
         print(model.model_dump_json() if self.as_json else text, flush=True)
-
-    @asynccontextmanager
-    async def _client(self) -> AsyncIterator[RigClient]:
-        settings = self._settings()
-        async with open_zenoh_session(settings) as session:
-            rig = self.rig
-            if rig is None:
-                rigs = [daemon.rig for daemon in await find_rigs(session)]
-                if not rigs:
-                    raise SessionError(
-                        f"no daemon answers at {', '.join(settings.connect) or 'the configured endpoints'}",
-                        remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role"
-                        " sees none either",
-                    )
-                if len(rigs) > 1:
-                    raise UnknownAxis(
-                        f"there are several rigs: {', '.join(sorted(rigs))}", remedy="choose one with --rig"
-                    )
-                rig = rigs[0]
-            yield RigClient(session, rig)
 
     def _settings(self) -> ZenohSettings:
         endpoints = self.connect or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))

@@ -28,6 +28,27 @@ async def test_the_example_follows_a_moving_axis_to_its_target():
     assert any(0.5 < position < 9.5 for position in positions)
 
 
+async def test_both_clients_move_under_a_lease_follow_the_motion_and_hear_why_they_are_refused():
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        programs = [
+            await asyncio.create_subprocess_exec(
+                sys.executable, str(ROOT / "examples" / f"client_{kind}.py"), endpoint, axis, stdout=PIPE
+            )
+            for kind, axis in (("asyncio", "x"), ("blocking", "y"))
+        ]
+        async with asyncio.timeout(45):
+            told = [(await program.communicate())[0].decode().splitlines() for program in programs]
+
+    assert [program.returncode for program in programs] == [0, 0]
+    for *steps, ended, refused in told:
+        left = [float(step.split()[2]) for step in steps]
+        assert len(left) > 3
+        assert left[0] > 3.0
+        assert abs(left[-1]) < 0.5
+        assert ended == "ended: standstill as asked"
+        assert refused.startswith("refused: position_limit")
+
+
 def test_the_example_is_thirty_lines_and_needs_nothing_of_ours():
     text = EXAMPLE.read_text()
 
