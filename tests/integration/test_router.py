@@ -135,10 +135,11 @@ async def test_a_router_killed_under_load_makes_no_move_happen_twice_and_telemet
                 await first.wait()
                 assert not moves.done()
                 async with router(endpoint):
-                    after = await position_after(positions, before.seq + 20)
+                    await position_after(positions, before.seq + 20)
                     replies = await moves
                     end = await client.wait_for_end("x", replies[-1].command_id)
-                    reached = await position_after(positions, after.seq + 10)
+                    async with client.samples("x", "position") as fresh:
+                        reached = await position_after(fresh, before.seq + 20)
 
     targets = [reply.position for reply in replies]
     assert targets == pytest.approx([STEP * number for number in range(1, MOVES + 1)])
