@@ -16,6 +16,6 @@ def command(target: Target, axis: str | None, count: int) -> None:
     """Show the latest events of the rig, oldest first."""
     for event in target.run(lambda client: latest_events(client, count, axis)):
         at = datetime.fromtimestamp(event.t / 1e9, UTC).isoformat(timespec="milliseconds")
-        who = event.client or "somebody"
+        who = f"{event.client or 'somebody'} ({f'login {event.login}' if event.login else 'not authenticated'})"
         why = f": {event.reason}" if event.reason else ""
         target.show(event, f"{at} {event.axis:8} {event.verb:14} {event.status:10} by {who} ({event.command_id}){why}")

@@ -50,8 +50,14 @@ class CommandDesk:
         self._next_command_id = next_command_id
         self._under_way: dict[str, asyncio.Event] = {}
 
-    async def carry_out(self, axis_name: str, verb: Verb, request: Request) -> CommandReply:
+    async def carry_out(self, axis_name: str, verb: Verb, request: Request, login: str | None = None) -> CommandReply:
         """Carry out a command that has just arrived, or answer as the first time when its id is known.
+
+        Args:
+            axis_name: which axis.
+            verb: what to do.
+            request: with which values.
+            login: whose link it came over, for the record.
 
         Raises:
             LdcndError: as the axis refused it, or because it must not be looked at.
@@ -65,7 +71,7 @@ class CommandDesk:
                 return await self._answer_again(entry)
             command_id = self._next_command_id()
         client = self._admit(axis_name, verb, request) or request.client
-        self._ledger.open(Entry(command_id, axis_name, verb, request, client))
+        self._ledger.open(Entry(command_id, axis_name, verb, request, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             return await self._execute(axis, verb, request, command_id)

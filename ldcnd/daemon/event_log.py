@@ -41,6 +41,7 @@ class EventLog:
             command_id=entry.command_id,
             verb=entry.verb.value,
             client=entry.client,
+            login=entry.login,
             status=entry.status,
             reason=entry.reason,
             code=error.code.value if error else None,
@@ -54,6 +55,7 @@ class EventLog:
             command_id=entry.command_id,
             verb=entry.verb.value,
             client=entry.client,
+            login=entry.login,
             status=entry.status.value,
             reason=entry.reason,
         )

@@ -21,6 +21,7 @@ class Entry:
     Attributes:
         request: what was asked; a repetition must ask the same.
         client: who asked, as far as that is known.
+        login: whose link it came over, if that has a certificate.
         status: how far it has got.
         reason: why it did not end as asked.
         answer: what the caller was told, once he was.
@@ -31,6 +32,7 @@ class Entry:
     verb: Verb
     request: Request
     client: str | None
+    login: str | None = None
     status: CommandStatus = CommandStatus.ACCEPTED
     reason: str | None = None
     answer: CommandReply | LdcndError | None = None

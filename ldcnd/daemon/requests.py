@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.control import Control
@@ -93,7 +94,8 @@ class Requests:
         if address.axis == RIG_ITSELF and address.verb == REHEARSE:
             return await rehearse(self._rig, decode(RehearsalRequest, query.payload, query.encoding))
         if address.axis == RIG_ITSELF and address.verb == MOVE_TOGETHER:
-            return await self._move_together(decode(MoveTogetherRequest, query.payload, query.encoding))
+            request = decode(MoveTogetherRequest, query.payload, query.encoding)
+            return await self._move_together(request, query.login)
         if address.axis == RIG_ITSELF:
             return self._control.rig.answer(address.verb, query.payload, query.encoding)
         axis = self._rig.axis(address.axis)
@@ -109,14 +111,14 @@ class Requests:
                 axis=address.axis,
                 value=address.verb,
             ) from None
-        request = decode(REQUEST_MODELS[verb], query.payload, query.encoding)
-        return await self._control.commands.carry_out(address.axis, verb, request)
+        command = decode(REQUEST_MODELS[verb], query.payload, query.encoding)
+        return await self._control.commands.carry_out(address.axis, verb, command, query.login)
 
-    async def _move_together(self, request: MoveTogetherRequest) -> MoveTogetherReply:
+    async def _move_together(self, request: MoveTogetherRequest, login: str | None) -> MoveTogetherReply:
         moves = {move.axis: MoveAbsoluteRequest(**move.model_dump(exclude={"axis"})) for move in request.moves}
         if len(moves) < len(request.moves):
             raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
-        replies = await move_together(self._rig, moves, self._control.commands.carry_out)
+        replies = await move_together(self._rig, moves, partial(self._control.commands.carry_out, login=login))
         return MoveTogetherReply(replies=replies)
 
     def _plan(self, axis: AxisService, request: PlanRequest) -> PlanReply:

@@ -83,9 +83,9 @@ class MemoryBroker:
         self.tokens: list[str] = []
 
     @asynccontextmanager
-    async def session(self) -> AsyncIterator["MemorySession"]:
-        """Join the network for as long as the context lasts."""
-        session = MemorySession(self)
+    async def session(self, login: str | None = None) -> AsyncIterator["MemorySession"]:
+        """Join the network for as long as the context lasts; `login` stands in for a certificate."""
+        session = MemorySession(self, login)
         try:
             yield session
         finally:
@@ -140,8 +140,9 @@ class MemoryBroker:
 class MemorySession(Session):
     """One participant; made by `MemoryBroker.session`."""
 
-    def __init__(self, broker: MemoryBroker) -> None:
+    def __init__(self, broker: MemoryBroker, login: str | None = None) -> None:
         self._broker = broker
+        self._login = login
         self._loop = asyncio.get_running_loop()
         self._declarations: list[Declaration] = []
         self._closed = False
@@ -213,7 +214,7 @@ class MemorySession(Session):
         for queryable in asked:
             if queryable.intake.admit():
                 send = partial(_answer, pending, queryable.intake)
-                queryable.intake.offer(Query(key, parameters, payload, encoding, send))
+                queryable.intake.offer(Query(key, parameters, payload, encoding, send, lambda: self._login))
             else:
                 Query(key, parameters, payload, encoding, pending.take).refuse(queryable.intake.refusal(key))
         try:

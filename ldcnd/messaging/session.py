@@ -72,6 +72,10 @@ class Answer:
     is_error: bool = False
 
 
+def _nobody() -> str | None:
+    return None
+
+
 Send = Callable[[tuple[Answer, ...]], None]
 """Takes all answers to one query, once, from any thread, without blocking."""
 
@@ -89,16 +93,34 @@ class Query:
         encoding: of the payload, as the client named it; empty when it did not.
     """
 
-    __slots__ = ("_answered", "_answers", "_send", "encoding", "key", "parameters", "payload")
+    __slots__ = ("_answered", "_answers", "_login", "_send", "encoding", "key", "parameters", "payload")
 
-    def __init__(self, key: str, parameters: Mapping[str, str], payload: bytes, encoding: str, send: Send) -> None:
+    def __init__(
+        self,
+        key: str,
+        parameters: Mapping[str, str],
+        payload: bytes,
+        encoding: str,
+        send: Send,
+        login: Callable[[], str | None] = _nobody,
+    ) -> None:
         self.key = key
+        self._login = login
         self.parameters = parameters
         self.payload = payload
         self.encoding = encoding
         self._send = send
         self._answers: list[Answer] = []
         self._answered = False
+
+    @property
+    def login(self) -> str | None:
+        """The certificate of the link that its sender says it comes from, by common name; for the record only.
+
+        None when the sender does not say, when it is behind a router, and on links without certificates. Whoever may
+        command can name another one's session, so this finds mistakes, not forgers.
+        """
+        return self._login()
 
     def reply(self, payload: bytes, encoding: str, key: str | None = None, measured_at_ns: int | None = None) -> None:
         """Answer; for good without a key, with one value of several when a key is given.

@@ -171,6 +171,7 @@ class ZenohSession(Session):
                 payload=b"" if asked.payload is None else asked.payload.to_bytes(),
                 encoding="" if asked.encoding is None else str(asked.encoding),
                 send=path.send,
+                login=partial(self._login_of, asked.source_info),
             )
             if admitted:
                 intake.offer(query)
@@ -246,6 +247,7 @@ class ZenohSession(Session):
                 payload=payload if payload or encoding else None,
                 encoding=encoding or None,
                 cancellation_token=token,
+                source_info=zenoh.SourceInfo(self._session.id, 0),
             )
 
         try:
@@ -324,6 +326,13 @@ class ZenohSession(Session):
             log.warning("declaration not taken back", reason=str(error) or "a peer takes nothing")
         finally:
             declared.stop()
+
+    def _login_of(self, source: zenoh.SourceInfo | None) -> str | None:
+        """Return who is at the other end of the link to the session that a query names."""
+        if source is None or self._closed:
+            return None
+        zid = str(source.source_id.zid)
+        return next((link.auth_identifier for link in self._session.info.links() if str(link.zid) == zid), None)
 
     def _new_outlet(self, key: str, qos: Qos) -> _Outlet:
         outlet = self._outlets[key] = _Outlet(qos)

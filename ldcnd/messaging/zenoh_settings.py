@@ -47,6 +47,8 @@ class ZenohSettings:
             "timestamping/enabled": True,
             # a receiver that stalls loses queries in it, and opening it needs mlock
             "transport/shared_memory/enabled": False,
+            # with it, asking who is connected ends the program
+            "transport/unicast/lowlatency": False,
             "transport/link/tx/lease": LEASE_MS,
             "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE_US,
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,

@@ -55,7 +55,10 @@ class CommandEvent(Frozen):
     verb: str
     """What was asked."""
     client: str | None
-    """By whom, as far as that is known; names are not authenticated."""
+    """By whom, as it calls itself; nobody has checked that."""
+    login: str | None = None
+    """Common name of the certificate of the link that it came over; null behind a router, on links without certificates
+    and when the sender does not say which link is its own: then nothing about it is authenticated."""
     status: CommandStatus
     """How far it has got."""
     reason: str | None = None

@@ -3,6 +3,7 @@
 import asyncio
 
 from ldcnd.client.events import follow_events, latest_events
+from ldcnd.client.rig_client import RigClient
 from ldcnd.daemon.event_log import KEPT_EVENTS
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
 from ldcnd.model.axes import LinkState
@@ -141,3 +142,12 @@ async def test_a_halt_of_an_axis_at_rest_is_an_event_as_well():
         event = await anext(events)
 
     assert (event.verb, event.client) == ("halt", "ann")
+
+
+async def test_an_event_tells_over_whose_link_its_command_came():
+    async with running_rig() as rig, rig.broker.session("ada") as session, follow_events(rig.client) as events:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await RigClient(session, "sim").command("x", Verb.POWER, PowerRequest(on=False, client="bob"))
+        event = await anext(events)
+
+    assert (event.client, event.login) == ("bob", "ada")

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import SessionError
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.requests import PowerRequest, Verb
+from ldcnd.model.requests import HaltRequest, PowerRequest, Verb
 from ldcnd.pki.access import Role
 from ldcnd.pki.site import Site, new_login, set_up
 from tests.support.access_facts import AccessFacts, alive
@@ -187,6 +188,21 @@ async def test_a_viewer_who_commands_is_told_that_he_may_not(rig: SecuredRig) ->
     async with open_zenoh_session(settings) as session:
         with pytest.raises(SessionError, match="not permitted to command"):
             await RigClient(session, "sim").command("x", Verb.POWER, PowerRequest(on=True))
+
+
+async def test_events_tell_whose_certificate_a_command_came_with(rig: SecuredRig) -> None:
+    settings = ZenohSettings(connect=(rig.endpoint,), mode="client", config_file=rig.folder / "operator.json5")
+
+    async with open_zenoh_session(settings) as session:
+        client = RigClient(session, "sim")
+        await client.command("z", Verb.HALT, HaltRequest(client="ann", command_id="by-ann"))
+        with rig.login("operator") as stranger:  # an operator with a program that does not say who it is
+            answers(stranger, "ldcn/sim/@cmd/z/halt", {"command_id": "by-somebody"})
+        events = await latest_events(client, 100, "z")
+
+    logins = {event.command_id: (event.client, event.login) for event in events}
+    assert logins["by-ann"] == ("ann", "operator")
+    assert logins["by-somebody"] == (None, None)
 
 
 def test_the_example_of_the_set_up_works_with_certificates_in_files(rig: SecuredRig, tmp_path: Path) -> None:

@@ -83,12 +83,17 @@ def test_what_keeps_hardware_safe_holds_whatever_the_file_says(tmp_path: Path):
     file.write_text("""{
         timestamping: { enabled: false },
         listen: { exit_on_failure: false },
-        transport: { shared_memory: { enabled: true }, link: { tx: { lease: 60000 } } },
+        transport: {
+            shared_memory: { enabled: true },
+            link: { tx: { lease: 60000 } },
+            unicast: { lowlatency: true, qos: { enabled: false } },
+        },
     }""")
 
     config = zenoh_config(ZenohSettings(config_file=file))
 
     assert json.loads(config.get_json("transport/shared_memory/enabled")) is False
+    assert json.loads(config.get_json("transport/unicast/lowlatency")) is False
     assert json.loads(config.get_json("timestamping/enabled")) is True
     assert json.loads(config.get_json("listen/exit_on_failure")) is True
     assert json.loads(config.get_json("transport/link/tx/lease")) == LEASE_MS

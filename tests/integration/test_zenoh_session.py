@@ -304,3 +304,16 @@ async def test_the_interpreter_exits_although_a_client_is_stuck(endpoint: str) -
 
         async with asyncio.timeout(5):
             assert await daemon.wait() == 7
+
+
+async def test_a_query_that_names_no_link_of_the_daemon_has_no_login(pair: Pair) -> None:
+    logins: list[str | None] = []
+
+    def take(query: Query) -> None:
+        logins.append(query.login)
+        echo(query)
+
+    await pair.server.serve(KEYS.all_commands, take, complete=True)
+    await served(pair.client, KEYS.command("x", "halt"))  # over a link without a certificate
+
+    assert set(logins) == {None}
