@@ -117,6 +117,32 @@ async def test_published_samples_count_up_and_bear_the_instant_of_measurement():
         assert abs(sample.timestamp.get_time().timestamp() - value["t"] / 1e9) < 0.001
 
 
+async def test_a_json_rig_is_readable_by_tools_that_print_what_they_get(tmp_path):
+    # what the examples z_sub, z_get and z_get_liveliness of eclipse-zenoh do, call by call
+    config = tmp_path / "json.toml"
+    config.write_text(RIG.read_text() + '\n[telemetry]\nencoding = "json"\n')
+    async with daemon(config) as endpoint:
+        with connect(endpoint) as session:
+            received = session.declare_subscriber("ldcn/sim/tele/**", zenoh.handlers.FifoChannel(100))
+            printed = [
+                f">> [Subscriber] Received {sample.kind} ('{sample.key_expr}': '{sample.payload.to_string()}')"
+                for sample in (received.recv() for _ in range(60))
+            ]
+            received.undeclare()
+            encodings = {str(reply.ok.encoding) for reply in session.get("ldcn/sim/tele/*/state") if reply.ok}
+            asked = [reply.ok.payload.to_string() for reply in session.get("ldcn/sim/tele/x/**") if reply.ok]
+            shown = [str(reply.ok.key_expr) for reply in session.liveliness().get("ldcn/**") if reply.ok]
+
+    for line in printed:
+        key, value = re.fullmatch(r">> \[Subscriber\] Received \S+ \('(\S+)': '(.+)'\)", line).groups()
+        assert key.startswith("ldcn/sim/tele/")
+        assert json.loads(value)["t"] > 0
+    assert encodings == {"application/json"}
+    assert len(asked) == 5
+    assert all(json.loads(value)["quality"] for value in asked)
+    assert sum("/axis/" in key for key in shown) == 4
+
+
 async def test_the_tour_of_the_readme_runs():
     text = (ROOT / "README.md").read_text()
     commands = re.findall(r"^\.venv/bin/(ldcnd axis .*)$", text, re.MULTILINE)
