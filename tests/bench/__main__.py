@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from tests.bench import bus_efficiency, system_calls, virtual_time
+from tests.bench import bus_efficiency, round_trip, system_calls, virtual_time
 from tests.bench.bus_efficiency import FLOOR, Result
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
@@ -37,6 +37,7 @@ def main() -> None:
     rows: list[Row] = []
     if not options.no_processes:
         rows += _processes(options.rounds)
+        rows += round_trip.rows()
     rows += virtual_time.rows(options.virtual_seconds)
     print(table(rows))
     if options.json:
