@@ -53,6 +53,7 @@ class ErrorCode(StrEnum):
     COMMAND_EXPIRED = "command_expired"
     COMMAND_ID_REUSED = "command_id_reused"
     UNKNOWN_COMMAND = "unknown_command"
+    NOT_PERMITTED = "not_permitted"
     # the daemon
     CONFIG_INVALID = "config_invalid"
     SESSION_FAILED = "session_failed"
@@ -345,6 +346,12 @@ class UnknownCommand(RequestRefused):
     """No such command is remembered."""
 
     code = ErrorCode.UNKNOWN_COMMAND
+
+
+class NotPermitted(RequestRefused):
+    """Whoever asks is not known, or asks from where nobody may; the console says so to browsers."""
+
+    code = ErrorCode.NOT_PERMITTED
 
 
 class ConfigError(LdcndError):

@@ -28,6 +28,7 @@ COMMANDS = {
     "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
     "drill": ("ldcnd.cli.drill", "Rehearse what happens when somebody disappears."),
     "bus": ("ldcnd.cli.bus", "Look at the lines of a running daemon."),
+    "console": ("ldcnd.cli.console", "Show rigs in a browser."),
     "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),
     "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),
     "plot": ("ldcnd.cli.plot", "Draw an axis of a recording."),

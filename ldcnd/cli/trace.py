@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
+from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import Trace, arm_trace, fetch_trace, wait_for_trace
 from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
 from ldcnd.model.traces import LONGEST_WAIT_S, MOST_SAMPLES, TraceChannel, TraceReply, TraceTrigger, TriggerKind

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ldcnd.cli.figure import save_figure, stacked_rows
-from ldcnd.cli.trace_file import column_title
+from ldcnd.client.trace_file import column_title
 from ldcnd.client.traces import Trace
 
 NS_PER_MS = 1e6

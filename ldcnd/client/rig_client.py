@@ -9,19 +9,21 @@ from typing import TypeVar
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
-from ldcnd.messaging.session import UNDELIVERED_SAMPLES, Answer, Declaration, Sample, SampleKind, Session
+from ldcnd.messaging.session import Answer, Declaration, Sample, SampleKind, Session
 from ldcnd.model.axes import AxisInfo, LinkState
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.meta import BusInfo, DaemonInfo
+from ldcnd.model.meta import BusInfo, CommandList, DaemonInfo
 from ldcnd.model.monitors import MonitorName, MonitorSample
+from ldcnd.model.plan import RigPlan
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.replies import CommandReply, StopReply
 from ldcnd.model.requests import REPLY_MODELS, Request, Verb
 from ldcnd.model.samples import SAMPLE_MODELS, StateSample, TelemetryItem
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
+from ldcnd.model.verbs import PLAN, WHY
 from ldcnd.model.why import WhyReply, WhyRequest
 
 ModelT = TypeVar("ModelT", bound=Frozen)
@@ -30,6 +32,9 @@ NO_QUESTION = WhyRequest()
 ITEMS = frozenset(item.value for item in TelemetryItem)
 KEPT_SAMPLES = 256
 """A watcher that is too slow keeps so many samples; the oldest give way."""
+
+KEPT_PUBLISHED = 4096
+"""Whoever takes all that a rig publishes may be held up for a second of a large one."""
 
 
 class Samples:
@@ -105,6 +110,16 @@ class RigClient:
                 if answer.key != self._keys.health:
                     found[answer.key.partition("/meta/")[2]] = answer.payload
         return found
+
+    async def line_plan(self) -> RigPlan | None:
+        """Return what the lines promise, or None when the daemon does not say."""
+        answers = await self._session.query(self._keys.plan)
+        return self._decoded(answers[0], RigPlan) if answers else None
+
+    async def command_list(self) -> CommandList | None:
+        """Return all commands and error codes, or None when the daemon does not say."""
+        answers = await self._session.query(self._keys.commands)
+        return self._decoded(answers[0], CommandList) if answers else None
 
     async def last(self, axis: str, item: TelemetryItem) -> Measurement | None:
         """Return the last value of an item, or None when there is none yet."""
@@ -191,17 +206,22 @@ class RigClient:
             raise await self._unanswered(verb)
         return self._one(answers, reply)
 
+    async def axis_question(self, axis: str, verb: str, request: Frozen, reply: type[ModelT]) -> ModelT:
+        """Ask about an axis what has no effect.
+
+        Raises:
+            LdcndError: as the daemon refused it, of the same class.
+        """
+        payload, encoding = encode(request, Encoding.MSGPACK)
+        return self._one(await self._session.query(self._keys.command(axis, verb), payload, encoding=encoding), reply)
+
     async def why(self, axis: str, request: WhyRequest = NO_QUESTION) -> WhyReply:
         """Ask why a motion of an axis would be refused now, and what would clear that."""
-        payload, encoding = encode(request, Encoding.MSGPACK)
-        answers = await self._session.query(self._keys.command(axis, "why"), payload, encoding=encoding)
-        return self._one(answers, WhyReply)
+        return await self.axis_question(axis, WHY, request, WhyReply)
 
     async def plan(self, axis: str, request: PlanRequest) -> PlanReply:
         """Ask what a motion would do; no effect."""
-        payload, encoding = encode(request, Encoding.MSGPACK)
-        answers = await self._session.query(self._keys.command(axis, "plan"), payload, encoding=encoding)
-        return self._one(answers, PlanReply)
+        return await self.axis_question(axis, PLAN, request, PlanReply)
 
     async def stop(self, axis: str | None = None, timeout_s: float = 5.0) -> StopReply:
         """Stop one axis, or the whole rig."""
@@ -234,7 +254,7 @@ class RigClient:
 
     @asynccontextmanager
     async def published(
-        self, take: Callable[[Sample], None], kept: int = UNDELIVERED_SAMPLES
+        self, take: Callable[[Sample], None], kept: int = KEPT_PUBLISHED
     ) -> AsyncIterator[Callable[[], int]]:
         """Hand all telemetry, events and health reports to `take`, as they come, for the time of the context.
 
@@ -249,6 +269,20 @@ class RigClient:
                 declared.push_async_callback(declaration.close)
                 declarations.append(declaration)
             yield lambda: sum(declaration.load.lost for declaration in declarations)
+
+    async def last_published(self) -> list[Sample]:
+        """Return the last value of every telemetry and health key, in msgpack; no samples of traces."""
+        keys = (
+            self._keys.telemetry_pattern("*", "*"),
+            self._keys.telemetry_pattern("*", "monitor") + "/*",
+            f"{self._keys.health}/**",
+        )
+        answers = [a for key in keys for a in await self._session.query(key, parameters={"enc": "msgpack"})]
+        return [
+            Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns)
+            for answer in answers
+            if not answer.is_error
+        ]
 
     @asynccontextmanager
     async def health(self, take: Callable[[DaemonHealth | BusHealth], None]) -> AsyncIterator[None]:

@@ -25,7 +25,10 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.schemas import schema_name
 
 MAX_PAYLOAD_BYTES = 16 * 1024
-"""No payload that is decoded is longer: the largest description has a quarter of this."""
+"""No request is longer: the largest has a quarter of this."""
+
+MAX_RECEIVED_BYTES = 4 * 1024 * 1024
+"""No answer of a daemon is longer: 1000 events have a tenth of this."""
 
 ECHO_CHARACTERS = 80
 """An error repeats so much of what it complains about."""
@@ -84,6 +87,7 @@ _ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
             errors.CommandExpired,
             errors.CommandIdReused,
             errors.UnknownCommand,
+            errors.NotPermitted,
             errors.ConfigError,
             errors.SessionError,
             errors.InternalError,
@@ -112,7 +116,7 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
         MalformedRequest: anything else; names the first field that is wrong and what is allowed there.
     """
     try:
-        return model.model_validate_json(_text(payload, encoding), strict=True)
+        return model.model_validate_json(_text(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
     except pydantic.ValidationError as error:
         raise _explained(model, error) from None
 
@@ -124,7 +128,7 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
 
     Args:
         model: what it must be.
-        payload: as for `decode`.
+        payload: at most `MAX_RECEIVED_BYTES`.
         encoding: as for `decode`.
 
     Raises:
@@ -132,7 +136,7 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
         MalformedRequest: a known field is missing or wrong.
     """
     try:
-        return model.model_validate_json(_text(payload, encoding), strict=True, extra="ignore")
+        return model.model_validate_json(_text(payload, encoding, MAX_RECEIVED_BYTES), strict=True, extra="ignore")
     except pydantic.ValidationError as error:
         raise _explained(model, error) from None
 
@@ -189,13 +193,13 @@ def _packable(value: object) -> object:
     return vars(value) if isinstance(value, Frozen) else pydantic_core.to_jsonable_python(value)
 
 
-def _text(payload: bytes, encoding: str) -> bytes:
+def _text(payload: bytes, encoding: str, longest: int) -> bytes:
     """Return a payload as JSON."""
-    if len(payload) > MAX_PAYLOAD_BYTES:
+    if len(payload) > longest:
         raise PayloadTooLarge(
-            f"the payload has {len(payload)} bytes, more than the {MAX_PAYLOAD_BYTES} that any request may have",
+            f"the payload has {len(payload)} bytes, more than the {longest} that it may have",
             value=len(payload),
-            limit=MAX_PAYLOAD_BYTES,
+            limit=longest,
         )
     if not payload:
         return b"{}"

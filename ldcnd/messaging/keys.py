@@ -31,6 +31,9 @@ ALL_STOPS = f"{ROOT}/*/@stop/**"
 ALL_COMMANDS = f"{ROOT}/*/@cmd/**"
 ALL_CLIENTS = f"{ROOT}/*/client/**"
 
+ALL_DAEMONS = f"{ROOT}/*/alive/*"
+"""The tokens of all daemons, whichever rig they serve."""
+
 _CHUNK = re.compile(r"[a-z0-9_]+")
 _ANY_CHUNKS = "**"
 _ANY_PART = "$*"
@@ -285,6 +288,18 @@ class Keys:
     @property
     def _root(self) -> str:
         return f"{ROOT}/{self.rig}"
+
+
+def rig_of(key: str) -> str:
+    """Return the rig that a key belongs to.
+
+    Raises:
+        MalformedRequest: the key belongs to none.
+    """
+    chunks = key.split("/")
+    if len(chunks) < 2 or chunks[0] != ROOT or not _CHUNK.fullmatch(chunks[1]):  # noqa: PLR2004 - root and rig
+        raise MalformedRequest(f"{key} is not below {ROOT}/<rig>", value=key)
+    return chunks[1]
 
 
 def matches(left: str, right: str) -> bool:

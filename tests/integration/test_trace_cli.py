@@ -5,7 +5,7 @@ from asyncio.subprocess import PIPE
 
 import pytest
 
-from ldcnd.cli.trace_file import load_trace
+from ldcnd.client.trace_file import load_trace
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.model.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.cli.trace_file import load_trace, require_suffix, save_trace
+from ldcnd.client.trace_file import load_trace, require_suffix, save_trace
 from ldcnd.client.traces import Trace
 from ldcnd.errors import ConfigError
 from ldcnd.model.axes import Quality

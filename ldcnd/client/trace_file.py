@@ -39,7 +39,7 @@ def save_trace(trace: Trace, path: Path) -> None:
     Raises:
         ConfigError: its name tells none, or it cannot be written.
     """
-    text = _as_csv(trace) if require_suffix(path).suffix == ".csv" else _as_json(trace)
+    text = trace_as_csv(trace) if require_suffix(path).suffix == ".csv" else trace_as_json(trace)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -66,17 +66,14 @@ def column_title(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _as_json(trace: Trace) -> str:
+def trace_as_json(trace: Trace) -> str:
+    """Return a trace as a JSON document."""
     document = _Document(header=trace.header, offsets_ns=trace.offsets_ns, values=trace.values, raw=trace.raw)
     return document.model_dump_json() + "\n"
 
 
-def _from_json(text: str) -> Trace:
-    document = _Document.model_validate_json(text)
-    return _checked(Trace(document.header, document.offsets_ns, document.values, document.raw))
-
-
-def _as_csv(trace: Trace) -> str:
+def trace_as_csv(trace: Trace) -> str:
+    """Return a trace as a table."""
     header = trace.header
     titles = ["offset_ns", *(column_title(each.name, each.unit) for each in header.channels), *header.raw_columns]
     columns = (trace.offsets_ns, *trace.values, *trace.raw)
@@ -86,6 +83,11 @@ def _as_csv(trace: Trace) -> str:
     writer.writerow(titles)
     writer.writerows(zip(*columns, strict=True))
     return text.getvalue()
+
+
+def _from_json(text: str) -> Trace:
+    document = _Document.model_validate_json(text)
+    return _checked(Trace(document.header, document.offsets_ns, document.values, document.raw))
 
 
 def _from_csv(text: str) -> Trace:

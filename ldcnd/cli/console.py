@@ -1,0 +1,69 @@
+"""`ldcnd console`: the rigs in a browser, from a process of its own."""
+
+import asyncio
+from pathlib import Path
+
+import click
+
+from ldcnd.cli.connection import DEFAULT_ENDPOINT
+from ldcnd.errors import ConfigError
+from ldcnd.log import configure_logging
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+
+DEFAULT_ADDRESS = "127.0.0.1:8470"
+FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@click.option(
+    "--connect", "-e", multiple=True, help=f"Zenoh endpoint of a daemon or router; repeatable [{DEFAULT_ENDPOINT}]."
+)
+@click.option("--config", type=FILE, help="Zenoh configuration file to start from, for each endpoint.")
+@click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
+@click.option("--listen", default=DEFAULT_ADDRESS, show_default=True, help="HOST:PORT to serve on; port 0 is any.")
+@click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
+@click.option("--certificate", type=FILE, help="PEM file: serve HTTPS with this certificate.")
+@click.option("--key", type=FILE, help="PEM file with its key.")
+@click.option("--token-file", type=FILE, help="File with the token that lets browsers in, instead of one-time links.")
+@click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
+@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="warning")
+def command(
+    connect: tuple[str, ...],
+    config: Path | None,
+    rig: tuple[str, ...],
+    listen: str,
+    host: tuple[str, ...],
+    certificate: Path | None,
+    key: Path | None,
+    token_file: Path | None,
+    *,
+    as_json: bool,
+    log_level: str,
+) -> None:
+    """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it. SIGUSR1 prints another one.
+
+    It stops axes, it is not an emergency stop.
+    """
+    try:
+        from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
+        from ldcnd.console.server import serve  # noqa: PLC0415
+        from ldcnd.console.settings import ConsoleSettings, parse_address, read_token  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError(f"{error.name} is not installed", remedy="install ldcnd[console]") from error
+    configure_logging(level=log_level)
+    endpoints = connect or (() if config else (DEFAULT_ENDPOINT,))
+    settings = ConsoleSettings(
+        endpoints=tuple(
+            Endpoint(name, ZenohSettings(mode="client", connect=(name,), config_file=config, instance="ldcnd console"))
+            for name in endpoints
+        )
+        or (Endpoint(str(config), ZenohSettings(mode=None, config_file=config, instance="ldcnd console")),),
+        rigs=rig,
+        address=parse_address(listen),
+        hosts=host,
+        certificate=certificate,
+        key=key,
+        token=read_token(token_file) if token_file else None,
+        as_json=as_json,
+    )
+    asyncio.run(serve(settings))

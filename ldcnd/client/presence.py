@@ -1,0 +1,25 @@
+"""Which daemons are there: told when one comes and when one goes, without asking."""
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from ldcnd.messaging.keys import ALL_DAEMONS, Keys, rig_of
+from ldcnd.messaging.session import Session
+
+OnDaemon = Callable[[str, str, bool], None]
+"""Learns that of a rig a run of the daemon has appeared (True) or vanished (False)."""
+
+
+@asynccontextmanager
+async def daemons(session: Session, told: OnDaemon) -> AsyncIterator[None]:
+    """Tell of every daemon that can be reached, first of those that are there, for the time of the context."""
+
+    def tell(key: str, alive: bool) -> None:  # noqa: FBT001 - a callback of the session
+        rig = rig_of(key)
+        told(rig, Keys(rig).parse_alive(key).instance, alive)
+
+    declaration = await session.watch_tokens(ALL_DAEMONS, tell)
+    try:
+        yield
+    finally:
+        await declaration.close()

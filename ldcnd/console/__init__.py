@@ -1,0 +1,1 @@
+"""The rig in a browser: a Zenoh client of its own process that serves pages."""

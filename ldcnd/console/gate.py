@@ -1,0 +1,133 @@
+"""The gate before everything else: which hosts, origins and visitors get through, and what every answer says.
+
+Nothing but `/static/` is given to strangers. What changes anything needs the visitor's cookie, a header that only the
+console's own pages can set, and the console's own origin; a WebSocket needs cookie and origin, because browsers let any
+page open one.
+"""
+
+from collections.abc import Iterable
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import HTTPConnection
+from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ldcnd.console.visitors import Visitor, Visitors, is_csrf_of
+from ldcnd.errors import NotPermitted
+from ldcnd.messaging.codec import error_reply
+
+SESSION_COOKIE = "ldcnd_session"
+CSRF_COOKIE = "ldcnd_csrf"
+CSRF_HEADER = "x-ldcnd-csrf"
+POLICY = (
+    "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; frame-ancestors 'none'; base-uri 'none';"
+    " form-action 'self'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+SAFE_METHODS = frozenset({"GET", "HEAD"})
+WEBSOCKET_POLICY_VIOLATION = 1008
+
+STRANGER_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>ldcnd console</title>
+<link rel="stylesheet" href="/static/style.css"></head>
+<body><main><h1>This browser is not let in yet</h1>
+<p>Open the console with the link that <code>ldcnd console</code> prints when it starts. A link works once, within ten
+minutes. For another one, ask somebody whose console is open, or send the console's process the signal USR1: it then
+prints one.</p>
+<p>If you came here by a link just now, <a href="/">try once more</a>.</p></main></body></html>
+"""
+
+
+class Gate:
+    """Wraps the application.
+
+    Args:
+        app: what is behind the gate; finds the `Visitor` in the scope's state.
+        visitors: who was let in.
+        scheme: http or https.
+        hosts: names and addresses under which browsers may reach the console, without ports.
+    """
+
+    def __init__(self, app: ASGIApp, visitors: Visitors, scheme: str, hosts: Iterable[str]) -> None:
+        self._app = app
+        self._visitors = visitors
+        self._scheme = scheme
+        self._hosts = frozenset(host.lower() for host in hosts)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on what may pass, answer the rest."""
+        path = scope["path"]
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(raw=message["headers"])
+                headers.update(HEADERS)
+                headers["Cache-Control"] = "no-cache" if path.startswith("/static/") else "no-store"
+            await send(message)
+
+        answer = self._answer(scope)
+        if answer is None:
+            await self._app(scope, receive, send_with_headers)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": WEBSOCKET_POLICY_VIOLATION})  # 403 before it is accepted
+        else:
+            await answer(scope, receive, send_with_headers)
+
+    def _answer(self, scope: Scope) -> Response | None:
+        """Return the answer to what does not get through; note the visitor of what does."""
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        if _without_port(host) not in self._hosts:
+            return _refusal(400, f"this console is not known as {host[:80]!r}")
+        if scope["type"] == "http" and scope["path"].startswith("/static/"):
+            return None
+        if scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET":
+            token = parse_qs(scope["query_string"].decode("latin-1")).get("link")
+            if token:
+                return self._let_in(token[-1])
+        visitor = self._visitors.find(HTTPConnection(scope).cookies.get(SESSION_COOKIE, ""))
+        if visitor is None:
+            return _stranger(scope["path"])
+        if scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS:
+            if headers.get("origin") != f"{self._scheme}://{host}":
+                return _refusal(403, "this is not asked by a page of this console (Origin)")
+            if scope["type"] == "http" and not is_csrf_of(visitor, headers.get(CSRF_HEADER, "")):
+                return _refusal(403, "this is not asked by a page of this visitor (X-Ldcnd-Csrf)")
+        scope.setdefault("state", {})["visitor"] = visitor
+        return None
+
+    def _let_in(self, token: str) -> Response:
+        visitor = self._visitors.enter(token)
+        if visitor is None:
+            return _stranger("/")
+        response = RedirectResponse("/", status_code=303)
+        self._give(response, visitor)
+        return response
+
+    def _give(self, response: Response, visitor: Visitor) -> None:
+        secure = self._scheme == "https"
+        response.set_cookie(SESSION_COOKIE, visitor.token, path="/", secure=secure, httponly=True, samesite="strict")
+        response.set_cookie(CSRF_COOKIE, visitor.csrf, path="/", secure=secure, samesite="strict")
+
+
+def _stranger(path: str) -> Response:
+    if path.startswith("/api/"):
+        return _refusal(401, "this browser is not let in; open the console with the link that it prints")
+    return HTMLResponse(STRANGER_PAGE, 401)
+
+
+def _refusal(status: int, message: str) -> Response:
+    reply = error_reply(NotPermitted(message, remedy="open the console with the link that it prints"))
+    return Response(reply.model_dump_json(), status, media_type="application/json")
+
+
+def _without_port(host: str) -> str:
+    name, colon, port = host.rpartition(":")
+    return (name if colon and (port.isdecimal() or not port) else host).lower()

@@ -1,0 +1,69 @@
+"""What the console answers that is no public model of the daemon."""
+
+from ldcnd.model.axes import AxisInfo
+from ldcnd.model.errors import ErrorReply
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.meta import BusInfo, CommandList, DaemonInfo
+from ldcnd.model.plan import RigPlan
+from ldcnd.model.replies import StopReply
+
+
+class RigReply(Frozen):
+    """One rig, as it described itself when it was last there."""
+
+    name: str
+    """The rig id."""
+    endpoint: str
+    """Through which it is reached."""
+    connected: bool
+    """Its daemon is there."""
+    problem: str | None
+    """What is wrong with that, in words."""
+    daemon: DaemonInfo | None = None
+    """None before it was ever there; the others likewise."""
+    axes: tuple[AxisInfo, ...] = ()
+    """In the order of lines and addresses."""
+    buses: tuple[BusInfo, ...] = ()
+    """Its lines."""
+    plan: RigPlan | None = None
+    """What the lines promise."""
+    commands: CommandList | None = None
+    """What can be asked of it."""
+
+
+class EndpointReply(Frozen):
+    """One session of the console."""
+
+    endpoint: str
+    """Where it connects to."""
+    connected: bool
+    """It is open; rigs behind it may be away all the same."""
+    problem: str | None
+    """Why it is not, in words, or what is left out of it."""
+
+
+class RigsReply(Frozen):
+    """`GET /api/rigs`."""
+
+    version: str
+    """Of the console."""
+    client: str
+    """The name under which this browser's commands go."""
+    endpoints: tuple[EndpointReply, ...]
+    """Where rigs are looked for."""
+    rigs: tuple[RigReply, ...]
+    """By name."""
+
+
+class StopsReply(Frozen):
+    """`POST /api/stop`."""
+
+    rigs: dict[str, StopReply | ErrorReply]
+    """What became of it, by rig."""
+
+
+class LinkReply(Frozen):
+    """`POST /api/link`."""
+
+    link: str
+    """Opens the console in one more browser, once, within ten minutes."""

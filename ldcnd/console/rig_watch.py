@@ -1,0 +1,125 @@
+"""One rig: whether its daemon is there, what it says about itself, and its values as they come."""
+
+import asyncio
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.replies import RigReply
+from ldcnd.errors import LdcndError
+from ldcnd.log import get_logger
+
+log = get_logger("console")
+
+ASK_AGAIN_S = 0.5
+"""A daemon that is there but did not answer is asked again so soon; behind a router it may not be heard at first."""
+DESCRIPTION_AGE_S = 1.0
+"""Pages that ask what a rig is get an answer that is so old at most, however many ask."""
+DESCRIBE_TIME_S = 4.0
+
+
+class RigWatch:
+    """Watches one rig over one session.
+
+    Attributes:
+        client: for commands.
+        endpoint: through which it is reached, in words.
+    """
+
+    def __init__(self, client: RigClient, endpoint: str, values: LatestValues) -> None:
+        self.client = client
+        self.endpoint = endpoint
+        self._values = values
+        self._instances: set[str] = set()
+        self._stirred = asyncio.Event()
+        self._reply = RigReply(
+            name=client.rig, endpoint=endpoint, connected=False, problem="its daemon was not there yet"
+        )
+        self._described_at_s = -DESCRIPTION_AGE_S
+        self._describing = asyncio.Lock()
+
+    @property
+    def connected(self) -> bool:
+        """Its daemon is there and has answered."""
+        return self._reply.connected
+
+    def daemon(self, instance: str, *, alive: bool) -> None:
+        """Learn that a run of the daemon has come or gone."""
+        (self._instances.add if alive else self._instances.discard)(instance)
+        self._stirred.set()
+
+    async def run(self) -> None:
+        """Watch until cancelled."""
+        while True:
+            try:
+                async with self.client.published(self._values.take):
+                    await self._follow()
+            except LdcndError as error:
+                self._show(problem=error.message)
+                await asyncio.sleep(ASK_AGAIN_S)
+
+    async def described(self) -> RigReply:
+        """Return what the rig is now, or what it was when it was last there."""
+        async with self._describing:  # those who ask meanwhile take what the first one gets
+            if self.connected and asyncio.get_running_loop().time() >= self._described_at_s + DESCRIPTION_AGE_S:
+                try:
+                    await self._describe()
+                except LdcndError as error:
+                    log.debug("rig not described", rig=self.client.rig, reason=error.message)
+        return self._reply
+
+    async def _follow(self) -> None:
+        """Ask the rig what it is whenever its daemon has come."""
+        while True:
+            self._stirred.clear()
+            if not self._instances:
+                self._show(problem="its daemon is not there; the values are the last ones")
+                await self._stirred.wait()
+            elif await self._learn():
+                await self._stirred.wait()
+            else:
+                await self._stirred_within(ASK_AGAIN_S)
+
+    async def _learn(self) -> bool:
+        """Bring description and values up to date; tell whether that worked."""
+        rig = self.client.rig
+        self._values.begin_again(rig)
+        try:
+            await self._describe()
+            self._values.settle(rig, await self.client.last_published())
+        except LdcndError as error:
+            self._show(problem=error.message)
+            return False
+        several = len(self._instances) > 1
+        self._show(problem="two daemons serve it; motion is refused until one of them goes" if several else None)
+        return True
+
+    async def _describe(self) -> None:
+        client = self.client
+        try:
+            async with asyncio.timeout(DESCRIBE_TIME_S):
+                described = {
+                    "daemon": await client.daemon(),
+                    "axes": tuple(await client.axes()),
+                    "buses": tuple(await client.buses()),
+                    "plan": await client.line_plan(),
+                    "commands": await client.command_list(),
+                }
+        except TimeoutError:
+            raise LdcndError(f"rig {client.rig} takes too long to describe itself") from None
+        self._reply = self._reply.model_copy(update=described)
+        self._described_at_s = asyncio.get_running_loop().time()
+
+    async def _stirred_within(self, seconds: float) -> None:
+        try:
+            async with asyncio.timeout(seconds):
+                await self._stirred.wait()
+        except TimeoutError:
+            return
+
+    def _show(self, *, problem: str | None) -> None:
+        connected = bool(self._instances) and (problem is None or len(self._instances) > 1)
+        if (connected, problem) == (self._reply.connected, self._reply.problem):
+            return
+        log.info("rig", rig=self.client.rig, connected=connected, problem=problem)
+        self._reply = self._reply.model_copy(update={"connected": connected, "problem": problem})
+        self._values.tell_of_rig(self.client.rig, {"connected": connected, "problem": problem})

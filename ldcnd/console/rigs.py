@@ -1,0 +1,122 @@
+"""All rigs that the console shows, over one session for each endpoint."""
+
+import asyncio
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from ldcnd.client.presence import daemons
+from ldcnd.client.rig_client import RigClient
+from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.replies import EndpointReply, RigReply
+from ldcnd.console.rig_watch import RigWatch
+from ldcnd.errors import SessionError, UnknownAxis
+from ldcnd.log import get_logger
+from ldcnd.messaging.session import Session
+from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+
+log = get_logger("console")
+
+OPEN_AGAIN_S = 1.0
+"""An endpoint that cannot be reached is tried again so soon; once it was reached, Zenoh itself keeps trying."""
+MOST_RIGS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where rigs are looked for.
+
+    Attributes:
+        name: in words.
+        settings: of its session.
+    """
+
+    name: str
+    settings: ZenohSettings
+
+
+class Rigs:
+    """The rigs by name. A name belongs to the endpoint that showed it first: nobody's commands reach a namesake.
+
+    Args:
+        values: takes what they publish.
+        wanted: these only; none means all.
+    """
+
+    def __init__(self, values: LatestValues, wanted: Collection[str] = ()) -> None:
+        self._values = values
+        self._wanted = frozenset(wanted)
+        self._watches: dict[str, RigWatch] = {}
+        self._endpoints: dict[str, EndpointReply] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all rigs that were ever there."""
+        return tuple(sorted(self._watches))
+
+    @property
+    def endpoints(self) -> tuple[EndpointReply, ...]:
+        """How the sessions are."""
+        return tuple(self._endpoints.values())
+
+    def client(self, rig: str) -> RigClient:
+        """Return what commands a rig.
+
+        Raises:
+            UnknownAxis: there was never such a rig.
+        """
+        return self._watch(rig).client
+
+    async def described(self) -> tuple[RigReply, ...]:
+        """Return what the rigs are, all asked at the same time."""
+        async with asyncio.TaskGroup() as group:
+            asked = [group.create_task(self._watches[rig].described(), name=f"describe {rig}") for rig in self.names]
+        return tuple(task.result() for task in asked)
+
+    async def run(self, endpoint: Endpoint) -> None:
+        """Watch what is behind an endpoint until cancelled."""
+        while True:
+            self._note(endpoint, problem="not connected yet")
+            try:
+                async with open_zenoh_session(endpoint.settings) as session:
+                    await self.watch(session, endpoint)
+            except SessionError as error:
+                self._note(endpoint, problem=error.message)
+                await asyncio.sleep(OPEN_AGAIN_S)
+
+    async def watch(self, session: Session, endpoint: Endpoint) -> None:
+        """Watch the rigs of a session until cancelled."""
+        self._note(endpoint, problem=None)
+        async with asyncio.TaskGroup() as group:
+
+            def told(rig: str, instance: str, alive: bool) -> None:  # noqa: FBT001 - told by the client
+                if self._wanted and rig not in self._wanted:
+                    return
+                watch = self._watches.get(rig)
+                if watch is None:
+                    if len(self._watches) >= MOST_RIGS:
+                        self._note(endpoint, problem=f"rig {rig} is left out: there are {MOST_RIGS} already")
+                        return
+                    watch = self._watches[rig] = RigWatch(RigClient(session, rig), endpoint.name, self._values)
+                    group.create_task(watch.run(), name=f"rig {rig}")
+                if watch.endpoint != endpoint.name:
+                    self._note(endpoint, problem=f"rig {rig} is shown as {watch.endpoint} has it; its namesake is not")
+                    return
+                watch.daemon(instance, alive=alive)
+
+            async with daemons(session, told):
+                await asyncio.Event().wait()
+
+    def _watch(self, rig: str) -> RigWatch:
+        if rig not in self._watches:
+            known = ", ".join(self.names) or "none"
+            raise UnknownAxis(f"no rig {rig[:64]} was seen", value=rig, remedy=f"there are: {known}")
+        return self._watches[rig]
+
+    def _note(self, endpoint: Endpoint, *, problem: str | None) -> None:
+        before = self._endpoints.get(endpoint.name)
+        opened = problem is None or (before is not None and before.connected)
+        now = EndpointReply(endpoint=endpoint.name, connected=opened, problem=problem)
+        if now != before:
+            log.info("endpoint", endpoint=endpoint.name, problem=problem)
+            self._endpoints[endpoint.name] = now

@@ -1,0 +1,149 @@
+"""The console's process: sessions to the rigs on one side, the web server on the other, links in between."""
+
+import asyncio
+import json
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import click
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+
+from ldcnd.console.commands import command_routes
+from ldcnd.console.feed import Feed
+from ldcnd.console.gate import Gate
+from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.reading import STATIC, reading_routes
+from ldcnd.console.replies import LinkReply
+from ldcnd.console.rigs import Rigs
+from ldcnd.console.settings import Address, ConsoleSettings
+from ldcnd.console.visitors import LINK_S, Visitors
+from ldcnd.errors import ConfigError
+
+END_TIME_S = 1
+"""Open pages have so long to go when the console ends."""
+SENT_BYTES = 256 * 1024
+"""The kernel keeps so much for a page that does not read: a few seconds of frames, which it would show late."""
+UNREAD_MS = 30_000
+"""The kernel gives up a page that takes nothing for so long."""
+LONGEST_MESSAGE_BYTES = 1024
+"""Pages have nothing to say on their WebSocket."""
+
+
+def build_app(
+    settings: ConsoleSettings, rigs: Rigs, feed: Feed, visitors: Visitors, new_link: Callable[[], str]
+) -> ASGIApp:
+    """Return the web application, behind its gate."""
+
+    async def link(_: Request) -> Response:
+        return Response(LinkReply(link=new_link()).model_dump_json(), media_type="application/json")
+
+    routes = [
+        *reading_routes(rigs, feed, visitors),
+        Route("/api/link", link, methods=["POST"]),
+        *command_routes(rigs),
+        Mount("/static", StaticFiles(directory=STATIC)),
+    ]
+    return Gate(Starlette(routes=routes), visitors, settings.scheme, settings.known_hosts)
+
+
+async def serve(settings: ConsoleSettings) -> None:
+    """Serve until SIGTERM or SIGINT; SIGUSR1 prints another link.
+
+    Raises:
+        ConfigError: the address cannot be listened on, or the certificate cannot be used.
+    """
+    loop = asyncio.get_running_loop()
+    values = LatestValues()
+    rigs = Rigs(values, settings.rigs)
+    visitors = Visitors(loop.time, settings.token)
+    listening = _listen(settings.address)
+    port = listening.getsockname()[1]
+
+    def new_link() -> str:
+        return f"{settings.scheme}://{settings.shown_host}:{port}/?link={visitors.new_link()}"
+
+    async with Feed(values) as feed, asyncio.TaskGroup() as group:
+        server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link), settings))
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, server.end)
+        loop.add_signal_handler(signal.SIGUSR1, lambda: _print(new_link(), settings))
+        watching = [
+            group.create_task(rigs.run(endpoint), name=f"endpoint {endpoint.name}") for endpoint in settings.endpoints
+        ]
+        _print(new_link(), settings)
+        await server.serve(sockets=[listening])
+        for task in watching:
+            task.cancel()
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves signals to the program around it."""
+
+    def end(self) -> None:
+        """Serve no longer than `END_TIME_S` from now on."""
+        self.should_exit = True
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
+
+def _config(app: ASGIApp, settings: ConsoleSettings) -> uvicorn.Config:
+    config = uvicorn.Config(
+        app,
+        http="h11",
+        ws="websockets-sansio",
+        ws_max_size=LONGEST_MESSAGE_BYTES,
+        ws_per_message_deflate=False,
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=END_TIME_S,
+        ssl_certfile=settings.certificate,
+        ssl_keyfile=settings.key,
+    )
+    try:
+        config.load()
+    except OSError as error:  # what ssl raises is an OSError
+        raise ConfigError(f"{settings.certificate}, {settings.key}: cannot be used: {error}") from error
+    return config
+
+
+def _listen(address: Address) -> socket.socket:
+    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+    listening = socket.socket(family)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # connections inherit these two
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SENT_BYTES)
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
+        listening.bind((address.host, address.port))
+        listening.listen()
+    except OSError as error:
+        listening.close()
+        raise ConfigError(
+            f"cannot listen on {address.in_url}:{address.port}: {error.strerror}",
+            value=address.port,
+            remedy="end the other program, or choose another port with --listen",
+        ) from error
+    return listening
+
+
+def _print(link: str, settings: ConsoleSettings) -> None:
+    if settings.as_json:
+        click.echo(json.dumps({"link": link}))
+    elif settings.token:
+        click.echo(f"console: {link}")
+    else:
+        click.echo(f"console: {link}\nThe link lets one browser in, within {LINK_S / 60:g} minutes.")
