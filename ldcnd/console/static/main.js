@@ -1,0 +1,100 @@
+/** The frame round every page: where one is, what is wrong, the stop; and the routes. */
+
+import { html, render, useEffect, useErrorBoundary, useRef, useState } from "./html.js";
+import { AxisPage } from "./pages/axis.js";
+import { EventsPage } from "./pages/events.js";
+import { NetworkPage } from "./pages/network.js";
+import { ParametersPage } from "./pages/parameters.js";
+import { RigPage } from "./pages/rig.js";
+import { ScopePage } from "./pages/scope.js";
+import { TracePage } from "./pages/trace.js";
+import { TuningPage } from "./pages/tuning.js";
+import { problems } from "./parts/problems.js";
+import { Mark } from "./parts/state.js";
+import { StopAll } from "./parts/stop_all.js";
+import { controlled, keepControl, lost } from "./session/control.js";
+import { feed } from "./session/feed.js";
+import { failure, rigs, useRigs, watch } from "./session/rigs.js";
+
+const PAGES = [
+  ["rig", "Rig", RigPage],
+  ["scope", "Scope", ScopePage],
+  ["trace", "Trace", TracePage],
+  ["tuning", "Tuning", TuningPage],
+  ["parameters", "Parameters", ParametersPage],
+  ["network", "Network", NetworkPage],
+  ["events", "Events", EventsPage],
+];
+
+/** The parts of the address behind the hash: page, rig, axis. */
+function place() {
+  const [page = "rig", ...rest] = location.hash.slice(2).split("/").map(decodeURIComponent);
+  return { page: page || "rig", rig: rest[0] ?? null, axis: rest[1] ?? null };
+}
+
+function Navigation({ at }) {
+  return html`<nav aria-label="Pages">
+    ${PAGES.map(([page, title]) => html`<a href=${`#/${page}`} aria-current=${at.page === page ? "page" : null}>${title}</a>`)}
+  </nav>`;
+}
+
+/** One line on how things are: heard by screen readers when it changes. */
+function Summary() {
+  const wrong = problems(rigs.values());
+  const worst = wrong.some((each) => each.level === "bad") ? "bad" : wrong.length ? "warn" : "";
+  const mine = controlled();
+  return html`<p class="summary" role="status">
+    ${feed.live ? "" : html`<${Mark} level="bad">No data from the console process<//> `}
+    <${Mark} level=${worst}>${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : "Nothing needs attention"}<//>
+    ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
+  </p>`;
+}
+
+function Notices() {
+  return html`<div role="alert">
+    ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
+    ${lost && html`<p class="notice mark" data-level="warn">${lost}</p>`}
+  </div>`;
+}
+
+/** A page that fails must not take the stop away. */
+function Guarded({ children }) {
+  const [error] = useErrorBoundary((failed) => console.error(failed));
+  if (!error) return children;
+  return html`<p class="notice mark" data-level="bad">This page has failed: ${error.message}. The stop still works; load the page again.</p>`;
+}
+
+function Console() {
+  const [at, setAt] = useState(place());
+  const main = useRef();
+  useRigs();
+  useEffect(() => {
+    const moved = () => {
+      setAt(place());
+      main.current.focus();
+      scrollTo(0, 0);
+    };
+    addEventListener("hashchange", moved);
+    return () => removeEventListener("hashchange", moved);
+  }, []);
+  const [, title, Page] = PAGES.find(([page]) => page === at.page) ?? ["axis", at.axis ?? "Axis", AxisPage];
+  useEffect(() => {
+    document.title = `${at.page === "axis" ? `Axis ${at.axis}` : title} – ldcnd`;
+  }, [at.page, at.axis]);
+
+  return html`<a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); main.current.focus(); }}>Skip to the page</a>
+    <header class="top">
+      <span class="brand">ldcnd</span>
+      <${Navigation} at=${at} />
+      <${Summary} />
+      <${StopAll} />
+    </header>
+    <main id="main" tabindex="-1" ref=${main}>
+      <${Notices} />
+      <${Guarded} key=${location.hash}><${Page} at=${at} /><//>
+    </main>`;
+}
+
+watch();
+keepControl();
+render(html`<${Console} />`, document.getElementById("console"));

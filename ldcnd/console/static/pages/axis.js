@@ -1,0 +1,43 @@
+/** The page of one axis: what it does now, and what can be asked of it. */
+
+import { html } from "../html.js";
+import { useRigs } from "../session/rigs.js";
+import { AuthorityPanel } from "./axis_authority.js";
+import { FaultPanel, WhyPanel } from "./axis_faults.js";
+import { GainsPanel } from "./axis_gains.js";
+import { HomePanel } from "./axis_homing.js";
+import { LimitsPanel, RegistersPanel } from "./axis_limits.js";
+import { MovePanel } from "./axis_motion.js";
+import { NowPanel } from "./axis_now.js";
+
+const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog"];
+
+export function AxisPage({ at }) {
+  const axis = useRigs().get(at.rig)?.axes.get(at.axis);
+  if (!axis?.info) return html`<h1>Axis ${at.axis}</h1><p>This axis is not known, or not known yet.</p>`;
+  const { info } = axis;
+  return html`
+    <header class="title">
+      <h1><a href="#/rig">${axis.rig.name}</a> <span class="quiet">/</span> ${axis.name}</h1>
+      <p class="quiet">${info.identity ?? info.model}, address ${info.address} on ${info.bus}</p>
+      <p class="links"><a href="#/scope">Scope</a> <a href=${`#/trace/${axis.rig.name}/${axis.name}`}>Trace</a>
+        ${axis.can("set_gains") && html` <a href=${`#/tuning/${axis.rig.name}/${axis.name}`}>Tuning</a>`}
+        ${axis.can("list_parameters") && html` <a href=${`#/parameters/${axis.rig.name}/${axis.name}`}>Parameters</a>`}</p>
+    </header>
+    ${axis.rig.worth && html`<p class="notice mark" data-level="bad">${axis.rig.worth.why} What follows is what was known last.</p>`}
+    <${FaultPanel} axis=${axis} />
+    <div class="columns">
+      <div class="column">
+        <${NowPanel} axis=${axis} />
+        ${axis.can("power") && html`<${WhyPanel} axis=${axis} />`}
+        <${LimitsPanel} axis=${axis} />
+      </div>
+      <div class="column">
+        <${AuthorityPanel} axis=${axis} />
+        ${MOTIONS.some((verb) => axis.can(verb)) && html`<${MovePanel} axis=${axis} />`}
+        ${axis.can("home") && html`<${HomePanel} axis=${axis} />`}
+      </div>
+    </div>
+    ${axis.can("set_gains") && html`<${GainsPanel} axis=${axis} />`}
+    ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}`;
+}

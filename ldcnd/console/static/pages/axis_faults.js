@@ -1,0 +1,64 @@
+/** What is wrong with an axis, what came first, what to do; and why it cannot move. */
+
+import { html, useEffect, useState } from "../html.js";
+import { Action, Panel, RefusalText } from "../parts/controls.js";
+import { clock, words } from "../parts/format.js";
+import { faultPage, Mark } from "../parts/state.js";
+import { command, leaseOf, question } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+
+export function FaultPanel({ axis }) {
+  const { faults } = axis;
+  const first = axis.samples.fault?.first;
+  return html`<div role="alert">
+    ${faults.length > 0 && html`<section class="faults" aria-label="Faults">
+      <h2>${faults.length === 1 ? "A fault stands" : `${faults.length} faults stand`}</h2>
+      ${first && !faults.some((each) => each.code === first.code) && html`<p>First of all came
+        <a href=${faultPage(first.code)}>${words(first.code)}</a> at ${clock(first.since)}: ${first.text}.</p>`}
+      <ul>${faults.map((fault) => html`<${FaultItem} fault=${fault} first=${first} />`)}</ul>
+      <p class="row"><${Action} act=${() => command(axis, "reset")} obstacle=${obstacle(axis, "reset")}>Reset ${axis.name}<//></p>
+    </section>`}
+  </div>`;
+}
+
+function FaultItem({ fault, first }) {
+  return html`<li>
+    <${Mark} level=${fault.stops ? "bad" : "warn"}>${fault.stops ? "motor off" : "warning"}<//>
+    <b>${words(fault.code)}</b>${first?.code === fault.code && html` <span class="quiet">came first</span>`}
+    <p>${fault.text}.</p>
+    <p class="quiet">Since ${clock(fault.since)}, says the ${fault.source}.
+      ${" "}<a href=${faultPage(fault.code)}>More about ${words(fault.code)}</a></p>
+  </li>`;
+}
+
+/** Asks the daemon whenever something has changed that may change the answer. */
+export function WhyPanel({ axis }) {
+  const [why, setWhy] = useState(null);
+  const [refusal, setRefusal] = useState(null);
+  const { state } = axis;
+  const lease = leaseOf(axis);
+  const situation = JSON.stringify([
+    state?.state, state?.link, state?.stop_latched, state?.referenced, state?.enabled,
+    axis.faults.map((each) => each.code), axis.holder, lease, axis.rig.connected,
+  ]);
+  useEffect(() => {
+    let wanted = true;
+    question(axis, "why", { lease }).then(
+      (reply) => wanted && (setWhy(reply), setRefusal(null)), (error) => wanted && setRefusal(error));
+    return () => {
+      wanted = false;
+    };
+  }, [axis, situation]);
+
+  return html`<${Panel} title="Can it move?">
+    <div aria-live="polite">
+      ${why && !refusal && (why.can_move
+        ? html`<p>Yes: a motion within the limits would be accepted.</p>`
+        : html`<p>No. In the order in which it has to be cleared:</p><ol class="causes">${why.causes.map((cause) => html`<li>
+            <a href=${faultPage(cause.code)}>${words(cause.code)}</a> <span>${cause.text}.</span>
+            ${cause.remedy && html`<p class="quiet">To clear it: ${cause.remedy}.</p>`}</li>`)}</ol>`)}
+      ${why?.first_fault && html`<p class="quiet">First since the last reset: ${why.first_fault}.</p>`}
+    </div>
+    <${RefusalText} refusal=${refusal} />
+  <//>`;
+}

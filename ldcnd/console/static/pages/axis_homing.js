@@ -1,0 +1,46 @@
+/** Homing with every condition; what is left empty comes from the axis's configuration. */
+
+import { html, useId, useState } from "../html.js";
+import { Action, Choice, Field, Panel, Reason } from "../parts/controls.js";
+import { HOME_METHODS, HOME_STOPS } from "../session/contract.js";
+import { words } from "../parts/format.js";
+import { command } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+
+const CONFIGURED = ["", "as configured"];
+const STOPS = { smooth: "decelerate, hold", abrupt: "hold at once", off: "open the loop: it coasts" };
+
+export function HomePanel({ axis }) {
+  const [values, setValues] = useState({});
+  const [name, setName] = useState(0);
+  const [toHome, toSet] = [useId(), useId()];
+  const set = (field) => (value) => setValues({ ...values, [field]: value === "" ? null : value });
+  const { unit } = axis.info;
+  const empty = { hint: "empty: as configured" };
+  const field = (label, of, key) =>
+    html`<${Field} label=${label} unit=${of} value=${values[key]} onChange=${set(key)} ...${empty} />`;
+  const way = obstacle(axis, "home");
+  const naming = obstacle(axis, "set_position") ?? (name === null ? "A position is missing." : null);
+
+  return html`<${Panel} title="Home">
+    <div class="fields">
+      <${Choice} label="Reference mark" value=${values.method} onChange=${set("method")}
+        options=${[CONFIGURED, ...HOME_METHODS.map((each) => [each, words(each)])]} />
+      <${Choice} label="At the mark" value=${values.stop} onChange=${set("stop")}
+        options=${[CONFIGURED, ...HOME_STOPS.map((each) => [each, STOPS[each]])]} />
+      ${field("Search velocity, signed", `${unit}/s`, "velocity")}
+      ${field("Acceleration", `${unit}/s²`, "acceleration")}
+      ${field("Position at the mark", unit, "position")}
+      ${field("Then move to", unit, "move_to")}
+      ${field("Longest search", "s", "timeout_s")}
+      ${field("Longest search", unit, "distance")}
+    </div>
+    <p class="row"><${Action} act=${() => command(axis, "home", values)} obstacle=${way} reason=${toHome} kind="main">Home<//></p>
+    ${way && html`<${Reason} id=${toHome} text=${way} />`}
+    ${axis.can("set_position") && html`<h3>Or tell it where it is</h3>
+      <div class="fields"><${Field} label="This is position" unit=${unit} value=${name} onChange=${setName} /></div>
+      <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} obstacle=${naming}
+        reason=${toSet} title="Nothing moves; afterwards the axis is referenced">Set position<//></p>
+      ${naming && html`<${Reason} id=${toSet} text=${naming} />`}`}
+  <//>`;
+}

@@ -1,0 +1,103 @@
+/** Motions of an axis, each previewed by the daemon before it is commanded. */
+
+import { html, useEffect, useId, useState } from "../html.js";
+import { Action, Choice, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
+import { decimalsOf, duration, number } from "../parts/format.js";
+import { command, question } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+
+const PAUSE_MS = 250;
+const KINDS = {
+  move_absolute: { title: "to a position", field: "position", label: "Position", unit: (unit) => unit, previewed: true },
+  move_relative: { title: "by a distance", field: "distance", label: "Distance", unit: (unit) => unit, previewed: true },
+  move_velocity: { title: "at a velocity", field: "velocity", label: "Velocity", unit: (unit) => `${unit}/s`, previewed: true },
+  set_pwm: { title: "with a raw duty", field: "duty", label: "Duty, −1 to 1", unit: () => "", previewed: false },
+  move_analog: { title: "to a sensor value", field: "target", label: "Target", unit: () => "A/D count", previewed: false },
+};
+const BUFFERING = [
+  ["refuse", "refuse it"], ["aborting", "halt, then move"], ["buffered", "wait for its end"],
+];
+
+export function MovePanel({ axis }) {
+  const kinds = Object.keys(KINDS).filter((verb) => axis.can(verb));
+  const [verb, setVerb] = useState(kinds[0]);
+  const [values, setValues] = useState({});
+  const reason = useId();
+  const { field, label, unit, previewed } = KINDS[verb];
+  const set = (name) => (value) => setValues({ ...values, [name]: value });
+  const body = bodyOf(verb, values);
+  const missing = body === null ? `${label} is missing.` : null;
+  const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing;
+
+  return html`<${Panel} title="Move">
+    <div class="fields">
+      <${Choice} label="Move" options=${kinds.map((each) => [each, KINDS[each].title])} value=${verb} onChange=${setVerb} />
+      <${Field} label=${label} unit=${unit(axis.info.unit)} value=${values[field]} onChange=${set(field)} />
+      ${verb === "set_pwm"
+        ? html`<${Field} label="For" unit="s" value=${values.duration_s} onChange=${set("duration_s")} />`
+        : html`${verb !== "move_velocity" && html`<${Field} label="Velocity" unit=${`${axis.info.unit}/s`} value=${values.speed}
+              onChange=${set("speed")} hint="empty: the axis default" />`}
+            <${Field} label="Acceleration" unit=${`${axis.info.unit}/s²`} value=${values.acceleration}
+              onChange=${set("acceleration")} hint="empty: the axis default" />`}
+      ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING} value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
+    </div>
+    ${previewed && html`<${Preview} axis=${axis} body=${body} field=${field} onNearest=${set(field)} />`}
+    <p class="row"><${Action} act=${() => command(axis, verb, body)} obstacle=${way} reason=${reason} kind="main">Move<//></p>
+    ${way && html`<${Reason} id=${reason} text=${way} />`}
+  <//>`;
+}
+
+/** Return what the verb carries, or null while its main value is missing. */
+function bodyOf(verb, values) {
+  const { field } = KINDS[verb];
+  if (values[field] === null || values[field] === undefined) return null;
+  if (verb === "set_pwm") return values.duration_s ? { duty: values.duty, duration_s: values.duration_s } : null;
+  const body = { [field]: values[field], acceleration: values.acceleration ?? null };
+  if (verb !== "move_velocity") body.velocity = values.speed ?? null;
+  if (verb !== "move_analog") body.buffer_mode = values.buffer_mode ?? "refuse";
+  return body;
+}
+
+function Preview({ axis, body, field, onNearest }) {
+  const [plan, setPlan] = useState(null);
+  const [refusal, setRefusal] = useState(null);
+  const asked = body && JSON.stringify({ ...body, buffer_mode: undefined });
+  useEffect(() => {
+    setPlan(null);
+    setRefusal(null);
+    if (!asked) return undefined;
+    let wanted = true;
+    const timer = setTimeout(() => {
+      question(axis, "plan", JSON.parse(asked)).then(
+        (reply) => wanted && setPlan(reply), (error) => wanted && setRefusal(error));
+    }, PAUSE_MS);
+    return () => {
+      wanted = false;
+      clearTimeout(timer);
+    };
+  }, [asked, axis]);
+
+  return html`<div class="preview" aria-live="polite">
+    <h3>What it would do</h3>
+    ${plan ? html`<${Planned} axis=${axis} plan=${plan} field=${field} onNearest=${onNearest} />`
+      : html`<p class="quiet">${asked ? "Asking the daemon…" : "Type a value: the daemon says what would come of it."}</p>`}
+    <${RefusalText} refusal=${refusal} />
+  </div>`;
+}
+
+function Planned({ axis, plan, field, onNearest }) {
+  const decimals = decimalsOf(axis.info);
+  const { unit } = axis.info;
+  if (plan.refusal) {
+    const { nearest } = plan.refusal;
+    return html`<p><span class="mark" data-level="bad">refused</span> ${plan.refusal.message}
+      ${nearest !== null && plan.refusal.code === "position_limit" && field === "position" &&
+        html` <button type="button" class="plain" onClick=${() => onNearest(nearest)}>Use ${number(nearest, decimals)}</button>`}</p>`;
+  }
+  const held = (value, error, of) => `${number(value, 3)} ${of}${error ? ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)` : ""}`;
+  return html`<p>${plan.position === null ? "Goes on until it is told otherwise" : `Ends at ${number(plan.position, decimals)} ${unit}`},
+    ${" "}at ${held(plan.velocity, plan.velocity_error, `${unit}/s`)}, with ${held(plan.acceleration, plan.acceleration_error, `${unit}/s²`)}${
+      plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`}.
+    ${" "}<span class="quiet">${plan.packets.length} packets, ${duration(plan.bus_s)} on the line at most.</span></p>
+    ${plan.obstacles.length > 0 && html`<ul class="obstacles">${plan.obstacles.map((each) => html`<li>${each}</li>`)}</ul>`}`;
+}

@@ -1,0 +1,77 @@
+/** What an axis does now: its values large, its status bits decoded. */
+
+import { html, useState } from "../html.js";
+import { Action, Facts, Panel } from "../parts/controls.js";
+import { age, clock, decimalsOf, number, words } from "../parts/format.js";
+import { Lamp, QualityWord, StateWord } from "../parts/state.js";
+import { readSignals, signalsOf } from "../session/captures.js";
+import { feed } from "../session/feed.js";
+import { obstacle } from "../session/obstacles.js";
+
+export function NowPanel({ axis }) {
+  const { info, samples, state } = axis;
+  const decimals = decimalsOf(info);
+  const { position, velocity, adc } = samples;
+  const left = state?.command?.target == null || !position ? null : state.command.target - position.value;
+  return html`<${Panel} title="Now" data-stale=${axis.rig.worth ? "yes" : "no"}>
+    <div class="now">
+      <p class="big"><output aria-label="Position">${number(position?.value, decimals)}</output>
+        <span class="unit">${info.unit}</span></p>
+      <p class="now-state"><${StateWord} axis=${axis} /> <${QualityWord} axis=${axis} /></p>
+    </div>
+    <${Facts} of=${[
+      ["velocity", html`${number(velocity?.value, decimals)} <span class="unit">${info.unit}/s</span>`],
+      ["following error", html`${number(position?.following_error, decimals)} <span class="unit">${info.unit}</span>`],
+      ["target", html`${number(state?.command?.target, decimals)} <span class="unit">${info.unit}</span>`],
+      ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],
+      ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
+      ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
+      ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command)}` : "none"],
+      ["last error", state?.last_error ?? "none"],
+    ]} />
+    <h3>Status</h3>
+    <${StatusLamps} state=${state} />
+    <${Monitors} axis=${axis} />
+    <${Signals} axis=${axis} />
+  <//>`;
+}
+
+function remaining(command) {
+  if (!command.expected_end) return `for ${age((feed.nowNs() - command.since) / 1e9)}`;
+  return `ends in ${age(Math.max(0, (command.expected_end - feed.nowNs()) / 1e9))}`;
+}
+
+function StatusLamps({ state }) {
+  return html`<ul class="lamps" aria-label="Status bits">
+    <${Lamp} label="loop closed" on=${state?.enabled} />
+    <${Lamp} label="referenced" on=${state?.referenced} />
+    <${Lamp} label="moves" on=${state && state.moving !== "unknown" ? state.moving === "yes" : null} />
+    <${Lamp} label="answers" on=${state && state.link !== "down"} yes=${state?.link} no="down" level=${state?.link === "degraded" ? "warn" : ""} />
+    <${Lamp} label="stop latched" on=${state?.stop_latched} level="warn" />
+    <${Lamp} label="error stop" on=${state && state.state === "error_stop"} level="bad" />
+  </ul>`;
+}
+
+function Monitors({ axis }) {
+  const monitors = Object.entries(axis.monitors);
+  if (!monitors.length) return null;
+  return html`<h3>Monitors</h3>
+    <${Facts} of=${monitors.map(([name, sample]) => [
+      sample.title,
+      sample.unit || !sample.high ? html`${number(sample.value, 0)} <span class="unit">${sample.unit}</span>`
+        : sample.high.length ? sample.high.join(", ") : "none high",
+    ])} />`;
+}
+
+/** The drive's own inputs are no telemetry; a trace of two samples reads them. */
+function Signals({ axis }) {
+  const [snapshot, setSnapshot] = useState(null);
+  const names = signalsOf(axis);
+  if (axis.info.family === "smartstep" || !names.length) return null;
+  return html`<h3>Drive signals</h3>
+    <ul class="lamps" aria-label="Drive signals">
+      ${names.map((name) => html`<${Lamp} label=${words(name)} on=${snapshot?.values[name] ?? null} yes="high" no="low" />`)}
+    </ul>
+    <p class="row"><${Action} act=${() => readSignals(axis)} obstacle=${obstacle(axis, "trace")} onDone=${setSnapshot}>Read signals<//>
+      <small>${snapshot ? `As they were at ${clock(snapshot.at)}.` : "Takes a trace of two samples; it replaces the last trace."}</small></p>`;
+}

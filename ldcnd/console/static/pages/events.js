@@ -1,0 +1,70 @@
+/** What has happened: every command of every rig, how it ended, and who sent it. */
+
+import { html, useEffect, useState } from "../html.js";
+import { Action, Choice, Field, Panel, RefusalText, Table } from "../parts/controls.js";
+import { save } from "../parts/chart_view.js";
+import { dateAndClock, words } from "../parts/format.js";
+import { faultPage, Mark } from "../parts/state.js";
+import { ask, rigPath } from "../session/api.js";
+import { COMMAND_STATUSES } from "../session/contract.js";
+import { changed, useRigs } from "../session/rigs.js";
+
+const ASKED = 500;
+const MOST_SHOWN = 300;
+const LEVELS = { refused: "warn", aborted: "warn", failed: "bad", unknown: "bad" };
+
+export function EventsPage() {
+  const all = [...useRigs().values()];
+  const [only, setOnly] = useState({ axis: "", status: "", text: "" });
+  const [refusal, setRefusal] = useState(null);
+  const connected = all.filter((rig) => rig.connected).map((rig) => rig.name).join();
+  useEffect(() => {
+    for (const rig of all) if (rig.connected) earlier(rig).catch(setRefusal);
+  }, [connected]);
+
+  const set = (name) => (value) => setOnly({ ...only, [name]: value ?? "" });
+  const axes = all.flatMap((rig) => [...rig.axes.values()]).map((axis) => [`${axis.rig.name}/${axis.name}`, `${axis.rig.name} · ${axis.name}`]);
+  const found = all.flatMap((rig) => rig.events.map((event) => ({ rig, event })))
+    .filter((each) => matches(each, only)).sort((one, other) => other.event.t - one.event.t);
+
+  return html`<h1>Events</h1>
+    <${Panel} title="Commands and how they ended">
+      <div class="fields">
+        <${Choice} label="Axis" options=${[["", "all"], ...axes]} value=${only.axis} onChange=${set("axis")} />
+        <${Choice} label="Status" options=${[["", "all"], ...COMMAND_STATUSES.map((each) => [each, each])]} value=${only.status} onChange=${set("status")} />
+        <${Field} label="Find" type="search" value=${only.text} onChange=${set("text")} />
+      </div>
+      <p class="row"><${Action} act=${() => save(new Blob([csvOf(found)], { type: "text/csv" }), "events.csv")} obstacle=${found.length ? null : "There is nothing to save."}>Save CSV<//></p>
+      <${RefusalText} refusal=${refusal} />
+      <p class="quiet" role="status">${found.length} events${found.length > MOST_SHOWN ? `, the latest ${MOST_SHOWN} are shown` : ""}.</p>
+      <${Table} label="Events" head=${["When", "Axis", "Command", "Status", "By", "Reason"]} rows=${found.slice(0, MOST_SHOWN).map(Row)} />
+    <//>`;
+}
+
+function Row({ rig, event }) {
+  return html`<tr key=${`${rig.name}/${event.axis}/${event.seq}`}>
+    <td class="number">${dateAndClock(event.t)}</td>
+    <td><a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a></td>
+    <td>${words(event.verb)}</td><td><${Mark} level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
+    <td>${event.reason ?? ""}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
+}
+
+function matches({ rig, event }, { axis, status, text }) {
+  if (axis && axis !== `${rig.name}/${event.axis}`) return false;
+  if (status && status !== event.status) return false;
+  return [event.axis, event.verb, event.client, event.reason, event.code, event.command_id].join(" ").toLowerCase().includes(text.toLowerCase());
+}
+
+/** Ask for what happened before this page was there. */
+async function earlier(rig) {
+  const { events } = await ask(`${rigPath(rig.name)}/rig/events`, { count: ASKED });
+  for (const event of events) rig.happened(event);
+  changed();
+}
+
+function csvOf(found) {
+  const cell = (value) => `"${String(value ?? "").replaceAll('"', '""')}"`;
+  const rows = found.map(({ rig, event }) =>
+    [dateAndClock(event.t), rig.name, event.axis, event.verb, event.status, event.client, event.reason, event.code, event.command_id].map(cell).join());
+  return `${["when,rig,axis,command,status,client,reason,code,command_id", ...rows].join("\n")}\n`;
+}

@@ -1,0 +1,114 @@
+/** The rig page: what is wrong first, then every axis of every line of every rig. */
+
+import { html } from "../html.js";
+import { Facts } from "../parts/controls.js";
+import { dateAndClock, decimalsOf, duration, number, percent } from "../parts/format.js";
+import { problems } from "../parts/problems.js";
+import { FaultWords, Mark, Meter, QualityWord, StateWord } from "../parts/state.js";
+import { controls } from "../session/control.js";
+import { useRigs } from "../session/rigs.js";
+
+const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Rate", "Control"];
+const FULL = 0.9;
+const COUNTERS = [
+  ["timeouts", "timeouts"], ["corrupt_replies", "corrupt"], ["rejected_packets", "rejected"], ["resent", "retries"],
+  ["resynchronisations", "resyncs"], ["losses", "port losses"],
+];
+
+export function RigPage() {
+  const all = [...useRigs().values()];
+  return html`
+    <h1 class="unseen">Rig</h1>
+    <${Attention} rigs=${all} />
+    ${all.length ? all.map((rig) => html`<${RigSection} key=${rig.name} rig=${rig} />`) : html`<${NoRig} />`}`;
+}
+
+function NoRig() {
+  return html`<section class="panel"><h2>No rig yet</h2>
+    <p>No daemon has been heard. Start one, <code>ldcnd run --config config/simulated.toml</code>, or name its endpoint
+      to <code>ldcnd console -e</code>. This page shows it as soon as it is there.</p></section>`;
+}
+
+function Attention({ rigs }) {
+  const wrong = problems(rigs);
+  if (!wrong.length) return null;
+  return html`<section class="attention" aria-labelledby="attention">
+    <h2 id="attention">Needs attention</h2>
+    <ul>${wrong.map(({ level, where, text, link }) => html`<li data-level=${level}>
+      <a href=${link}>${where}</a> <${Mark} level=${level}>${level === "bad" ? "wrong" : "look"}<//> <span>${text}</span>
+    </li>`)}</ul>
+  </section>`;
+}
+
+function RigSection({ rig }) {
+  return html`<section class="rig" aria-label=${`Rig ${rig.name}`} data-stale=${rig.worth ? "yes" : "no"}>
+    <header>
+      <h2>${rig.name}</h2>
+      <${Facts} of=${[
+        ["daemon", rig.daemon && `ldcnd ${rig.daemon.version}`],
+        ["since", rig.daemon && dateAndClock(rig.daemon.started).slice(0, -4)],
+        ["at", rig.endpoint],
+        ["loop lag", duration(rig.health?.loop_lag_s)],
+      ]} />
+    </header>
+    ${rig.worth && html`<p class="notice mark" data-level="bad">${rig.worth.why} What follows is what was known last.</p>`}
+    ${[...rig.buses.values()].map((bus) => html`<${BusSection} key=${bus.name} rig=${rig} bus=${bus} />`)}
+  </section>`;
+}
+
+function BusSection({ rig, bus }) {
+  const axes = [...rig.axes.values()].filter((axis) => axis.info?.bus === bus.name);
+  return html`<section class="bus" aria-label=${`Line ${bus.name}`}>
+    <${BusLine} bus=${bus} />
+    <table class="axes" role="table" aria-label=${`Axes on ${bus.name}`}>
+      <thead role="rowgroup"><tr role="row">${COLUMNS.map((each) => html`<th role="columnheader" scope="col">${each}</th>`)}</tr></thead>
+      <tbody role="rowgroup">${axes.map((axis) => html`<${AxisRow} key=${axis.name} axis=${axis} />`)}</tbody>
+    </table>
+  </section>`;
+}
+
+function BusLine({ bus }) {
+  const { info, health } = bus;
+  return html`<header class="bus-line">
+    <h3>${bus.name}</h3>
+    <${Mark} level=${info && !info.up ? "bad" : ""}>${info ? (info.up ? "up" : "down") : "unknown"}<//>
+    <span class="quiet">${info?.port}, ${info?.baud} baud</span>
+    <${Meter} label="in use" share=${health?.utilisation} text=${percent(health?.utilisation)}
+      level=${health?.utilisation > FULL ? "warn" : ""} />
+    <ul class="counters" aria-label="Link quality">
+      ${COUNTERS.map(([counter, label]) => html`<${Counter} bus=${bus} counter=${counter} label=${label} />`)}
+    </ul>
+  </header>`;
+}
+
+function Counter({ bus, counter, label }) {
+  const lately = bus.lately(counter);
+  return html`<li><span class="quiet">${label}</span> <b>${bus.health?.[counter] ?? "–"}</b>
+    ${lately > 0 && html` <${Mark} level="warn">+${lately} in the last minute<//>`}</li>`;
+}
+
+function AxisRow({ axis }) {
+  const { info, samples, state, health } = axis;
+  const decimals = decimalsOf(info);
+  const { position, velocity, adc } = samples;
+  const cell = (label, content, kind = "") => html`<td role="cell" data-label=${label} class=${kind}>${content}</td>`;
+  return html`<tr role="row" data-axis=${axis.name}>
+    <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
+      <small>${info.model} · ${info.address}</small></th>
+    ${cell("State", html`<${StateWord} axis=${axis} />${state?.stop_latched && html` <${Mark} level="warn">stop latched<//>`}`)}
+    ${cell("Position", html`<b>${number(position?.value, decimals)}</b> <span class="unit">${info.unit}</span>`, "number main")}
+    ${cell("Velocity", html`${number(velocity?.value, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
+    ${cell("Target", number(state?.command?.target, decimals), "number")}
+    ${cell("A/D", adc ? html`${number(adc.volts, 2)} <span class="unit">V</span>` : html`<span class="quiet">none</span>`, "number")}
+    ${cell("Faults", html`<${FaultWords} axis=${axis} />`)}
+    ${cell("Values", html`<${QualityWord} axis=${axis} />`)}
+    ${cell("Rate", html`${number(health?.rate_hz, 1)} <span class="quiet">of ${number(health?.rate_wanted_hz, 1)} Hz</span>`, "number")}
+    ${cell("Control", html`<${HolderWord} axis=${axis} />`)}
+  </tr>`;
+}
+
+/** Who controls an axis. */
+export function HolderWord({ axis }) {
+  if (controls(axis)) return html`<span class="mine">this page</span>`;
+  return axis.holder ? html`<span>${axis.holder}</span>` : html`<span class="quiet">nobody</span>`;
+}

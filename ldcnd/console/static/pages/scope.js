@@ -1,0 +1,87 @@
+/** The scope: any quantities of any axes against time, as they come. */
+
+import { html, useEffect, useState } from "../html.js";
+import { ChartView } from "../parts/chart_view.js";
+import { Choice, Panel, Tick } from "../parts/controls.js";
+import { channelsOf, Recording } from "../session/channels.js";
+import { MOST_CHANNELS } from "../session/contract.js";
+import { feed } from "../session/feed.js";
+import { useRigs } from "../session/rigs.js";
+
+const WINDOWS = [5, 10, 30, 60, 300];
+const AT_FIRST = 2;
+/** What was chosen is kept while other pages are looked at. */
+let remembered = null;
+
+export function ScopePage() {
+  const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.info);
+  const [chosen, setChosen] = useState(remembered);
+  const [windowS, setWindowS] = useState(10);
+  const [paused, setPaused] = useState(false);
+  const recording = useRecording(axes, chosen);
+  const redraws = useRedraws();
+
+  function toggle(key, on) {
+    const keys = recording.channels.map((channel) => channel.key);
+    remembered = on ? [...keys, key] : keys.filter((each) => each !== key);
+    setChosen(remembered);
+  }
+
+  if (!recording) return html`<h1>Scope</h1><p>No axis is known yet.</p>`;
+  return html`<h1>Scope</h1>
+    <${Panel} title="Live">
+      <${ChartView} name="scope" curves=${recording.curves} csv=${() => recording.csv()} height=${460}
+        live=${{ now: () => recording.now(), windowS, paused, onPause: setPaused }}
+        note=${html`<span class="quiet number" data-redraws=${redraws}>${redraws} redraws/s${feed.dropped ? `, ${feed.dropped} frames dropped` : ""}</span>`} />
+      <${Choice} label="Time across" options=${WINDOWS.map((each) => [each, `${each} s`])} value=${windowS} onChange=${(value) => setWindowS(Number(value))} />
+    <//>
+    <${Panel} title="Channels" note=${`Up to ${MOST_CHANNELS} at once; every sample is drawn at the instant at which it was true.`}>
+      <div class="channels">${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} recording=${recording} onToggle=${toggle} />`)}</div>
+    <//>`;
+}
+
+function AxisChannels({ axis, recording, onToggle }) {
+  const keys = recording.channels.map((channel) => channel.key);
+  const full = keys.length >= MOST_CHANNELS;
+  return html`<fieldset><legend>${axis.rig.name} · ${axis.name}</legend>
+    ${channelsOf(axis).map((channel) => {
+      const on = keys.includes(channel.key);
+      return (on || !full) && html`<${Tick} key=${channel.key} label=${channel.title} checked=${on} onChange=${(ticked) => onToggle(channel.key, ticked)} />`;
+    })}
+  </fieldset>`;
+}
+
+/** Record the chosen channels, or the first axes' positions. */
+function useRecording(axes, chosen) {
+  const [recording, setRecording] = useState(null);
+  const known = axes.length > 0;
+  useEffect(() => {
+    if (!known) return undefined;
+    const all = axes.flatMap(channelsOf);
+    const wanted = chosen
+      ? chosen.map((key) => all.find((channel) => channel.key === key)).filter(Boolean)
+      : all.filter((channel) => channel.field === "value" && channel.item === "position").slice(0, AT_FIRST);
+    const begun = new Recording(wanted);
+    setRecording(begun);
+    return () => begun.close();
+  }, [known, chosen]);
+  return recording;
+}
+
+/** Count the frames of the browser: what a curve can be redrawn with. */
+function useRedraws() {
+  const [rate, setRate] = useState(0);
+  useEffect(() => {
+    let [count, sinceMs] = [0, performance.now()];
+    let frame = requestAnimationFrame(function tick(atMs) {
+      count += 1;
+      if (atMs - sinceMs >= 1_000) {
+        setRate(Math.round((count * 1e3) / (atMs - sinceMs)));
+        [count, sinceMs] = [0, atMs];
+      }
+      frame = requestAnimationFrame(tick);
+    });
+    return () => cancelAnimationFrame(frame);
+  }, []);
+  return rate;
+}

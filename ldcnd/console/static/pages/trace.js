@@ -1,0 +1,112 @@
+/** Traces: recorded as fast as the line or the drive can, started by a trigger, laid over earlier ones. */
+
+import { html, useId, useMemo, useState } from "../html.js";
+import { ChartView } from "../parts/chart_view.js";
+import { Action, Choice, Field, Panel, Reason, Tick } from "../parts/controls.js";
+import { Curve } from "../parts/curve.js";
+import { clock, dateAndClock, duration, number, words } from "../parts/format.js";
+import { axisPath } from "../session/api.js";
+import { capture, captures, discard, fetchLast, keep } from "../session/captures.js";
+import { look } from "../session/channels.js";
+import { MOST_CHANNELS, MOST_SAMPLES, TRACE_UNDER_WAY, TRIGGER_KINDS } from "../session/contract.js";
+import { command } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+import { useRigs } from "../session/rigs.js";
+
+const FIRST = { samples: 500, timeout_s: 30, pre_trigger: 0, kind: "rising", level: 0 };
+
+export function TracePage({ at }) {
+  const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.can("trace"));
+  const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis) ?? axes[0];
+  if (!axis) return html`<h1>Trace</h1><p>No axis that can be traced is known yet.</p>`;
+  return html`<h1>Trace</h1>
+    <${AxisChoice} axes=${axes} axis=${axis} page="trace" />
+    <${Captured} />
+    <${TraceForm} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`;
+}
+
+/** Choose the axis that a page is about. */
+export function AxisChoice({ axes, axis, page }) {
+  const names = axes.map((each) => [`${each.rig.name}/${each.name}`, `${each.rig.name} · ${each.name}`]);
+  return html`<div class="fields"><${Choice} label="Axis" options=${names} value=${`${axis.rig.name}/${axis.name}`}
+    onChange=${(value) => { location.hash = `#/${page}/${value}`; }} /></div>`;
+}
+
+function TraceForm({ axis }) {
+  const all = axis.info.trace_channels;
+  const [chosen, setChosen] = useState(all.slice(0, 3));
+  const [set, setSet] = useState(FIRST);
+  const reason = useId();
+  const field = (name) => ({ value: set[name], onChange: (value) => setSet({ ...set, [name]: value }) });
+  const under = axis.trace && TRACE_UNDER_WAY.includes(axis.trace.phase);
+  const way = obstacle(axis, "trace") ?? (chosen.length ? null : "Choose a channel.")
+    ?? (under ? "A trace is under way." : null) ?? (set.samples ? null : "How many samples?");
+  const request = {
+    channels: chosen, samples: set.samples, timeout_s: set.timeout_s ?? FIRST.timeout_s,
+    interval_s: set.interval_ms ? set.interval_ms / 1e3 : "fastest",
+    ...(set.trigger && { pre_trigger: set.pre_trigger ?? 0, trigger: { channel: set.trigger, kind: set.kind, level: set.level ?? 0 } }),
+  };
+
+  return html`<${Panel} title=${`Record ${axis.name}`} note="Recording moves nothing.">
+    <fieldset class="ticks"><legend>Channels, up to ${MOST_CHANNELS}</legend>
+      ${all.map((name) => html`<${Tick} key=${name} label=${words(name)} checked=${chosen.includes(name)}
+        onChange=${(on) => setChosen(on ? [...chosen, name].slice(0, MOST_CHANNELS) : chosen.filter((each) => each !== name))} />`)}
+    </fieldset>
+    <div class="fields">
+      <${Field} label="Samples" ...${field("samples")} min="2" max=${MOST_SAMPLES} step="1" />
+      <${Field} label="Interval" unit="ms" ...${field("interval_ms")} hint="empty: as fast as can be" />
+      <${Choice} label="Trigger" options=${[["", "none: at once"], ...chosen.map((name) => [name, words(name)])]} ...${field("trigger")} />
+      ${set.trigger && html`<${Choice} label="When it is" options=${TRIGGER_KINDS.map((each) => [each, each])} ...${field("kind")} />
+        <${Field} label="Level" hint="not used for signals" ...${field("level")} />
+        <${Field} label="Samples before" ...${field("pre_trigger")} min="0" step="1" />
+        <${Field} label="Wait at most" unit="s" ...${field("timeout_s")} />`}
+    </div>
+    <p class="row">
+      <${Action} act=${() => capture(axis, request)} obstacle=${way} reason=${reason} kind="main">Record<//>
+      <${Action} act=${() => command(axis, "trace_abort")} obstacle=${under ? null : "No trace is under way."}>Abort<//>
+      <${Action} act=${async () => keep(await fetchLast(axis))} obstacle=${under ? "A trace is under way." : null}>Fetch the last one<//>
+    </p>
+    ${way && html`<${Reason} id=${reason} text=${way} />`}
+    <p role="status">${axis.trace && `${words(axis.trace.phase)}: ${axis.trace.samples} samples of ${axis.trace.channels.map((each) => each.name).join(", ")}${axis.trace.problem ? `; ${axis.trace.problem}` : ""}`}</p>
+  <//>`;
+}
+
+function Captured() {
+  const kept = captures();
+  const [hidden, setHidden] = useState(() => new Set());
+  const shown = kept.filter((one) => !hidden.has(one.id));
+  const curves = useMemo(() => curvesOf(shown), [shown.map((one) => one.id).join()]);
+  if (!kept.length) return html`<${Panel} title="Captures"><p class="quiet">Nothing was recorded on this page yet.</p><//>`;
+  const toggle = (one, on) => setHidden(new Set([...kept.map((each) => each.id)].filter((id) => (id === one.id ? !on : hidden.has(id)))));
+  return html`<${Panel} title="Captures">
+    <${ChartView} name="trace" curves=${curves} csv=${() => csvOf(shown)} height=${420} />
+    <ul class="captures">${kept.map((one) => html`<li key=${one.id}>
+      <${Tick} label=${`${one.axis.name}, ${dateAndClock(one.header.t)}`} checked=${!hidden.has(one.id)} onChange=${(on) => toggle(one, on)} />
+      <span class="quiet">${one.seconds.length} samples in ${duration(one.seconds.at(-1) - one.seconds[0])}${
+        one.header.trigger ? `, trigger ${one.header.trigger.channel} ${one.header.trigger.kind} at 0 s` : ""}${
+        one.header.missed ? `, ${one.header.missed} missed` : ""}${one.header.problem ? `; ${one.header.problem}` : ""}</span>
+      <a href=${`${axisPath(one.axis.rig.name, one.axis.name)}/trace.csv`} download>the axis's last trace as a file of ldcnd</a>
+      <button type="button" class="plain" onClick=${() => discard(one)}>Forget<span class="unseen"> the capture of ${clock(one.header.t)}</span></button>
+    </li>`)}</ul>
+  <//>`;
+}
+
+/** The newest in full, earlier ones dashed: they are told apart without colour. */
+function curvesOf(shown) {
+  let count = 0;
+  return shown.flatMap((one, nth) => one.channels.map((channel) => new Curve({
+    label: `${one.axis.name} ${words(channel.name)}${nth ? ` (${clock(one.header.t)})` : ""}`,
+    unit: channel.unit, step: channel.signal, colour: look(count++).colour, dash: nth ? [[8, 4], [2, 3]][(nth - 1) % 2] : [],
+    xs: one.seconds, ys: channel.values,
+  })));
+}
+
+function csvOf(shown) {
+  const rows = ["time_s,capture,channel,value,unit"];
+  for (const one of shown) {
+    for (const channel of one.channels) {
+      channel.values.forEach((value, row) => rows.push(`${number(one.seconds[row], 6).replace("−", "-")},${one.id},${channel.name},${value},${channel.unit}`));
+    }
+  }
+  return `${rows.join("\n")}\n`;
+}

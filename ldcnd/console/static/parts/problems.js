@@ -1,0 +1,57 @@
+/** What is wrong, the worst first: the list that comes before everything else. */
+
+import { number, words } from "./format.js";
+
+const BUSY = 0.9;
+const RATE_SHORT = 0.8;
+/** A few repeated exchanges a minute are a line's daily life; more deserve a look. */
+const ERRORS_A_MINUTE = 5;
+const COUNTERS = ["timeouts", "corrupt_replies", "rejected_packets"];
+
+/** Return `{level, where, text, link}` of everything that deserves a look, "bad" before "warn". */
+export function problems(rigs) {
+  const found = [...rigs].flatMap((rig) => [...ofRig(rig)]);
+  return found.sort((one, other) => (one.level === other.level ? 0 : one.level === "bad" ? -1 : 1));
+}
+
+function* ofRig(rig) {
+  const link = "#/rig";
+  if (rig.worth) {
+    yield { level: "bad", where: rig.name, text: rig.worth.why, link };
+    return; // nothing below it is known
+  }
+  if (rig.problem) yield { level: "bad", where: rig.name, text: rig.problem, link };
+  if (rig.plan && !rig.plan.holds) {
+    yield { level: "warn", where: rig.name, text: "The plan of its lines does not hold.", link: "#/network" };
+  }
+  for (const bus of rig.buses.values()) yield* ofBus(rig, bus);
+  for (const axis of rig.axes.values()) yield* ofAxis(rig, axis);
+}
+
+function* ofBus(rig, bus) {
+  const at = { where: `${rig.name} · ${bus.name}`, link: "#/network" };
+  if (bus.info && !bus.info.up) yield { ...at, level: "bad", text: `The line is down: ${bus.info.problem}` };
+  for (const remark of bus.info?.remarks ?? []) yield { ...at, level: "warn", text: remark };
+  if (!bus.health) return;
+  const errors = COUNTERS.reduce((sum, counter) => sum + bus.lately(counter), 0);
+  if (errors > ERRORS_A_MINUTE) {
+    yield { ...at, level: "warn", text: `${errors} bad or missing replies within the last minute.` };
+  }
+  if (bus.health.utilisation > BUSY) yield { ...at, level: "warn", text: "The line is full." };
+}
+
+function* ofAxis(rig, axis) {
+  const at = { where: `${rig.name} · ${axis.name}`, link: `#/axis/${rig.name}/${axis.name}` };
+  const { state, quality, health } = axis;
+  if (state?.link === "down") yield { ...at, level: "bad", text: "The drive does not answer." };
+  for (const fault of axis.faults) yield { ...at, level: fault.stops ? "bad" : "warn", text: `${words(fault.code)}: ${fault.text}` };
+  if (state?.state === "error_stop" && !axis.faults.length && state.link !== "down") {
+    yield { ...at, level: "bad", text: `In error stop: ${state.last_error ?? "reset it to go on"}` };
+  }
+  if (state?.stop_latched) yield { ...at, level: "warn", text: "A stop is latched: nothing moves before reset." };
+  if (state?.link === "degraded") yield { ...at, level: "warn", text: "The drive missed its latest polls." };
+  if (quality.level && state?.link !== "down") yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
+  if (health && state?.link === "up" && health.rate_hz < RATE_SHORT * health.rate_wanted_hz && health.rate_wanted_hz > 1) {
+    yield { ...at, level: "warn", text: `${number(health.rate_hz, 1)} samples a second instead of ${number(health.rate_wanted_hz, 1)}.` };
+  }
+}

@@ -1,0 +1,59 @@
+/** State, quality and the like: always a word with a shape, and colour only where something deserves a look. */
+
+import { html } from "../html.js";
+import { age, words } from "./format.js";
+
+const LEVELS = {
+  disabled: "off", standstill: "still", homing: "moving", discrete_motion: "moving", continuous_motion: "moving",
+  stopping: "moving", error_stop: "bad",
+};
+const WORDS = { discrete_motion: "moving", continuous_motion: "running", error_stop: "error stop" };
+
+/** The state of an axis. */
+export function StateWord({ axis }) {
+  const state = axis.state?.state;
+  const level = axis.rig.worth || !state ? "unknown" : LEVELS[state];
+  return html`<span class="state" data-level=${level}>${state ? WORDS[state] ?? words(state) : "unknown"}</span>`;
+}
+
+/** How much the values are worth and how old they are. */
+export function QualityWord({ axis }) {
+  const { word, level } = axis.quality;
+  return html`<span class="quality" data-level=${level}>${word}</span>${" "}
+    <span class="quiet">${age(axis.ageS(axis.samples.position ? "position" : "state"))}</span>`;
+}
+
+/** A word that stands out only when its level says so: "", "warn" or "bad". */
+export function Mark({ level = "", children }) {
+  return html`<span class="mark" data-level=${level}>${children}</span>`;
+}
+
+/** A yes or no of the axis, as a lamp with its word. */
+export function Lamp({ label, on, level = "", yes = "yes", no = "no" }) {
+  const known = on !== null && on !== undefined;
+  return html`<li class="lamp" data-on=${known && on ? "yes" : "no"} data-level=${known && on ? level : ""}>
+    <span>${label}</span> <b>${known ? (on ? yes : no) : "unknown"}</b>
+  </li>`;
+}
+
+/** A share of a whole as a bar with its number. */
+export function Meter({ label, share, text, level = "" }) {
+  return html`<span class="meter" data-level=${level}>
+    <span class="quiet">${label}</span>
+    <meter min="0" max="1" value=${Math.min(1, share ?? 0)} aria-label=${label}>${text}</meter>
+    <b>${text}</b>
+  </span>`;
+}
+
+/** The faults of an axis in a few words, each a link to its page. */
+export function FaultWords({ axis }) {
+  if (!axis.faults.length) return html`<span class="quiet">none</span>`;
+  return axis.faults.map(
+    (fault) => html`<a class="mark" data-level=${fault.stops ? "bad" : "warn"} href=${faultPage(fault.code)}>${words(fault.code)}</a>${" "}`,
+  );
+}
+
+/** The page about a fault or an error code. */
+export function faultPage(code) {
+  return `/faults/${encodeURIComponent(code)}`;
+}

@@ -1,0 +1,94 @@
+/** Questions and commands to the console process: JSON by POST, with the token that proves they come from this page. */
+
+const PATIENCE_MS = 15_000;
+/** A browser keeps six connections to a host; three are left for renewals and stops, which wait for nothing. */
+const MOST_AT_ONCE = 3;
+
+/** What a question was refused with: the daemon's error reply, or what came instead of one. */
+export class Refusal extends Error {
+  constructor(reply, status) {
+    super(reply.message);
+    this.code = reply.code;
+    this.remedy = reply.remedy ?? null;
+    this.nearest = reply.nearest ?? null;
+    this.retryable = reply.retryable ?? false;
+    this.status = status;
+  }
+}
+
+const waiting = [];
+let underWay = 0;
+
+/** Ask in turn with the others; a long answer must not keep a stop from its connection. */
+export async function ask(path, body = {}, patienceMs = PATIENCE_MS) {
+  if (underWay >= MOST_AT_ONCE) await new Promise((resolve) => waiting.push(resolve));
+  underWay += 1;
+  try {
+    return await askAtOnce(path, body, { patienceMs });
+  } finally {
+    underWay -= 1;
+    waiting.shift()?.();
+  }
+}
+
+/** Ask past all others: stops and the renewal of leases. */
+export function askAtOnce(path, body = {}, { patienceMs = PATIENCE_MS, keepalive = false } = {}) {
+  return answer(path, {
+    method: "POST",
+    headers: { "Content-Type": "application/json", "X-Ldcnd-Csrf": cookie("ldcnd_csrf") },
+    body: JSON.stringify(body),
+    priority: "high",
+    keepalive,
+    signal: AbortSignal.timeout(patienceMs),
+  });
+}
+
+/** Read something that has no effect. */
+export function read(path) {
+  return answer(path, { signal: AbortSignal.timeout(PATIENCE_MS) });
+}
+
+/** Return the path of an axis below /api. */
+export function axisPath(rig, axis) {
+  return `/api/rigs/${encodeURIComponent(rig)}/axes/${encodeURIComponent(axis)}`;
+}
+
+/** Return the path of a rig below /api. */
+export function rigPath(rig) {
+  return `/api/rigs/${encodeURIComponent(rig)}`;
+}
+
+async function answer(path, request) {
+  let response;
+  try {
+    response = await fetch(path, { ...request, credentials: "same-origin", redirect: "error" });
+  } catch (error) {
+    throw new Refusal(silence(error), 0);
+  }
+  const reply = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Refusal(explained(reply, response.status), response.status);
+  return reply;
+}
+
+function silence(error) {
+  const late = error.name === "TimeoutError";
+  return {
+    code: late ? "no_answer" : "console_unreachable",
+    message: late
+      ? "No answer in time: what was asked may have happened all the same."
+      : "The console process does not answer: what was asked may not have got through.",
+    remedy: late ? "Look at the axis before anything else is sent." : "Check that ldcnd console still runs.",
+  };
+}
+
+function explained(reply, status) {
+  if (reply.message) return reply;
+  if (status === 401) {
+    return { code: "no_session", message: "This page has no session any more.", remedy: "Open a new link of ldcnd console." };
+  }
+  return { code: `http_${status}`, message: `The console answered with HTTP status ${status}.` };
+}
+
+function cookie(name) {
+  return document.cookie.split("; ").find((each) => each.startsWith(`${name}=`))?.slice(name.length + 1) ?? "";
+}

@@ -1,0 +1,96 @@
+/** What a scope can show live: quantities of axes, and the curves that gather them. */
+
+import { GrowingCurve } from "../parts/curve.js";
+import { words } from "../parts/format.js";
+import { feed } from "./feed.js";
+
+const KEPT = 60_000;
+const GAP_PERIODS = 5;
+const SHORTEST_GAP_S = 0.5;
+export const COLOURS = [1, 2, 3, 4, 5, 6, 7, 8].map((each) => `--curve-${each}`);
+const DASHES = [[], [8, 4], [2, 3]];
+
+/** One quantity of one axis. */
+export class Channel {
+  constructor(axis, item, field, title, unit) {
+    Object.assign(this, { axis, item, field, title, unit });
+    this.key = `${axis.rig.name}/${axis.name}/${item}/${field}`;
+    this.stream = `${axis.rig.name}/${axis.name}/${item}`;
+    this.label = `${axis.name} ${title}`;
+  }
+
+  /** How far apart samples may be before the line between them breaks. */
+  get gapS() {
+    return Math.max(SHORTEST_GAP_S, GAP_PERIODS / (this.axis.health?.rate_wanted_hz || 1));
+  }
+}
+
+/** All channels of an axis. */
+export function channelsOf(axis) {
+  const { unit, items, monitors } = axis.info;
+  const found = [new Channel(axis, "position", "value", "position", unit)];
+  found.push(new Channel(axis, "velocity", "value", "velocity", `${unit}/s`));
+  if (axis.info.capabilities.includes("power")) {
+    found.push(new Channel(axis, "position", "following_error", "following error", unit));
+  }
+  if (items.includes("adc")) found.push(new Channel(axis, "adc", "volts", "A/D", "V"));
+  for (const name of monitors) {
+    found.push(new Channel(axis, `monitor/${name}`, "value", words(name), axis.monitors[name]?.unit || "raw"));
+  }
+  return found;
+}
+
+/** Return colour and dashes of the n-th curve: told apart without colour, too. */
+export function look(index) {
+  return { colour: COLOURS[index % COLOURS.length], dash: DASHES[Math.floor(index / 4) % DASHES.length] };
+}
+
+/** Gathers the samples of some channels for as long as it is not closed. */
+export class Recording {
+  /** Instant of second 0, ns since 1970. */
+  zeroNs = feed.nowNs();
+
+  #byTopic = new Map();
+  #leave;
+
+  constructor(channels) {
+    this.channels = channels;
+    this.curves = channels.map((channel, index) => {
+      const { label, unit, gapS } = channel;
+      const curve = new GrowingCurve({ label, unit, gapS, ...look(index) }, KEPT);
+      const topic = `${channel.axis.rig.name}/tele/${channel.axis.name}/${channel.item}`;
+      this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, field: channel.field }]);
+      return curve;
+    });
+    this.#leave = feed.listen((rig, topic, sample) => this.#take(`${rig}/${topic}`, sample));
+    feed.stream([...new Set(channels.map((channel) => channel.stream))]);
+  }
+
+  /** Seconds since second 0. */
+  now() {
+    return (feed.nowNs() - this.zeroNs) / 1e9;
+  }
+
+  /** Every sample in a row of its own: channels are not sampled at the same instants. */
+  csv() {
+    const rows = ["time_s,channel,value,unit"];
+    for (const curve of this.curves) {
+      for (let index = 0; index < curve.length; index += 1) {
+        rows.push(`${curve.xs[index].toFixed(6)},${curve.label},${curve.ys[index]},${curve.unit}`);
+      }
+    }
+    return `${rows.join("\n")}\n`;
+  }
+
+  close() {
+    this.#leave();
+    feed.stream([]);
+  }
+
+  #take(topic, sample) {
+    for (const { curve, field } of this.#byTopic.get(topic) ?? []) {
+      const good = sample && sample.quality !== "bad" && sample[field] !== null;
+      if (sample) curve.push((sample.t - this.zeroNs) / 1e9, good ? sample[field] : NaN);
+    }
+  }
+}

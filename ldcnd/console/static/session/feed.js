@@ -1,0 +1,83 @@
+/** Telemetry: one read-only WebSocket, opened again whenever it is lost or other streams are wanted. */
+
+import { decode } from "../vendor/msgpack/decode.mjs";
+
+const RATE_HZ = 10;
+const FIRST_PAUSE_MS = 500;
+const LONGEST_PAUSE_MS = 4_000;
+/** Clocks drift: the fastest frame counts so much less with every frame after it. */
+const FORGOTTEN_MS = 0.01;
+
+/** A feed hands entries on as they come; who listens decides what is kept. */
+export class Feed {
+  /** Samples that the console process had to drop for this page, because it was too slow. */
+  dropped = 0;
+  /** Whether a socket is open and has brought a frame. */
+  live = false;
+  /** Console clock minus performance.now(), in ms, as the fastest frame had it. */
+  offsetMs = -Infinity;
+
+  #listeners = new Set();
+  #streams = [];
+  #socket = null;
+  #pauseMs = FIRST_PAUSE_MS;
+
+  /** Call `listener(rig, topic, sample, sentNs)` for every entry; returns what ends that. */
+  listen(listener) {
+    this.#listeners.add(listener);
+    return () => this.#listeners.delete(listener);
+  }
+
+  /** Receive every sample of these keys, `<rig>/<axis>/<item>`, beside the latest value of everything. */
+  stream(keys) {
+    if (keys.join() === this.#streams.join()) return;
+    this.#streams = keys;
+    this.open();
+  }
+
+  /** The console's clock, in ns since 1970. */
+  nowNs() {
+    const offsetMs = Number.isFinite(this.offsetMs) ? this.offsetMs : Date.now() - performance.now();
+    return (performance.now() + offsetMs) * 1e6;
+  }
+
+  /** Connect; an older socket is kept until the new one speaks. */
+  open() {
+    const query = new URLSearchParams({ rate: RATE_HZ });
+    if (this.#streams.length) query.set("stream", this.#streams.join());
+    const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/api/feed?${query}`);
+    const before = this.#socket;
+    this.#socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => {
+      if (socket !== this.#socket) return;
+      before?.close();
+      this.#take(decode(data));
+    };
+    socket.onclose = () => {
+      if (socket !== this.#socket) return;
+      before?.close();
+      this.#lost();
+    };
+  }
+
+  #take([sentNs, dropped, entries]) {
+    this.live = true;
+    this.#pauseMs = FIRST_PAUSE_MS;
+    this.dropped = dropped;
+    this.offsetMs = Math.max(this.offsetMs - FORGOTTEN_MS, sentNs / 1e6 - performance.now());
+    for (const [rig, topic, sample] of entries) {
+      for (const listener of this.#listeners) listener(rig, topic, sample, sentNs);
+    }
+  }
+
+  #lost() {
+    this.live = false;
+    this.offsetMs = -Infinity;
+    for (const listener of this.#listeners) listener(null, "lost", null, 0);
+    setTimeout(() => this.open(), this.#pauseMs);
+    this.#pauseMs = Math.min(2 * this.#pauseMs, LONGEST_PAUSE_MS);
+  }
+}
+
+export const feed = new Feed();

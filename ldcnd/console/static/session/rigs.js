@@ -1,0 +1,268 @@
+/** What is known of every rig: descriptions by GET, latest values by the feed, and how old they are. */
+
+import { useEffect, useState } from "../html.js";
+import { ask, read, rigPath } from "./api.js";
+import { feed } from "./feed.js";
+
+const DESCRIBED_EACH_MS = 5_000;
+const HOLDERS_EACH_MS = 1_000;
+const DRAWN_EACH_MS = 100;
+const SILENT_AFTER_S = 3;
+const OLD_AFTER_S = 1.5;
+const OLD_AFTER_PERIODS = 4;
+const REPORTS_KEPT = 61;
+const EVENTS_KEPT = 1_000;
+
+/** One axis: its description and its latest samples. */
+export class Axis {
+  samples = {};
+  monitors = {};
+  trace = null;
+  holder = null;
+  #arrived = new Map();
+
+  constructor(rig, name) {
+    this.rig = rig;
+    this.name = name;
+    this.info = null;
+  }
+
+  get bus() {
+    return this.rig.buses.get(this.info?.bus) ?? null;
+  }
+
+  get state() {
+    return this.samples.state ?? null;
+  }
+
+  get faults() {
+    return this.samples.fault?.active ?? [];
+  }
+
+  can(capability) {
+    return this.info?.capabilities.includes(capability) ?? false;
+  }
+
+  /** The health report of its line says how often it is published, and how often that was wanted. */
+  get health() {
+    return this.bus?.health?.axes.find((each) => each.axis === this.name) ?? null;
+  }
+
+  take(item, sample, sentNs) {
+    const [kind, monitor] = item.split("/");
+    if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
+    else if (item === "trace") this.trace = sample;
+    else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
+    if (sample) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
+  }
+
+  /** Age of a sample in seconds; null before the first. */
+  ageS(item) {
+    const arrived = this.#arrived.get(item);
+    return arrived ? arrived.ageS + (performance.now() - arrived.atMs) / 1e3 : null;
+  }
+
+  /** How much the last values are worth now, in a word, and whether that needs attention. */
+  get quality() {
+    const known = this.rig.worth;
+    if (known) return known;
+    const sample = this.samples.position ?? this.samples.state;
+    if (!sample) return { word: "no data", level: "bad" };
+    const item = this.samples.position ? "position" : "state";
+    const rate = this.health?.rate_wanted_hz || 1;
+    if (this.ageS(item) > OLD_AFTER_S + OLD_AFTER_PERIODS / rate) return { word: "old", level: "bad" };
+    return { word: sample.quality, level: { good: "", uncertain: "warn" }[sample.quality] ?? "bad" };
+  }
+
+  #keep(where, name, sample) {
+    if (sample) where[name] = sample;
+    else delete where[name];
+  }
+}
+
+/** One line: its description, and its health reports of the last minute. */
+export class Bus {
+  info = null;
+  reports = [];
+
+  constructor(name) {
+    this.name = name;
+  }
+
+  get health() {
+    return this.reports.at(-1) ?? null;
+  }
+
+  report(sample) {
+    if (!sample) this.reports = [];
+    else this.reports = [...this.reports, sample].slice(-REPORTS_KEPT);
+  }
+
+  /** By how much a counter has grown within the reports kept, a minute. */
+  lately(counter) {
+    const first = this.reports[0];
+    return first ? this.health[counter] - first[counter] : 0;
+  }
+}
+
+/** One rig and everything on it. */
+export class Rig {
+  connected = false;
+  problem = null;
+  endpoint = "";
+  daemon = null;
+  plan = null;
+  health = null;
+  leaseRequired = null;
+  axes = new Map();
+  buses = new Map();
+  events = [];
+  heardAtMs = performance.now();
+
+  constructor(name) {
+    this.name = name;
+  }
+
+  /** What all its values are worth when nothing comes in; null while it does. */
+  get worth() {
+    if (!feed.live) return { word: "no data", level: "bad", why: "The console process sends nothing." };
+    if (!this.connected) return { word: "no data", level: "bad", why: this.problem ?? "The daemon is not connected." };
+    const silentS = (performance.now() - this.heardAtMs) / 1e3;
+    if (silentS > SILENT_AFTER_S) return { word: "old", level: "bad", why: `Nothing was heard for ${silentS.toFixed(0)} s.` };
+    return null;
+  }
+
+  axis(name) {
+    if (!this.axes.has(name)) this.axes.set(name, new Axis(this, name));
+    return this.axes.get(name);
+  }
+
+  bus(name) {
+    if (!this.buses.has(name)) this.buses.set(name, new Bus(name));
+    return this.buses.get(name);
+  }
+
+  describe(told) {
+    this.endpoint = told.endpoint;
+    this.connected = told.connected;
+    this.problem = told.problem;
+    this.daemon = told.daemon ?? this.daemon;
+    this.plan = told.plan ?? this.plan;
+    for (const info of told.buses) this.bus(info.bus).info = info;
+    for (const info of told.axes) this.axis(info.axis).info = info;
+    const place = ({ info }) => (info ? [info.bus, info.address] : ["", 0]);
+    this.axes = new Map([...this.axes].sort(([, one], [, other]) => {
+      const [[bus, address], [otherBus, otherAddress]] = [place(one), place(other)];
+      return bus.localeCompare(otherBus) || address - otherAddress;
+    }));
+  }
+
+  take(topic, sample, sentNs) {
+    this.heardAtMs = performance.now();
+    const [root, name, ...rest] = topic.split("/");
+    if (root === "tele") this.#telemetry(name, rest.join("/"), sample, sentNs);
+    else if (topic === "meta/health") this.health = sample;
+    else if (root === "meta" && name === "health") this.bus(rest[0]).report(sample);
+  }
+
+  /** Add an event unless it is known. */
+  happened(event) {
+    if (this.events.some((each) => each.axis === event.axis && each.seq === event.seq && each.t === event.t)) return;
+    this.events.push(event);
+    this.events.sort((one, other) => one.t - other.t);
+    if (this.events.length > EVENTS_KEPT) this.events.shift();
+  }
+
+  #telemetry(name, item, sample, sentNs) {
+    if (item === "event") {
+      if (sample) this.happened(sample);
+    } else this.axis(name).take(item, sample, sentNs);
+  }
+}
+
+/** All rigs by name. */
+export const rigs = new Map();
+
+/** Why the descriptions could not be read; null while they can. */
+export let failure = null;
+
+const watchers = new Set();
+let drawnAtMs = 0;
+let due = 0;
+
+/** Redraw whoever shows rigs, at most ten times a second. */
+export function changed() {
+  if (due) return;
+  const waitMs = Math.max(0, drawnAtMs + DRAWN_EACH_MS - performance.now());
+  due = setTimeout(() => {
+    due = 0;
+    drawnAtMs = performance.now();
+    for (const watcher of watchers) watcher();
+  }, waitMs);
+}
+
+/** Redraw this component when something of any rig has changed. */
+export function useRigs() {
+  const [, redraw] = useState(0);
+  useEffect(() => {
+    const watcher = () => redraw((count) => count + 1);
+    watchers.add(watcher);
+    return () => watchers.delete(watcher);
+  }, []);
+  return rigs;
+}
+
+/** Read all descriptions anew; values come by the feed. */
+export async function describe() {
+  try {
+    const { rigs: told } = await read("/api/rigs");
+    for (const each of told) rigNamed(each.name).describe(each);
+    failure = null;
+  } catch (error) {
+    failure = error;
+  }
+  changed();
+}
+
+/** Begin to watch; once for a page. */
+export function watch() {
+  feed.listen((rig, topic, sample, sentNs) => {
+    if (rig !== null) {
+      if (topic === "rig") joined(rigNamed(rig), sample);
+      else rigNamed(rig).take(topic, sample, sentNs);
+    }
+    changed();
+  });
+  feed.open();
+  describe();
+  setInterval(describe, DESCRIBED_EACH_MS);
+  setInterval(changed, HOLDERS_EACH_MS); // ages grow by themselves
+  setInterval(askHolders, HOLDERS_EACH_MS);
+}
+
+/** Ask every rig who controls what. */
+export async function askHolders() {
+  if (document.hidden) return;
+  for (const rig of rigs.values()) {
+    if (!rig.connected) continue;
+    try {
+      const { required, holders } = await ask(`${rigPath(rig.name)}/rig/holders`);
+      rig.leaseRequired = required;
+      for (const { axis, client } of holders) rig.axis(axis).holder = client;
+    } catch {
+      for (const axis of rig.axes.values()) axis.holder = null; // the page says already that nothing comes in
+    }
+  }
+  changed();
+}
+
+function rigNamed(name) {
+  if (!rigs.has(name)) rigs.set(name, new Rig(name));
+  return rigs.get(name);
+}
+
+function joined(rig, { connected, problem }) {
+  const came = connected && !rig.connected;
+  Object.assign(rig, { connected, problem });
+  if (came) describe(); // another run of the daemon may have other axes
+}

@@ -1,0 +1,84 @@
+/** Test moves: a trace is armed, the move is commanded once, and the samples are judged. */
+
+import { Refusal } from "./api.js";
+import { arm } from "./captures.js";
+import { command, question } from "./control.js";
+import { judge } from "./response.js";
+import { changed } from "./rigs.js";
+
+const MOST_RUNS = 8;
+/** Settled is within so much of the distance, but no finer than some counts. */
+const BAND = 0.02;
+const BAND_COUNTS = 3;
+const CHANNELS = ["position", "following_error", "velocity"];
+/** Asked for; a slow line grants a longer one. */
+const INTERVAL_S = 0.005;
+const MOST_SAMPLES = 4_000;
+const LEAD_S = 0.1;
+
+export const MOVES = {
+  trapezoid: { title: "trapezoid", hint: "a relative move with the axis defaults" },
+  steep: { title: "steepest trapezoid", hint: "a relative move at the velocity and acceleration limits" },
+  step: { title: "step", hint: "one set-point without a profile; needs [bus.axis.tracking]" },
+};
+
+const all = new Map();
+let counted = 0;
+
+/** The runs of an axis, the newest first. */
+export function runs(axis) {
+  return all.get(axis) ?? [];
+}
+
+/** Carry out one test move and judge it.
+ *
+ * Raises what the daemon refuses it with; then nothing has moved.
+ */
+export async function runTest(axis, { kind, distance, settleS }) {
+  const start = axis.samples.position?.value;
+  if (start === undefined) throw new Refusal({ message: "Where the axis is is not known." }, 0);
+  const limits = kind === "steep" ? { velocity: axis.info.limits.velocity, acceleration: axis.info.limits.acceleration } : {};
+  const profileS = kind === "step" ? 0 : await planned(axis, { distance, ...limits });
+  const { finished } = await armFor(axis, LEAD_S + profileS + settleS, INTERVAL_S);
+  finished.catch(() => {}); // awaited below; a refused move leaves before that
+  const reply = kind === "step"
+    ? await command(axis, "track", { position: start + distance })
+    : await command(axis, "move_relative", { distance, ...limits });
+  const capture = await finished;
+  return keep(axis, run(axis, kind, distance, reply, capture));
+}
+
+async function planned(axis, body) {
+  const { refusal, duration_s: duration } = await question(axis, "plan", body);
+  if (refusal) throw new Refusal(refusal, 409);
+  return duration;
+}
+
+/** Arm a trace of so many seconds, as dense as the line allows; tracing moves nothing, so it may be asked for twice. */
+async function armFor(axis, seconds, intervalS) {
+  const samples = Math.min(MOST_SAMPLES, Math.ceil(seconds / intervalS));
+  try {
+    return await arm(axis, { channels: CHANNELS, samples, interval_s: intervalS });
+  } catch (error) {
+    if (error.code === "value_out_of_range" && error.nearest > intervalS) return armFor(axis, seconds, error.nearest);
+    throw error;
+  }
+}
+
+function run(axis, kind, distance, reply, capture) {
+  const counts = axis.info.counts_per_unit ?? 1;
+  const band = Math.max(BAND * Math.abs(distance), BAND_COUNTS / counts);
+  const target = reply.position;
+  const position = capture.channel("position").values;
+  const start = target - distance;
+  const error = capture.channel("following_error").values;
+  const result = judge({ seconds: capture.seconds, position, error, start, target, band, profileS: reply.duration_s ?? 0 });
+  const gains = Object.fromEntries(axis.info.registers.map(({ name, value }) => [name, value]));
+  return { number: ++counted, kind, distance, start, target, band, capture, result, gains };
+}
+
+function keep(axis, one) {
+  all.set(axis, [one, ...runs(axis)].slice(0, MOST_RUNS));
+  changed();
+  return one;
+}
