@@ -31,13 +31,13 @@ export function AxisPage({ at }) {
         <${NowPanel} axis=${axis} />
         ${axis.can("power") && html`<${WhyPanel} axis=${axis} />`}
         <${LimitsPanel} axis=${axis} />
+        ${axis.can("set_gains") && html`<${GainsPanel} axis=${axis} />`}
       </div>
       <div class="column">
         <${AuthorityPanel} axis=${axis} />
         ${MOTIONS.some((verb) => axis.can(verb)) && html`<${MovePanel} axis=${axis} />`}
         ${axis.can("home") && html`<${HomePanel} axis=${axis} />`}
+        ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}
       </div>
-    </div>
-    ${axis.can("set_gains") && html`<${GainsPanel} axis=${axis} />`}
-    ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}`;
+    </div>`;
 }

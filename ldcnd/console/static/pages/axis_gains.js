@@ -38,11 +38,11 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
   const way = obstacle(axis, "set_gains") ?? (count ? null : "No new value differs from the present one.");
 
   const rows = Object.values(gains).map(({ name, value, provenance }) => html`<tr key=${name}>
-    <th scope="row">${name}</th><td>${GAINS[name].title}</td><td class="number">${number(value, 0)}</td>
-    <td><${ProvenanceWord} provenance=${provenance} /></td>
+    <th scope="row">${name} <small>${GAINS[name].title}</small></th>
+    <td class="number">${number(value, 0)} <small><${ProvenanceWord} provenance=${provenance} /></small></td>
     <td><input type="number" min=${GAINS[name].min} max=${GAINS[name].max} step="1" aria-label=${`New ${name}`} value=${wanted[name] ?? ""}
-      onInput=${({ target }) => setWanted({ ...wanted, [name]: target.value === "" ? null : Number(target.value) })} /></td>
-    <td class="quiet">${GAINS[name].min} to ${GAINS[name].max}${GAINS[name].unit && `, ${GAINS[name].unit}`}</td>
+      onInput=${({ target }) => setWanted({ ...wanted, [name]: target.value === "" ? null : Number(target.value) })} />
+      <small>${GAINS[name].min} to ${GAINS[name].max} ${GAINS[name].unit}</small></td>
   </tr>`);
 
   async function write() {
@@ -51,7 +51,7 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
     await describe();
   }
 
-  return html`<${Table} label="Gains" head=${["Register", "What", "Present", "Known by", "New", "Range"]} rows=${rows} />
+  return html`<${Table} label="Gains" kind="gains" head=${["Register", "#Present", "New"]} rows=${rows} />
     <p class="row"><${Action} act=${write} obstacle=${way} reason=${reason} kind="main">
       ${count ? `Write ${Object.entries(changes).map(([name, value]) => `${name} = ${value}`).join(", ")}` : "Write gains"}<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}`;

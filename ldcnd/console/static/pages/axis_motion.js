@@ -7,6 +7,8 @@ import { command, question } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 
 const PAUSE_MS = 250;
+/** Registers are whole numbers; so large a share of a value is worth a word. */
+const NOTICED = 1e-4;
 const KINDS = {
   move_absolute: { title: "to a position", field: "position", label: "Position", unit: (unit) => unit, previewed: true },
   move_relative: { title: "by a distance", field: "distance", label: "Distance", unit: (unit) => unit, previewed: true },
@@ -94,10 +96,10 @@ function Planned({ axis, plan, field, onNearest }) {
       ${nearest !== null && plan.refusal.code === "position_limit" && field === "position" &&
         html` <button type="button" class="plain" onClick=${() => onNearest(nearest)}>Use ${number(nearest, decimals)}</button>`}</p>`;
   }
-  const held = (value, error, of) => `${number(value, 3)} ${of}${error ? ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)` : ""}`;
+  const rounding = (value, error) => Math.abs(error) > NOTICED * Math.abs(value) && ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)`;
+  const held = (value, error, of) => `${number(value, 3)} ${of}${rounding(value, error) || ""}`;
   return html`<p>${plan.position === null ? "Goes on until it is told otherwise" : `Ends at ${number(plan.position, decimals)} ${unit}`},
     ${" "}at ${held(plan.velocity, plan.velocity_error, `${unit}/s`)}, with ${held(plan.acceleration, plan.acceleration_error, `${unit}/s²`)}${
       plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`}.
-    ${" "}<span class="quiet">${plan.packets.length} packets, ${duration(plan.bus_s)} on the line at most.</span></p>
-    ${plan.obstacles.length > 0 && html`<ul class="obstacles">${plan.obstacles.map((each) => html`<li>${each}</li>`)}</ul>`}`;
+    ${" "}<span class="quiet">${plan.packets.length} packets, ${duration(plan.bus_s)} on the line at most.</span></p>`;
 }

@@ -43,7 +43,7 @@ export function EventsPage() {
 
 function Row({ rig, event }) {
   return html`<tr key=${`${rig.name}/${event.axis}/${event.seq}`}>
-    <td class="number">${dateAndClock(event.t)}</td>
+    <td class="time">${dateAndClock(event.t)}</td>
     <td><a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a></td>
     <td>${words(event.verb)}</td><td><${Mark} level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
     <td>${event.reason ?? ""}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;

@@ -49,7 +49,7 @@ function Chain({ rig, bus }) {
     <td>${module.model ?? html`<${Mark} level="warn">not described: never moved<//>`}</td>
     <td class="number">${module.device_id === undefined ? "–" : `${module.device_id}, version ${module.version}`}</td>
   </tr>`);
-  return html`<${Table} label=${`Chain of ${bus.name}`} head=${["Address", "Axis", "Identity", "Model", "Device"]} rows=${rows} />`;
+  return html`<${Table} label=${`Chain of ${bus.name}`} head=${["Address", "Axis", "Identity", "Model", "#Device"]} rows=${rows} />`;
 }
 
 function Health({ bus }) {
@@ -62,7 +62,7 @@ function Health({ bus }) {
     const lately = bus.lately(name);
     return [name.replaceAll("_", " "), html`${health[name]} <span class=${lately && name !== "exchanges" ? "mark" : "quiet"} data-level="warn">+${lately}</span>`];
   });
-  return html`<${Table} label=${`Lanes of ${bus.name}`} head=${["Lane", "Waiting", "Replies", "Half within", "99 % within", "Longest"]} rows=${lanes} />
+  return html`<${Table} label=${`Lanes of ${bus.name}`} head=${["Lane", "#Waiting", "#Replies", "#Half within", "#99 % within", "#Longest"]} rows=${lanes} />
     <p class="quiet">Since the daemon started, and within the last minute:</p>
     <${Facts} of=${counters} />`;
 }
@@ -77,6 +77,6 @@ function Plan({ plan }) {
       ["room for", `${number(plan.commands_per_s, 0)} commands a second`],
       ["stop answered within", duration(plan.stop_s)], ["after a lost reply", duration(plan.stop_after_loss_s)],
     ]} />
-    <${Table} label=${`Polls of ${plan.bus}`} head=${["Axis", "Rate", "Bytes", "Takes", "Done within", ""]} rows=${polls} />
+    <${Table} label=${`Polls of ${plan.bus}`} head=${["Axis", "#Rate", "#Bytes", "#Takes", "#Done within", "Verdict"]} rows=${polls} />
     ${plan.remedies.map((remedy) => html`<p class="mark" data-level="warn">${remedy}</p>`)}`;
 }

@@ -56,7 +56,7 @@ function Memories({ axis }) {
         <${Tick} label="Only what differs" checked=${only.differing} onChange=${(differing) => setOnly({ ...only, differing })} />
       </div>
       <${RefusalText} refusal=${refusal} />
-      <${Table} label="Parameters" head=${["Number", "Name", "RAM", "EEPROM", "File", "Factory", "Range", "EEPROM writes"]}
+      <${Table} label="Parameters" head=${["Number", "Name", "#RAM", "#EEPROM", "#File", "#Factory", "Range", "#EEPROM writes"]}
         rows=${rows.map((row) => html`<${Row} key=${row.parameter} row=${row} />`)} />
     <//>
     ${values && html`<${Change} axis=${axis} values=${values} listed=${listed} onWritten=${renew} />`}

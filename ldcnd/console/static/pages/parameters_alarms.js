@@ -17,7 +17,7 @@ export function AlarmPanel({ axis }) {
       <${Action} act=${() => command(axis, "read_alarms")} onDone=${setReport} obstacle=${obstacle(axis, "parameters")}>Read alarms<//>
       <${Action} act=${() => command(axis, "read_profile")} onDone=${setProfile} obstacle=${obstacle(axis, "none")}>Show doubts<//>
     </p>
-    ${report && html`<${Table} label="Alarms" head=${["When", "Code", "Meaning", "Kind"]}
+    ${report && html`<${Table} label="Alarms" head=${["When", "#Code", "Meaning", "Kind"]}
       rows=${[["now", report.present], ...report.history.map((entry, nth) => [`${nth + 1}`, entry])].map(([when, entry]) => html`<tr>
         <th scope="row">${when}</th><td class="number">${entry.code.toString(16).toUpperCase().padStart(2, "0")}</td>
         <td>${entry.text}</td><td><${Mark} level=${when === "now" ? LEVELS[entry.kind] ?? "" : ""}>${entry.kind}<//></td></tr>`)} />`}

@@ -6,7 +6,7 @@ import { dateAndClock, decimalsOf, duration, number, percent } from "../parts/fo
 import { problems } from "../parts/problems.js";
 import { FaultWords, Mark, Meter, QualityWord, StateWord } from "../parts/state.js";
 import { controls } from "../session/control.js";
-import { useRigs } from "../session/rigs.js";
+import { endpoints, useRigs } from "../session/rigs.js";
 
 const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Rate", "Control"];
 const FULL = 0.9;
@@ -26,7 +26,9 @@ export function RigPage() {
 function NoRig() {
   return html`<section class="panel"><h2>No rig yet</h2>
     <p>No daemon has been heard. Start one, <code>ldcnd run --config config/simulated.toml</code>, or name its endpoint
-      to <code>ldcnd console -e</code>. This page shows it as soon as it is there.</p></section>`;
+      to <code>ldcnd console -e</code>. This page shows it as soon as it is there.</p>
+    <ul>${endpoints.map(({ endpoint, connected, problem }) => html`<li>${endpoint}: ${problem ?? (connected ? "connected" : "not connected")}</li>`)}</ul>
+  </section>`;
 }
 
 function Attention({ rigs }) {
@@ -34,8 +36,9 @@ function Attention({ rigs }) {
   if (!wrong.length) return null;
   return html`<section class="attention" aria-labelledby="attention">
     <h2 id="attention">Needs attention</h2>
-    <ul>${wrong.map(({ level, where, text, link }) => html`<li data-level=${level}>
-      <a href=${link}>${where}</a> <${Mark} level=${level}>${level === "bad" ? "wrong" : "look"}<//> <span>${text}</span>
+    <ul>${wrong.map(({ level, text, places }) => html`<li key=${text} data-level=${level}>
+      <${Mark} level=${level}>${level === "bad" ? "wrong" : "look"}<//>
+      <span>${text}</span> <span class="places">${places.map(({ where, link }) => html`<a href=${link}>${where}</a> `)}</span>
     </li>`)}</ul>
   </section>`;
 }

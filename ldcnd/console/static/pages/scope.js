@@ -19,7 +19,6 @@ export function ScopePage() {
   const [windowS, setWindowS] = useState(10);
   const [paused, setPaused] = useState(false);
   const recording = useRecording(axes, chosen);
-  const redraws = useRedraws();
 
   function toggle(key, on) {
     const keys = recording.channels.map((channel) => channel.key);
@@ -29,15 +28,21 @@ export function ScopePage() {
 
   if (!recording) return html`<h1>Scope</h1><p>No axis is known yet.</p>`;
   return html`<h1>Scope</h1>
-    <${Panel} title="Live">
-      <${ChartView} name="scope" curves=${recording.curves} csv=${() => recording.csv()} height=${460}
-        live=${{ now: () => recording.now(), windowS, paused, onPause: setPaused }}
-        note=${html`<span class="quiet number" data-redraws=${redraws}>${redraws} redraws/s${feed.dropped ? `, ${feed.dropped} frames dropped` : ""}</span>`} />
-      <${Choice} label="Time across" options=${WINDOWS.map((each) => [each, `${each} s`])} value=${windowS} onChange=${(value) => setWindowS(Number(value))} />
-    <//>
-    <${Panel} title="Channels" note=${`Up to ${MOST_CHANNELS} at once; every sample is drawn at the instant at which it was true.`}>
-      <div class="channels">${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} recording=${recording} onToggle=${toggle} />`)}</div>
-    <//>`;
+    <div class="bench">
+      <${Panel} title="Channels" note=${`Up to ${MOST_CHANNELS} at once; each sample is drawn at the instant at which it was true.`}>
+        <div class="fields">
+          <${Choice} label="Time across" options=${WINDOWS.map((each) => [each, `${each} s`])} value=${windowS} onChange=${(value) => setWindowS(Number(value))} />
+        </div>
+        <div class="channels" tabindex="0" role="region" aria-label="Channels of all axes">
+          ${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} recording=${recording} onToggle=${toggle} />`)}
+        </div>
+      <//>
+      <${Panel} title="Live" class="panel bench-picture">
+        <${ChartView} name="scope" curves=${recording.curves} csv=${() => recording.csv()} height=${460}
+          live=${{ now: () => recording.now(), windowS, paused, onPause: setPaused }}
+          note=${feed.dropped > 0 && html`<span class="quiet">${feed.dropped} frames dropped: this browser is too slow</span>`} />
+      <//>
+    </div>`;
 }
 
 function AxisChannels({ axis, recording, onToggle }) {
@@ -66,22 +71,4 @@ function useRecording(axes, chosen) {
     return () => begun.close();
   }, [known, chosen]);
   return recording;
-}
-
-/** Count the frames of the browser: what a curve can be redrawn with. */
-function useRedraws() {
-  const [rate, setRate] = useState(0);
-  useEffect(() => {
-    let [count, sinceMs] = [0, performance.now()];
-    let frame = requestAnimationFrame(function tick(atMs) {
-      count += 1;
-      if (atMs - sinceMs >= 1_000) {
-        setRate(Math.round((count * 1e3) / (atMs - sinceMs)));
-        [count, sinceMs] = [0, atMs];
-      }
-      frame = requestAnimationFrame(tick);
-    });
-    return () => cancelAnimationFrame(frame);
-  }, []);
-  return rate;
 }

@@ -21,8 +21,10 @@ export function TracePage({ at }) {
   if (!axis) return html`<h1>Trace</h1><p>No axis that can be traced is known yet.</p>`;
   return html`<h1>Trace</h1>
     <${AxisChoice} axes=${axes} axis=${axis} page="trace" />
-    <${Captured} />
-    <${TraceForm} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`;
+    <div class="bench">
+      <div><${TraceForm} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} /></div>
+      <div class="bench-picture"><${Captured} /></div>
+    </div>`;
 }
 
 /** Choose the axis that a page is about. */
@@ -85,7 +87,7 @@ function Captured() {
       <span class="quiet">${one.seconds.length} samples in ${duration(one.seconds.at(-1) - one.seconds[0])}${
         one.header.trigger ? `, trigger ${one.header.trigger.channel} ${one.header.trigger.kind} at 0 s` : ""}${
         one.header.missed ? `, ${one.header.missed} missed` : ""}${one.header.problem ? `; ${one.header.problem}` : ""}</span>
-      <a href=${`${axisPath(one.axis.rig.name, one.axis.name)}/trace.csv`} download>the axis's last trace as a file of ldcnd</a>
+      <a href=${`${axisPath(one.axis.rig.name, one.axis.name)}/trace.csv`} download>last trace of ${one.axis.name}, as ldcnd saves it</a>
       <button type="button" class="plain" onClick=${() => discard(one)}>Forget<span class="unseen"> the capture of ${clock(one.header.t)}</span></button>
     </li>`)}</ul>
   <//>`;

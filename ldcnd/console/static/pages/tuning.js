@@ -4,7 +4,7 @@ import { html, useId, useMemo, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
 import { Action, Choice, Field, Panel, Reason, Table, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
-import { clock, decimalsOf, duration, number, percent } from "../parts/format.js";
+import { decimalsOf, duration, number, percent } from "../parts/format.js";
 import { look } from "../session/channels.js";
 import { useRigs } from "../session/rigs.js";
 import { obstacle } from "../session/obstacles.js";
@@ -24,15 +24,16 @@ export function TuningPage({ at }) {
 
 function Bench({ axis }) {
   const [wanted, setWanted] = useState({});
-  return html`
-    <${Runs} axis=${axis} onPutBack=${setWanted} />
-    <div class="columns">
-      <div class="column"><${TestMove} axis=${axis} /></div>
-      <div class="column"><${AuthorityPanel} axis=${axis} /></div>
+  return html`<div class="bench">
+    <div>
+      <${TestMove} axis=${axis} />
+      <${AuthorityPanel} axis=${axis} />
+      <${Panel} title="Gains" note="Nothing is written without a click.">
+        <${GainsTable} axis=${axis} wanted=${wanted} onWanted=${setWanted} />
+      <//>
     </div>
-    <${Panel} title="Gains" note="Nothing is written without a click.">
-      <${GainsTable} axis=${axis} wanted=${wanted} onWanted=${setWanted} />
-    <//>`;
+    <div class="bench-picture"><${Runs} axis=${axis} onPutBack=${setWanted} /></div>
+  </div>`;
 }
 
 function TestMove({ axis }) {
@@ -69,7 +70,6 @@ function Runs({ axis, onPutBack }) {
   const names = Object.keys(gainsOf(axis));
   const rows = all.map((run) => html`<tr key=${run.number}>
     <th scope="row"><${Tick} label=${`Run ${run.number}`} checked=${!hidden.has(run.number)} onChange=${(on) => hide(run, on)} /></th>
-    <td class="quiet">${clock(run.capture.header.t)}</td>
     <td>${MOVES[run.kind].title} ${number(run.distance, decimals)}</td>
     <td class="number">${number(run.result.overshoot, decimals)} <span class="quiet">${percent(run.result.overshootShare)}</span></td>
     <td class="number">${run.result.settlingS === null ? html`<span class="mark" data-level="warn">not settled</span>` : duration(run.result.settlingS)}</td>
@@ -80,10 +80,10 @@ function Runs({ axis, onPutBack }) {
     ${names.map((name) => html`<td class="number">${number(run.gains[name], 0)}</td>`)}
     <td><button type="button" class="plain" onClick=${() => onPutBack(run.gains)}>Put back<span class="unseen"> the gains of run ${run.number}</span></button></td>
   </tr>`);
-  const head = ["Run", "At", `Move, ${unit}`, `Overshoot, ${unit}`, "Settling", "Rise", `Peak error, ${unit}`, `RMS error, ${unit}`, `Final error, ${unit}`, ...names, "Gains"];
-  return html`<${Panel} title="Runs" note=${`Settled is within ${number(all[0].band, decimals)} ${unit}, counted from the end of the profile.`}>
+  const head = ["Run", "Move", "#Overshoot", "#Settling", "#Rise", "#Peak error", "#RMS error", "#Final error", ...names.map((name) => `#${name}`), "Gains"];
+  return html`<${Panel} title="Runs" note=${`Lengths in ${unit}. Settled is within ${number(all[0].band, decimals)} ${unit}, counted from the end of the profile.`}>
     <${ChartView} name=${`tuning ${axis.name}`} curves=${curves} csv=${() => csvOf(shown)} height=${440} />
-    <${Table} label="Runs and their gains" head=${head} rows=${rows} />
+    <${Table} label="Runs and their gains" kind="runs" head=${head} rows=${rows} />
   <//>`;
 }
 

@@ -2,8 +2,10 @@
 
 import uPlot from "../vendor/uplot/uPlot.esm.js";
 
-const AXIS_PX = 68;
-const TIME_AXIS_PX = 44;
+const AXIS_PX = 56;
+const TIME_AXIS_PX = 28;
+const LABEL_PX = 18;
+const LEAST_PX = 100;
 const DRAG_PX = 6;
 const MARGIN = 0.08;
 /** A range is kept while its curves fill more than this much of it: an axis that twitches cannot be read. */
@@ -113,8 +115,8 @@ export class Chart {
       scales: { x: { time: false, auto: false }, y: { auto: false } },
       axes: [
         { ...axis, size: isLast ? TIME_AXIS_PX : 0, values: isLast ? undefined : () => [], label: isLast ? "seconds" : undefined,
-          labelSize: 16, labelFont: font, labelGap: 0 },
-        { ...axis, size: AXIS_PX, label: unit || "0 or 1", labelSize: 18, labelFont: font, labelGap: 0,
+          labelSize: LABEL_PX, labelFont: font, labelGap: 0 },
+        { ...axis, size: AXIS_PX, label: unit || "0 or 1", labelSize: LABEL_PX, labelFont: font, labelGap: 0,
           values: (plot, ticks) => ticks.map((each) => `${Number(each.toPrecision(7))}`.replace("-", "−")) },
       ],
       series: [{}, { show: false }],
@@ -180,8 +182,8 @@ export class Chart {
   }
 
   #paneHeight(isLast, count) {
-    const body = (this.#height - TIME_AXIS_PX) / count;
-    return Math.max(110, Math.round(body + (isLast ? TIME_AXIS_PX : 0)));
+    const below = TIME_AXIS_PX + LABEL_PX;
+    return Math.max(LEAST_PX, Math.round((this.#height - below) / count)) + (isLast ? below : 0);
   }
 
   #resize() {

@@ -8,6 +8,7 @@ import { number } from "./format.js";
 const ZOOM = 2;
 const STEPS = 1000;
 const DIGITS = 4;
+const COUNTED_MS = 1_000;
 
 /** Show `curves`; with `live` the span follows `live.now()` until somebody looks closer.
 
@@ -18,6 +19,7 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
   const chart = useRef();
   const [cursors, setCursors] = useState({ a: null, b: null });
   const [zoom, setZoom] = useState(null);
+  const [redraws, setRedraws] = useState(null);
   const looksBack = live ? live.paused || zoom !== null : true;
 
   useEffect(() => {
@@ -51,10 +53,15 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
       drawn.draw();
       return undefined;
     }
-    let frame = requestAnimationFrame(function redraw() {
+    let [count, sinceMs] = [drawn.drawn, performance.now()];
+    let frame = requestAnimationFrame(function redraw(atMs) {
       const now = live.now();
       drawn.span = { min: now - live.windowS, max: now };
       drawn.draw();
+      if (atMs - sinceMs >= COUNTED_MS) {
+        setRedraws(Math.round(((drawn.drawn - count) * 1e3) / (atMs - sinceMs)));
+        [count, sinceMs] = [drawn.drawn, atMs];
+      }
       frame = requestAnimationFrame(redraw);
     });
     return () => cancelAnimationFrame(frame);
@@ -77,6 +84,7 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
       <button type="button" onClick=${() => setZoom(live && !live.paused ? null : chart.current.extent())}>Show all</button>
       <button type="button" onClick=${() => save(new Blob([csv()], { type: "text/csv" }), `${name}.csv`)}>Save CSV</button>
       <button type="button" onClick=${async () => save(await chart.current.png(), `${name}.png`)}>Save PNG</button>
+      ${live && !looksBack && redraws !== null && html`<span class="quiet number" data-redraws=${redraws}>${redraws} redraws a second</span>`}
       ${note}
     </p>
     <${Cursors} curves=${curves} cursors=${cursors} onCursors=${setCursors} span=${span} fixed=${looksBack} />
@@ -104,7 +112,7 @@ function Cursors({ curves, cursors, onCursors, span, fixed }) {
     ${fixed ? html`<div class="row">${slider("a", "Cursor A")}${slider("b", "Cursor B")}
         <p class="number">${a !== null && b !== null ? `B − A: ${number(b - a, DIGITS)} s${a === b ? "" : `, ${number(1 / Math.abs(b - a), 2)} Hz`}` : "Click the chart for A, with Shift for B."}</p></div>`
       : html`<p class="quiet">Pause to place the cursors. Drag over the chart to look closer.</p>`}
-    <${Table} label="Values of the curves" head=${["Curve", "Last", "At A", "At B", "B − A", "Unit"]} rows=${rows} />`;
+    <${Table} label="Values of the curves" head=${["Curve", "#Last", "#At A", "#At B", "#B − A", "Unit"]} rows=${rows} />`;
 }
 
 /** A piece of the curve's line: its colour and its dashes. */

@@ -18,7 +18,8 @@ export function Action({ act, obstacle = null, reason = null, kind = "", onDone,
     setUnderWay(true);
     setRefusal(null);
     try {
-      onDone?.(await act());
+      const outcome = await act();
+      onDone?.(outcome);
     } catch (error) {
       if (onRefused) onRefused(error);
       else setRefusal(error);
@@ -102,11 +103,14 @@ export function Facts({ of }) {
   </dl>`;
 }
 
-/** A table that scrolls sideways by itself when there is no room, also by keyboard. */
+/** A table that scrolls sideways by itself when there is no room, also by keyboard.
+
+ * The title of a column of numbers begins with "#": it stands on their side.
+ */
 export function Table({ label, head, rows, kind = "" }) {
   return html`<div class="scrolls" tabindex="0" role="region" aria-label=${label}>
     <table class=${kind}>
-      <thead><tr>${head.map((each) => html`<th scope="col">${each}</th>`)}</tr></thead>
+      <thead><tr>${head.map((each) => html`<th scope="col" class=${each[0] === "#" ? "number" : null}>${each.replace("#", "")}</th>`)}</tr></thead>
       <tbody>${rows}</tbody>
     </table>
   </div>`;

@@ -16,6 +16,7 @@ export function decimalsOf(info) {
 /** Seconds in the unit that fits. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
+  if (seconds === 0) return "0 s";
   if (seconds < 0.001) return `${number(seconds * 1e6, 0)} µs`;
   if (seconds < 1) return `${number(seconds * 1e3, seconds < 0.01 ? 2 : 0)} ms`;
   return seconds < 100 ? `${number(seconds, 2)} s` : `${number(seconds / 60, 0)} min`;

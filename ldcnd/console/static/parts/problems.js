@@ -8,10 +8,18 @@ const RATE_SHORT = 0.8;
 const ERRORS_A_MINUTE = 5;
 const COUNTERS = ["timeouts", "corrupt_replies", "rejected_packets"];
 
-/** Return `{level, where, text, link}` of everything that deserves a look, "bad" before "warn". */
+/** Return `{level, text, places: [{where, link}]}` of everything that deserves a look, "bad" before "warn".
+
+ * What is said of several axes is said once.
+ */
 export function problems(rigs) {
-  const found = [...rigs].flatMap((rig) => [...ofRig(rig)]);
-  return found.sort((one, other) => (one.level === other.level ? 0 : one.level === "bad" ? -1 : 1));
+  const found = new Map();
+  for (const { level, text, where, link } of [...rigs].flatMap((rig) => [...ofRig(rig)])) {
+    const key = `${level} ${text}`;
+    if (!found.has(key)) found.set(key, { level, text, places: [] });
+    found.get(key).places.push({ where, link });
+  }
+  return [...found.values()].sort((one, other) => (one.level === other.level ? 0 : one.level === "bad" ? -1 : 1));
 }
 
 function* ofRig(rig) {

@@ -8,7 +8,7 @@ const MOST_AT_ONCE = 3;
 export class Refusal extends Error {
   constructor(reply, status) {
     super(reply.message);
-    this.code = reply.code;
+    this.code = reply.code ?? null; // one of the daemon's, each has a page
     this.remedy = reply.remedy ?? null;
     this.nearest = reply.nearest ?? null;
     this.retryable = reply.retryable ?? false;
@@ -73,7 +73,6 @@ async function answer(path, request) {
 function silence(error) {
   const late = error.name === "TimeoutError";
   return {
-    code: late ? "no_answer" : "console_unreachable",
     message: late
       ? "No answer in time: what was asked may have happened all the same."
       : "The console process does not answer: what was asked may not have got through.",
@@ -84,9 +83,9 @@ function silence(error) {
 function explained(reply, status) {
   if (reply.message) return reply;
   if (status === 401) {
-    return { code: "no_session", message: "This page has no session any more.", remedy: "Open a new link of ldcnd console." };
+    return { message: "This page has no session any more.", remedy: "Open a new link of ldcnd console." };
   }
-  return { code: `http_${status}`, message: `The console answered with HTTP status ${status}.` };
+  return { message: `The console answered with HTTP status ${status}.` };
 }
 
 function cookie(name) {

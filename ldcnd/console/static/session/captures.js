@@ -23,7 +23,7 @@ export class Capture {
     this.channels = header.channels.map((channel, column) => ({
       ...channel,
       signal: channel.unit === "",
-      values: Float64Array.from(values, (row) => row[column] ?? NaN),
+      values: Float64Array.from(values[column], (value) => value ?? NaN),
     }));
   }
 

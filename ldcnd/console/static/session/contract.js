@@ -6,7 +6,7 @@ export const GAINS = {
   kd: { title: "velocity gain", min: 0, max: 32767, unit: "" },
   ki: { title: "integral gain", min: 0, max: 32767, unit: "" },
   il: { title: "integration limit", min: 0, max: 32767, unit: "" },
-  ol: { title: "output limit", min: 0, max: 255, unit: "255 is full duty" },
+  ol: { title: "output limit", min: 0, max: 255, unit: "of 255" },
   cl: { title: "current limit, 0 is off", min: 0, max: 255, unit: "" },
   el: { title: "position error limit", min: 0, max: 16383, unit: "count" },
   deadband: { title: "amplifier deadband compensation", min: 0, max: 255, unit: "" },

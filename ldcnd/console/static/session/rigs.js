@@ -183,6 +183,9 @@ export class Rig {
 /** All rigs by name. */
 export const rigs = new Map();
 
+/** Where rigs are looked for, and what is wrong there. */
+export let endpoints = [];
+
 /** Why the descriptions could not be read; null while they can. */
 export let failure = null;
 
@@ -215,7 +218,8 @@ export function useRigs() {
 /** Read all descriptions anew; values come by the feed. */
 export async function describe() {
   try {
-    const { rigs: told } = await read("/api/rigs");
+    const { rigs: told, endpoints: looked } = await read("/api/rigs");
+    endpoints = looked;
     for (const each of told) rigNamed(each.name).describe(each);
     failure = null;
   } catch (error) {
