@@ -254,18 +254,19 @@ class RigClient:
 
     @asynccontextmanager
     async def published(
-        self, take: Callable[[Sample], None], kept: int = KEPT_PUBLISHED
+        self, take: Callable[[Sample], None], kept: int = KEPT_PUBLISHED, linger_s: float = 0.0
     ) -> AsyncIterator[Callable[[], int]]:
         """Hand all telemetry, events and health reports to `take`, as they come, for the time of the context.
 
         Args:
             take: takes what was published.
             kept: so many samples of a kind may wait for it; yields a function that returns how many more gave way.
+            linger_s: a sample may wait for so long for others, which costs less than taking each by itself.
         """
         async with AsyncExitStack() as declared:
             declarations: list[Declaration] = []
             for key in (self._keys.all_telemetry, f"{self._keys.health}/**"):
-                declaration = await self._session.subscribe(key, take, kept)
+                declaration = await self._session.subscribe(key, take, kept, linger_s=linger_s)
                 declared.push_async_callback(declaration.close)
                 declarations.append(declaration)
             yield lambda: sum(declaration.load.lost for declaration in declarations)

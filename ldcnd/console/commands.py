@@ -19,7 +19,7 @@ from ldcnd.model.errors import ErrorReply
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.replies import StopReply
 from ldcnd.model.requests import REQUEST_MODELS, Verb
-from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS, VerbModels
+from ldcnd.model.verbs import AXIS_QUESTIONS, MOVE_TOGETHER, RIG_VERBS, VerbModels
 
 BODY_TIME_S = 5.0
 """A page has so long to send what it asks."""
@@ -68,7 +68,9 @@ def command_routes(rigs: Rigs) -> list[Route]:
             raise _unknown(verb)
         models: VerbModels = RIG_VERBS[verb]
         body = await _body(request)
-        if "client" in models.request.model_fields:
+        if verb == MOVE_TOGETHER:
+            body = _each_signed(body, request.state.visitor.client)
+        elif "client" in models.request.model_fields:
             body = _signed(body, request.state.visitor.client)
         return _json(await client.rig_command(verb, decode(models.request, body, Encoding.JSON), models.reply))
 
@@ -120,13 +122,26 @@ async def _body(request: Request) -> bytes:
 
 def _signed(body: bytes, client: str) -> bytes:
     """Return a request with the name of whoever sends it, whatever it said."""
+    request = _object(body)
+    return body if request is None else json.dumps(request | {"client": client}).encode()
+
+
+def _each_signed(body: bytes, client: str) -> bytes:
+    """Return a request of several moves, each with the name of whoever sends it."""
+    request = _object(body)
+    moves = request and request.get("moves")
+    if not isinstance(moves, list) or not all(isinstance(move, dict) for move in moves):
+        return body
+    return json.dumps({**(request or {}), "moves": [move | {"client": client} for move in moves]}).encode()
+
+
+def _object(body: bytes) -> dict[str, object] | None:
+    """Return a JSON object; None for what is none: that is refused where it is decoded, in the usual words."""
     try:
         request = json.loads(body or b"{}")
-    except ValueError:
-        return body  # refused where it is decoded, in the words of all such refusals
-    if not isinstance(request, dict):
-        return body
-    return json.dumps(request | {"client": client}).encode()
+    except (ValueError, RecursionError):
+        return None
+    return request if isinstance(request, dict) else None
 
 
 def _unknown(verb: str) -> UnknownVerb:

@@ -1,7 +1,6 @@
 """Telemetry on its way to pages: those that ask for the same share a channel, and nobody waits for a slow one."""
 
 import asyncio
-import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
@@ -75,8 +74,9 @@ class Page:
         dropped: how many frames gave up their streams because it did not read.
     """
 
-    def __init__(self, entry: Callable[[str], bytes], first: Batch) -> None:
+    def __init__(self, entry: Callable[[str], bytes], first: Batch, now_ns: Callable[[], int]) -> None:
         self.dropped = 0
+        self._now_ns = now_ns
         self._entry = entry
         self._waiting = deque([first])
         self._ready = asyncio.Event()
@@ -99,7 +99,7 @@ class Page:
             batch = self._waiting.popleft()
             while self._waiting:
                 batch = self._waiting.popleft().after(batch, streams=True)
-            yield frame(time.time_ns(), self.dropped, batch.body(self._entry))
+            yield frame(self._now_ns(), self.dropped, batch.body(self._entry))
 
 
 class Channel:
@@ -152,9 +152,15 @@ class Channel:
 
 
 class Feed:
-    """All open pages."""
+    """All open pages.
 
-    def __init__(self, values: LatestValues) -> None:
+    Args:
+        values: what they show.
+        now_ns: the wall clock, UTC in ns since 1970.
+    """
+
+    def __init__(self, values: LatestValues, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
         self._values = values
         self._channels: dict[Wish, tuple[Channel, asyncio.Task[None]]] = {}
         self._group = asyncio.TaskGroup()
@@ -178,7 +184,7 @@ class Feed:
         if sum(len(channel.pages) for channel, _ in self._channels.values()) >= MOST_PAGES:
             raise TooManyRequests(f"{MOST_PAGES} pages are open", limit=MOST_PAGES, remedy="close some of them")
         channel, task = self._channels.get(wish) or self._new_channel(wish)
-        page = Page(self._values.entry, Batch(self._values.paths(wish.covers)))
+        page = Page(self._values.entry, Batch(self._values.names(wish.covers)), self._now_ns)
         channel.pages.append(page)
         try:
             yield page

@@ -36,7 +36,7 @@ WEBSOCKET_POLICY_VIOLATION = 1008
 
 STRANGER_PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>ldcnd console</title>
-<link rel="stylesheet" href="/static/style.css"></head>
+<link rel="stylesheet" href="/static/style/base.css"></head>
 <body><main><h1>This browser is not let in yet</h1>
 <p>Open the console with the link that <code>ldcnd console</code> prints when it starts. A link works once, within ten
 minutes. For another one, ask somebody whose console is open, or send the console's process the signal USR1: it then

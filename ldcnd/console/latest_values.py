@@ -5,7 +5,9 @@ stay the bytes that the daemon has sent.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
 from typing import Protocol
 
 import msgpack
@@ -19,7 +21,6 @@ RIG_TOPIC = "rig"
 MOST_PATHS = 20_000
 """More keys than any rigs have; what comes on others is left out."""
 
-_BELOW_ROOT = len(ROOT) + 1
 _TRIPLE = b"\x93"
 _NIL = b"\xc0"
 _MAPS = frozenset({*range(0x80, 0x90), 0xDE, 0xDF})
@@ -36,6 +37,30 @@ class Watcher(Protocol):
         """Learn of an event."""
 
 
+class _Kind(Enum):
+    """What a path carries."""
+
+    VALUE = "value"
+    EVENT = "event"
+    LEFT_OUT = "left out"
+
+
+@dataclass(frozen=True, slots=True)
+class _Path:
+    """What is known of a path once and for all.
+
+    Attributes:
+        name: the path.
+        rig: its first chunk.
+        start: how its entries begin.
+    """
+
+    name: str
+    rig: str
+    start: bytes
+    kind: _Kind
+
+
 class LatestValues:
     """What pages show.
 
@@ -46,77 +71,86 @@ class LatestValues:
     def __init__(self) -> None:
         self.watchers: list[Watcher] = []
         self._entries: dict[str, bytes] = {}
-        self._starts: dict[str, bytes] = {}
-        self._touched: dict[str, set[str]] = {}
+        self._paths: dict[str, _Path] = {}
+        self._newer: dict[str, set[str]] = {}
 
     def take(self, sample: Sample) -> None:
         """Take what a daemon has published; samples of traces are left out, pages ask for them."""
-        path = sample.key[_BELOW_ROOT:]
-        kind = path.split("/", 4)[3:]
+        path = self._paths.get(sample.key) or self._new_path(sample.key)
+        if path.kind is _Kind.LEFT_OUT:
+            return
         if sample.kind is SampleKind.DELETE:
-            self._put(path, None)
-        elif kind == ["event"]:
-            payload = as_msgpack(sample.payload, sample.encoding)
-            if payload and (start := self._start(path)):
-                for watcher in self.watchers:
-                    watcher.happened(path, start + payload)
-        elif len(kind) == 1 or kind[:1] != ["trace"]:
-            self._put(path, as_msgpack(sample.payload, sample.encoding))
+            self._remove(path)
+            return
+        payload = as_msgpack(sample.payload, sample.encoding)
+        if payload is None:
+            return
+        if path.kind is _Kind.VALUE:
+            self._put(path, payload)
+            return
+        for watcher in self.watchers:
+            watcher.happened(path.name, path.start + payload)
 
-    def tell_of_rig(self, rig: str, told: object) -> None:
-        """Replace what pages know about a rig itself; `told` is made of what msgpack takes."""
-        self._put(f"{rig}/{RIG_TOPIC}", msgpack.packb(told))
+    def tell_of_rig(self, rig: str, told: Mapping[str, bool | str | None]) -> None:
+        """Replace what pages know about a rig itself."""
+        key = f"{ROOT}/{rig}/{RIG_TOPIC}"
+        self._put(self._paths.get(key) or self._new_path(key), msgpack.packb(told))
 
     def begin_again(self, rig: str) -> None:
         """Note which values of a rig come from now on; see `settle`."""
-        self._touched[rig] = set()
+        self._newer[rig] = set()
 
-    def settle(self, rig: str, samples: Iterable[Sample]) -> None:
-        """Put a rig's values in order after it has come back, given what it answered.
+    def settle(self, rig: str, answers: Sequence[Sample]) -> None:
+        """Put a rig's values in order after it has come back, given the values that it answered.
 
         What has come since `begin_again` is newer than an answer; what has neither come nor was answered is no more.
         """
-        newer = self._touched.pop(rig, set())
-        answered = {sample.key[_BELOW_ROOT:]: sample for sample in samples}
-        for path, sample in answered.items():
-            if path not in newer:
-                self.take(sample)
-        below = f"{rig}/"
-        for path in [path for path in self._entries if path.startswith(below) and path != below + RIG_TOPIC]:
-            if path not in newer and path not in answered:
-                self._put(path, None)
+        newer = self._newer.pop(rig, set())
+        for answer in answers:
+            if answer.key not in newer:
+                self.take(answer)
+        kept = newer | {answer.key for answer in answers} | {f"{ROOT}/{rig}/{RIG_TOPIC}"}
+        for key, path in self._paths.items():
+            if path.rig == rig and key not in kept:
+                self._remove(path)
 
-    def paths(self, wanted: Callable[[str], bool]) -> frozenset[str]:
-        """Return the paths that have a value."""
-        return frozenset(path for path in self._entries if wanted(path))
+    def names(self, wanted: Callable[[str], bool]) -> frozenset[str]:
+        """Return the wanted ones of the paths that have a value."""
+        return frozenset(name for name in self._entries if wanted(name))
 
-    def entry(self, path: str) -> bytes:
+    def entry(self, name: str) -> bytes:
         """Return what pages are told of a path now."""
-        return self._entries.get(path) or self._starts[path] + _NIL
+        return self._entries.get(name) or self._paths[f"{ROOT}/{name}"].start + _NIL
 
-    def _put(self, path: str, sample: bytes | None) -> None:
-        start = self._start(path)
-        if start is None or (sample is None and path not in self._entries):
-            return
-        entry = start + (sample or _NIL)
-        if sample is None:
-            del self._entries[path]
-        else:
-            self._entries[path] = entry
-        if self._touched:
-            touched = self._touched.get(path.partition("/")[0])
-            if touched is not None:
-                touched.add(path)
+    def _put(self, path: _Path, payload: bytes) -> None:
+        entry = self._entries[path.name] = path.start + payload
+        if self._newer and path.rig in self._newer:
+            self._newer[path.rig].add(f"{ROOT}/{path.name}")
         for watcher in self.watchers:
-            watcher.changed(path, entry)
+            watcher.changed(path.name, entry)
 
-    def _start(self, path: str) -> bytes | None:
-        """Return how the entries of a path begin."""
-        start = self._starts.get(path)
-        if start is None and len(self._starts) < MOST_PATHS:
-            rig, _, topic = path.partition("/")
-            start = self._starts[path] = _TRIPLE + msgpack.packb(rig) + msgpack.packb(topic)
-        return start
+    def _remove(self, path: _Path) -> None:
+        if self._entries.pop(path.name, None):
+            for watcher in self.watchers:
+                watcher.changed(path.name, path.start + _NIL)
+
+    def _new_path(self, key: str) -> _Path:
+        name = key[len(ROOT) + 1 :]
+        rig, _, topic = name.partition("/")
+        start = _TRIPLE + msgpack.packb(rig) + msgpack.packb(topic)
+        if len(self._paths) >= MOST_PATHS:
+            return _Path(name, rig, start, _Kind.LEFT_OUT)
+        path = self._paths[key] = _Path(name, rig, start, _kind(topic.split("/")))
+        return path
+
+
+def _kind(topic: list[str]) -> _Kind:
+    match topic:
+        case ["tele", _, "event"]:
+            return _Kind.EVENT
+        case ["tele", _, "trace", _]:
+            return _Kind.LEFT_OUT
+    return _Kind.VALUE
 
 
 def as_msgpack(payload: bytes, encoding: str) -> bytes | None:

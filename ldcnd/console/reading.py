@@ -32,7 +32,7 @@ NOTHING_TO_SAY = 1008
 _FAULT_CODE = re.compile(r"[a-z0-9_]{1,64}")
 _FAULT_PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>{code} - ldcnd</title><link rel="stylesheet" href="/static/style.css"></head>
+<title>{code} - ldcnd</title><link rel="stylesheet" href="/static/style/base.css"></head>
 <body><main class="fault-page">{text}</main></body></html>
 """
 

@@ -12,6 +12,8 @@ log = get_logger("console")
 
 ASK_AGAIN_S = 0.5
 """A daemon that is there but did not answer is asked again so soon; behind a router it may not be heard at first."""
+LINGER_S = 0.016
+"""Samples are taken so many seconds' worth at a time; less than a frame at the highest rate."""
 DESCRIPTION_AGE_S = 1.0
 """Pages that ask what a rig is get an answer that is so old at most, however many ask."""
 DESCRIBE_TIME_S = 4.0
@@ -51,7 +53,7 @@ class RigWatch:
         """Watch until cancelled."""
         while True:
             try:
-                async with self.client.published(self._values.take):
+                async with self.client.published(self._values.take, LINGER_S):
                     await self._follow()
             except LdcndError as error:
                 self._show(problem=error.message)

@@ -4,6 +4,7 @@ import asyncio
 import json
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -70,7 +71,7 @@ async def serve(settings: ConsoleSettings) -> None:
     def new_link() -> str:
         return f"{settings.scheme}://{settings.shown_host}:{port}/?link={visitors.new_link()}"
 
-    async with Feed(values) as feed, asyncio.TaskGroup() as group:
+    async with Feed(values, time.time_ns) as feed, asyncio.TaskGroup() as group:
         server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link), settings))
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, server.end)

@@ -168,8 +168,11 @@ class MemorySession(Session):
         self._broker.queryables.append(queryable)
         return self._declared(undeclare, queryable.intake.load)
 
-    async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
-        """Take samples."""
+    async def subscribe(
+        self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES, *, linger_s: float = 0.0
+    ) -> Declaration:
+        """Take samples, at once however long they may linger."""
+        del linger_s
         self._must_be_open()
         samples = HandOver(self._loop, on_sample, kept)
         subscription = _Subscription(key, samples)

@@ -259,13 +259,16 @@ class Session(ABC):
         """
 
     @abstractmethod
-    async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
+    async def subscribe(
+        self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES, *, linger_s: float = 0.0
+    ) -> Declaration:
         """Take the samples that match a key expression; the oldest are lost when the loop is too slow.
 
         Args:
             key: the expression.
             on_sample: takes a sample.
             kept: so many samples may wait for the loop.
+            linger_s: a sample may wait for so long for others; for those who take very many.
         """
 
     @abstractmethod

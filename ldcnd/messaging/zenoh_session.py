@@ -16,7 +16,7 @@ from functools import partial
 from typing import Protocol
 
 import zenoh
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, RingChannel
 
 from ldcnd.errors import SessionError, ValueOutOfRange
 from ldcnd.log import get_logger
@@ -38,6 +38,7 @@ from ldcnd.messaging.session import (
     Query,
     Session,
 )
+from ldcnd.messaging.sweep import Sweep
 from ldcnd.messaging.workers import Workers
 from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
 from ldcnd.messaging.zenoh_settings import ZenohSettings
@@ -184,8 +185,12 @@ class ZenohSession(Session):
             intake.load,
         )
 
-    async def subscribe(self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES) -> Declaration:
+    async def subscribe(
+        self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES, *, linger_s: float = 0.0
+    ) -> Declaration:
         """Take samples."""
+        if linger_s:
+            return await self._sweep(key, on_sample, kept, linger_s)
         samples = HandOver(self._loop, on_sample, kept)
 
         def take(sample: zenoh.Sample) -> None:
@@ -216,6 +221,19 @@ class ZenohSession(Session):
             return _SubscriberWatch(publisher, listener)
 
         return await self._declare(declare, looks.close)
+
+    async def _sweep(self, key: str, on_sample: OnSample, kept: int, period_s: float) -> Declaration:
+        """Look for samples now and then: Zenoh's threads then need not run any Python."""
+        found: list[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]] = []
+
+        def declare() -> _Undeclarable:
+            found.append(self._session.declare_subscriber(key, RingChannel(kept)))
+            return found[0]
+
+        sweep = Sweep[zenoh.Sample](self._loop, lambda sample: on_sample(to_sample(sample)), period_s, kept)
+        declaration = await self._declare(declare, sweep.close)
+        sweep.begin(found[0].try_recv)
+        return declaration
 
     async def query(
         self,

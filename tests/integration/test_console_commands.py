@@ -1,0 +1,195 @@
+"""Commands of pages reach the rig as the pages meant them, once, and come back as the rig answered."""
+
+import asyncio
+import json
+
+import pytest
+
+from ldcnd.client.traces import arm_trace, fetch_trace, wait_for_trace
+from ldcnd.console import reading
+from ldcnd.model.axes import AxisState
+from ldcnd.model.events import EventList, EventsRequest
+from ldcnd.model.requests import TraceRequest
+from tests.support.browser import WebAnswer
+from tests.support.console_rig import running_console
+
+X = "/api/rigs/sim/axes/x"
+RIG = "/api/rigs/sim/rig"
+
+
+@pytest.fixture
+async def console():
+    async with running_console() as running:
+        yield running
+
+
+async def test_an_axis_is_powered_moved_and_arrives(console):
+    powered = await console.browser.post(f"{X}/power", {"on": True})
+    await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+    moved = await console.browser.post(f"{X}/move_absolute", {"position": 2.5})
+
+    arrived = await console.rig.client.wait_for_end("x", moved.document["command_id"])
+
+    assert (powered.status, moved.status) == (200, 200)
+    assert moved.document["position"] == 2.5
+    assert arrived.state is AxisState.STANDSTILL
+    assert (await console.rig.client.last("x", "position")).value == pytest.approx(2.5, abs=0.05)
+
+
+async def test_questions_about_an_axis_are_answered(console):
+    why = await console.browser.post(f"{X}/why")
+    plan = await console.browser.post(f"{X}/plan", {"position": 5.0})
+
+    assert why.document["can_move"] is False
+    assert plan.status == 200, plan.document
+
+
+async def test_commands_go_under_the_visitor_s_name_whatever_they_say(console):
+    await console.browser.post(f"{X}/power", {"on": True, "client": "somebody else"})
+    lease = await console.browser.post(f"{RIG}/acquire", {"client": "somebody else", "lease_s": 5})
+
+    events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
+    assert {event.client for event in events} == {"console-1"}
+    assert lease.document["client"] == "console-1"
+
+
+async def test_moves_together_go_under_the_visitor_s_name(console):
+    moves = [{"axis": axis, "position": 1.0, "client": "somebody else"} for axis in "xy"]
+
+    await console.browser.post(f"{RIG}/move_together", {"moves": moves})
+
+    events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
+    assert {event.axis for event in events} == {"x", "y"}
+    assert {event.client for event in events} == {"console-1"}
+
+
+async def test_control_that_is_not_renewed_is_lost(console):
+    lease = (await console.browser.post(f"{RIG}/acquire", {"lease_s": 5})).document["lease"]
+    other = await console.enter()
+    meanwhile = await other.post(f"{X}/power", {"on": True})
+    renewed = await console.browser.post(f"{RIG}/renew", {"lease": lease})
+    await asyncio.sleep(6)
+
+    late = await console.browser.post(f"{RIG}/renew", {"lease": lease})
+    afterwards = await other.post(f"{X}/power", {"on": True})
+
+    assert (meanwhile.status, meanwhile.document["code"]) == (409, "lease_held")
+    assert renewed.status == 200
+    assert (late.status, late.document["code"]) == (409, "lease_expired")
+    assert afterwards.status == 200
+
+
+async def test_stops_need_no_lease_and_latch(console):
+    other = await console.enter()
+    await other.post(f"{RIG}/acquire", {"lease_s": 60})
+
+    one = await console.browser.post("/api/rigs/sim/stop", {"axis": "x"})
+    every = await console.browser.post("/api/stop")
+
+    assert one.document["axes"] == ["x"]
+    assert set(every.document["rigs"]["sim"]["axes"]) == {"x", "y", "z", "c"}
+    assert (await console.rig.client.state("z")).stop_latched
+
+
+async def test_a_stop_overtakes_the_commands_before_it(console):
+    async with asyncio.TaskGroup() as group:
+        before = [
+            group.create_task(console.browser.post("/api/rigs/sim/axes/z/set_gains", {"kp": kp}), name="gains")
+            for kp in range(100, 160)
+        ]
+        await asyncio.sleep(0.002)
+
+        stopped = await console.browser.post("/api/rigs/sim/stop")
+
+    codes = [task.result().document.get("code") for task in before]
+    assert set(stopped.document["confirmed"]) == {"x", "y", "z", "c"}
+    assert "stop_latched" in codes
+    assert codes.count(None) < 5
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status", "code"),
+    [
+        (f"{X}/power", b"{", 400, "malformed_request"),
+        (f"{X}/power", b"[]", 400, "malformed_request"),
+        (f"{X}/power", b'{"on": 1}', 400, "malformed_request"),
+        (f"{X}/power", b'{"on": true, "speed": 1}', 400, "malformed_request"),
+        (f"{X}/move_absolute", b'{"position": NaN}', 400, "malformed_request"),
+        (f"{X}/power", b'{"on": true}' + b" " * 20_000, 400, "payload_too_large"),
+        ("/api/rigs/sim/stop", b'{"axes": "x"}', 400, "malformed_request"),
+        (f"{X}/fly", b"{}", 404, "unknown_verb"),
+        (f"{RIG}/fly", b"{}", 404, "unknown_verb"),
+        ("/api/rigs/sim/axes/w/halt", b"{}", 404, "unknown_axis"),
+        ("/api/rigs/none/axes/x/halt", b"{}", 404, "unknown_axis"),
+        ("/api/rigs/none/stop", b"{}", 404, "unknown_axis"),
+        (f"{X}/move_absolute", b'{"position": 1.0}', 409, "wrong_state"),
+        (f"{X}/read_alarms", b"{}", 409, "not_supported"),
+    ],
+)
+async def test_what_cannot_be_done_is_refused_in_the_public_form(console, path, body, status, code):
+    answer = await console.browser.post(path, body)
+
+    assert (answer.status, answer.document["code"]) == (status, code)
+    assert answer.document["message"]
+
+
+async def test_an_axis_with_an_impossible_name_does_not_exist(console):
+    assert (await console.browser.post("/api/rigs/sim/axes/*/halt")).status in (404, 409)
+    assert (await console.browser.post("/api/rigs/*/stop")).status == 404
+
+
+async def test_the_rigs_are_described(console):
+    document = (await console.browser.get("/api/rigs")).document
+
+    rig = document["rigs"][0]
+    assert document["client"] == "console-1"
+    assert document["endpoints"] == [{"endpoint": "memory", "connected": True, "problem": None}]
+    assert (rig["name"], rig["connected"], rig["problem"]) == ("sim", True, None)
+    assert [axis["axis"] for axis in rig["axes"]] == ["x", "y", "z", "c"]
+    assert rig["plan"]["holds"]
+    assert {command["verb"] for command in rig["commands"]["commands"]} >= {"power", "acquire", "why"}
+
+
+async def test_a_trace_is_served_as_document_and_as_table(console):
+    none = await console.browser.get(f"{X}/trace")
+    reply = await arm_trace(console.rig.client, "x", TraceRequest(channels=("position",), samples=50))
+    await wait_for_trace(console.rig.client, "x", reply.trace_id, 60)
+
+    document = (await console.browser.get(f"{X}/trace")).document
+    table = await console.browser.get(f"{X}/trace.csv")
+
+    taken = await fetch_trace(console.rig.client, "x")
+    assert (none.status, none.document["code"]) == (404, "wrong_state")
+    assert document["offsets_ns"] == list(taken.offsets_ns)
+    assert document["values"] == [list(column) for column in taken.values]
+    assert table.headers["content-type"].startswith("text/csv")
+    assert table.body.decode().splitlines()[1].startswith("offset_ns,position [mm]")
+    assert len(table.body.splitlines()) == 52
+
+
+async def test_what_a_fault_means_is_shown_and_its_text_stays_text(console, tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "FAULT_PAGES", tmp_path)
+    (tmp_path / "overcurrent.md").write_text(
+        "# Too much current\n\n<script>alert(1)</script>\n\n| a | b |\n|---|---|\n"
+    )
+
+    shown = await console.browser.get("/faults/overcurrent")
+    unknown = await console.browser.get("/faults/undercurrent")
+    elsewhere = await console.browser.get("/faults/..%2fovercurrent")
+
+    assert b"<h1>Too much current</h1>" in shown.body
+    assert b"<script>" not in shown.body
+    assert b"<table>" in shown.body
+    assert (unknown.status, elsewhere.status) == (404, 404)
+    assert b"no page" in unknown.body
+
+
+async def test_a_rig_with_hundreds_of_events_tells_them_all(console):
+    """What a daemon answers may be longer than any request."""
+    for _ in range(150):
+        await console.browser.post(f"{X}/halt")
+
+    answer: WebAnswer = await console.browser.post(f"{RIG}/events", {"count": 1000})
+
+    assert answer.status == 200
+    assert len(json.dumps(answer.document)) > 16_384

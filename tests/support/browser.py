@@ -1,0 +1,160 @@
+"""Browsers that say to a console exactly what a test wants said."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field, replace
+from urllib.parse import urlsplit
+
+import msgpack
+from websockets.asyncio.client import ClientConnection, connect
+
+from tests.support.process import START_TIME_S, process
+
+JsonObject = dict[str, "JsonValue"]
+JsonValue = JsonObject | list["JsonValue"] | str | int | float | bool | None
+ASK_TIME_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class WebAnswer:
+    """What a console has answered."""
+
+    status: int
+    headers: Mapping[str, str]
+    cookies: Mapping[str, str]
+    body: bytes
+
+    @property
+    def document(self) -> JsonObject:
+        """The body as JSON."""
+        document = json.loads(self.body)
+        assert isinstance(document, dict)
+        return document
+
+
+@dataclass(frozen=True, slots=True)
+class WebQuestion:
+    """What a browser asks."""
+
+    method: str
+    path: str
+    headers: Mapping[str, str]
+    body: bytes = b""
+
+
+Ask = Callable[[WebQuestion], Awaitable[WebAnswer]]
+
+
+@dataclass(frozen=True, slots=True)
+class Browser:
+    """Speaks to one console; what it says can be forged.
+
+    Attributes:
+        origin: of the console's pages.
+        cookies: as given on entering.
+        extra: headers to send beside the usual ones, or in their place; an empty one is left out.
+    """
+
+    ask: Ask
+    origin: str
+    cookies: Mapping[str, str] = field(default_factory=dict)
+    extra: Mapping[str, str] = field(default_factory=dict)
+
+    def forging(self, **headers: str) -> "Browser":
+        """Return one that sends other headers; underscores stand for hyphens."""
+        return replace(self, extra={**self.extra, **{name.replace("_", "-"): text for name, text in headers.items()}})
+
+    def without_cookies(self) -> "Browser":
+        """Return a stranger."""
+        return replace(self, cookies={})
+
+    async def enter(self, link: str) -> "Browser":
+        """Return one that was let in."""
+        answer = await self.get(path_of(link))
+        assert answer.status == 303, answer
+        return replace(self, cookies=answer.cookies)
+
+    async def get(self, path: str) -> WebAnswer:
+        """GET."""
+        return await self.ask(WebQuestion("GET", path, self.headers()))
+
+    async def post(self, path: str, body: JsonObject | bytes | None = None) -> WebAnswer:
+        """POST as the console's own pages do."""
+        payload = body if isinstance(body, bytes) else json.dumps(body or {}).encode()
+        usual = {"origin": self.origin, "x-ldcnd-csrf": self.cookies.get("ldcnd_csrf", "")}
+        return await self.ask(WebQuestion("POST", path, self.headers(usual), payload))
+
+    def headers(self, usual: Mapping[str, str] | None = None) -> dict[str, str]:
+        """Return the headers of a question."""
+        cookies = "; ".join(f"{name}={text}" for name, text in self.cookies.items())
+        said = {"host": urlsplit(self.origin).netloc, "cookie": cookies, **(usual or {}), **self.extra}
+        return {name: text for name, text in said.items() if text}
+
+
+def path_of(link: str) -> str:
+    """Return path and query of a link."""
+    parts = urlsplit(link)
+    return f"{parts.path}?{parts.query}" if parts.query else parts.path
+
+
+async def ask_over_tcp(host: str, port: int, question: WebQuestion) -> WebAnswer:
+    """Ask a console in another process, on a connection of its own."""
+    async with asyncio.timeout(ASK_TIME_S):
+        reader, writer = await asyncio.open_connection(host, port)
+        try:
+            lines = [f"{question.method} {question.path} HTTP/1.1", "connection: close"]
+            lines += [f"{name}: {text}" for name, text in question.headers.items()]
+            if question.body:
+                lines.append(f"content-length: {len(question.body)}")
+            writer.write("\r\n".join([*lines, "", ""]).encode() + question.body)
+            head, _, body = (await reader.read()).partition(b"\r\n\r\n")
+        finally:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+    first, *rest = head.decode().split("\r\n")
+    headers = [line.split(": ", 1) for line in rest]
+    return web_answer(int(first.split()[1]), [(name, text) for name, text in headers], body)
+
+
+def web_answer(status: int, headers: list[tuple[str, str]], body: bytes) -> WebAnswer:
+    """Return an answer from what came."""
+    cookies = [text.partition(";")[0].partition("=") for name, text in headers if name.lower() == "set-cookie"]
+    given = {name: text for name, _, text in cookies}
+    return WebAnswer(status, {name.lower(): text for name, text in headers}, given, body)
+
+
+@asynccontextmanager
+async def console(*arguments: str) -> AsyncIterator[tuple[Browser, asyncio.subprocess.Process]]:
+    """Run `ldcnd console ARGUMENTS` on a free port until the context ends; yields a browser that was let in."""
+    async with process("console", "--json", "--listen", "127.0.0.1:0", *arguments) as running:
+        assert running.stdout
+        async with asyncio.timeout(START_TIME_S):
+            link = json.loads(await running.stdout.readline())["link"]
+        at = urlsplit(link)
+        assert at.hostname
+        assert at.port
+        host, port = at.hostname, at.port
+        browser = Browser(lambda question: ask_over_tcp(host, port, question), f"http://{at.netloc}")
+        yield await browser.enter(link), running
+
+
+@asynccontextmanager
+async def feed(browser: Browser, query: str = "") -> AsyncIterator[ClientConnection]:
+    """Open a page's WebSocket."""
+    at = urlsplit(browser.origin)
+    headers = browser.headers()
+    del headers["host"]
+    uri = f"ws://{at.netloc}/api/feed{query}"
+    async with connect(uri, origin=browser.origin, additional_headers=headers, compression=None) as socket:  # type: ignore[arg-type] # any text is an origin
+        yield socket
+
+
+def entries(frame: bytes | str) -> list[tuple[str, str, JsonObject | None]]:
+    """Return what a frame tells."""
+    assert isinstance(frame, bytes)
+    _sent_ns, _dropped, told = msgpack.unpackb(frame)
+    return [(rig, topic, sample) for rig, topic, sample in told]
