@@ -30,8 +30,8 @@ from ldcnd.errors import ConfigError
 
 END_TIME_S = 1
 """Open pages have so long to go when the console ends."""
-SENT_BYTES = 256 * 1024
-"""The kernel keeps so much for a page that does not read: a few seconds of frames, which it would show late."""
+SENT_BYTES = 64 * 1024
+"""The kernel keeps so much for a page that does not read: frames that it would show late."""
 UNREAD_MS = 30_000
 """The kernel gives up a page that takes nothing for so long."""
 LONGEST_MESSAGE_BYTES = 1024

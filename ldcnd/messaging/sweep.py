@@ -1,7 +1,7 @@
 """Samples taken from a queue now and then, for those who take very many: waking up the loop for each costs far more."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Generic, TypeVar
 
 ItemT = TypeVar("ItemT")
@@ -34,6 +34,11 @@ class Sweep(Generic[ItemT]):
         """Deliver no more."""
         if self._timer:
             self._timer.cancel()
+
+    async def end(self, take_back: Callable[[], Awaitable[None]]) -> None:
+        """Deliver no more, then take the queue back: one that is gone cannot be asked."""
+        self.close()
+        await take_back()
 
     def _empty(self, take: Callable[[], ItemT | None]) -> None:
         self.begin(take)  # first, because `deliver` may close

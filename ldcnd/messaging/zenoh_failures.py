@@ -1,4 +1,4 @@
-"""What an operator is told when Zenoh cannot start: Zenoh's words name Rust sources, these name endpoints and remedies.
+"""What an operator is told when Zenoh cannot start or answer: Zenoh names Rust sources, these name endpoints and remedies.
 
 Source: the messages of Zenoh 1.10.2, as seen; whatever is not recognised is passed on, without its source locations.
 """
@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from ldcnd.errors import ConfigError, LdcndError, SessionError
+from ldcnd.errors import ConfigError, LdcndError, OutcomeUnknown, SessionError
 
 _SOURCE_LOCATION = re.compile(r",? at /\S+\.rs:\d+\.?")
 
@@ -15,6 +15,11 @@ _SOURCE_LOCATION = re.compile(r",? at /\S+\.rs:\d+\.?")
 def is_about_connecting(reason: str) -> bool:
     """Tell whether Zenoh has failed to connect, rather than to listen."""
     return "Unable to connect" in reason
+
+
+def no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
+    """Return the error for a query that nobody has answered in time."""
+    return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
 
 
 def login_refused(refusals: Sequence[str]) -> SessionError:

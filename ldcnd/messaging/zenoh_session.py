@@ -233,7 +233,7 @@ class ZenohSession(Session):
         sweep = Sweep[zenoh.Sample](self._loop, lambda sample: on_sample(to_sample(sample)), period_s, kept)
         declaration = await self._declare(declare, sweep.close)
         sweep.begin(found[0].try_recv)
-        return declaration
+        return Declaration(partial(sweep.end, declaration.close))
 
     async def query(
         self,

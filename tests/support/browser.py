@@ -3,9 +3,11 @@
 import asyncio
 import contextlib
 import json
+import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from urllib.parse import urlsplit
 
 import msgpack
@@ -100,10 +102,10 @@ def path_of(link: str) -> str:
     return f"{parts.path}?{parts.query}" if parts.query else parts.path
 
 
-async def ask_over_tcp(host: str, port: int, question: WebQuestion) -> WebAnswer:
+async def ask_over_tcp(host: str, port: int, question: WebQuestion, tls: ssl.SSLContext | None = None) -> WebAnswer:
     """Ask a console in another process, on a connection of its own."""
     async with asyncio.timeout(ASK_TIME_S):
-        reader, writer = await asyncio.open_connection(host, port)
+        reader, writer = await asyncio.open_connection(host, port, ssl=tls)
         try:
             lines = [f"{question.method} {question.path} HTTP/1.1", "connection: close"]
             lines += [f"{name}: {text}" for name, text in question.headers.items()]
@@ -127,9 +129,32 @@ def web_answer(status: int, headers: list[tuple[str, str]], body: bytes) -> WebA
     return WebAnswer(status, {name.lower(): text for name, text in headers}, given, body)
 
 
+@dataclass(frozen=True, slots=True)
+class ConsoleProcess:
+    """A console in a process of its own.
+
+    Attributes:
+        link: as it was printed.
+        process: the process.
+        stranger: a browser that was not let in.
+    """
+
+    link: str
+    process: asyncio.subprocess.Process
+    stranger: Browser
+
+    async def printed_link(self) -> str:
+        """Return the next link that it prints."""
+        assert self.process.stdout
+        async with asyncio.timeout(START_TIME_S):
+            link = json.loads(await self.process.stdout.readline())["link"]
+        assert isinstance(link, str)
+        return link
+
+
 @asynccontextmanager
-async def console(*arguments: str) -> AsyncIterator[tuple[Browser, asyncio.subprocess.Process]]:
-    """Run `ldcnd console ARGUMENTS` on a free port until the context ends; yields a browser that was let in."""
+async def console(*arguments: str, tls: ssl.SSLContext | None = None) -> AsyncIterator[ConsoleProcess]:
+    """Run `ldcnd console ARGUMENTS` on a free port until the context ends."""
     async with process("console", "--json", "--listen", "127.0.0.1:0", *arguments) as running:
         assert running.stdout
         async with asyncio.timeout(START_TIME_S):
@@ -137,24 +162,25 @@ async def console(*arguments: str) -> AsyncIterator[tuple[Browser, asyncio.subpr
         at = urlsplit(link)
         assert at.hostname
         assert at.port
-        host, port = at.hostname, at.port
-        browser = Browser(lambda question: ask_over_tcp(host, port, question), f"http://{at.netloc}")
-        yield await browser.enter(link), running
+        ask = partial(ask_over_tcp, at.hostname, at.port, tls=tls)
+        yield ConsoleProcess(link, running, Browser(ask, f"{at.scheme}://{at.netloc}"))
 
 
 @asynccontextmanager
 async def feed(browser: Browser, query: str = "") -> AsyncIterator[ClientConnection]:
     """Open a page's WebSocket."""
     at = urlsplit(browser.origin)
-    headers = browser.headers()
+    headers = browser.headers({"origin": browser.origin})
     del headers["host"]
     uri = f"ws://{at.netloc}/api/feed{query}"
-    async with connect(uri, origin=browser.origin, additional_headers=headers, compression=None) as socket:  # type: ignore[arg-type] # any text is an origin
+    # what the test has not read stands in the way of a goodbye
+    async with connect(uri, additional_headers=headers, compression=None, close_timeout=0.2) as socket:
         yield socket
 
 
-def entries(frame: bytes | str) -> list[tuple[str, str, JsonObject | None]]:
-    """Return what a frame tells."""
-    assert isinstance(frame, bytes)
+async def entries(socket: ClientConnection) -> list[tuple[str, str, JsonObject | None]]:
+    """Return what the next frame tells."""
+    async with asyncio.timeout(ASK_TIME_S):
+        frame = await socket.recv(decode=False)
     _sent_ns, _dropped, told = msgpack.unpackb(frame)
     return [(rig, topic, sample) for rig, topic, sample in told]

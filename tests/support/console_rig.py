@@ -112,7 +112,8 @@ async def page(app: ASGIApp, browser: Browser, query: str = "") -> AsyncIterator
     """Open a page's WebSocket; returns once it was let in or not."""
     socket = PageSocket()
     headers = browser.headers({"origin": browser.origin})
-    scope = _scope("websocket", f"/api/feed{query}", headers) | {
+    scope = {
+        **_scope("websocket", f"/api/feed{query}", headers),
         "subprotocols": [],
         "extensions": {"websocket.http.response": {}},
     }
@@ -165,7 +166,7 @@ async def _asked(app: ASGIApp, question: WebQuestion) -> WebAnswer:
         said.append(message)
 
     async with asyncio.timeout(PATIENCE_S):
-        await app(_scope("http", question.path, question.headers) | {"method": question.method}, receive, send)
+        await app({**_scope("http", question.path, question.headers), "method": question.method}, receive, send)
     headers = [(name.decode(), text.decode()) for name, text in said[0]["headers"]]
     return web_answer(said[0]["status"], headers, b"".join(message.get("body", b"") for message in said[1:]))
 

@@ -47,6 +47,27 @@ class SampleFacts:
         assert arrived == list(range(published - UNDELIVERED_SAMPLES, published))
         assert samples.empty()
 
+    async def test_samples_that_may_linger_arrive_in_order_and_none_after_the_end(self, pair: Pair) -> None:
+        await subscribed(pair.server, pair.client)
+        arrived: asyncio.Queue[Sample] = asyncio.Queue()
+        declaration = await pair.client.subscribe("ldcn/bench1/tele/x/*", arrived.put_nowait, keep=1000, linger_s=0.02)
+        while arrived.empty():
+            pair.server.publish(POSITION, b"first", encoding=JSON, qos=Qos.TELEMETRY)
+            await asyncio.sleep(0.01)
+
+        for number in range(300):
+            pair.server.publish(POSITION, b"%d" % number, encoding=JSON, qos=Qos.TELEMETRY)
+
+        async with asyncio.timeout(5):
+            samples = [await arrived.get()]
+            while samples[-1].payload != b"299":
+                samples.append(await arrived.get())
+        await declaration.close()
+        pair.server.publish(POSITION, b"late", encoding=JSON, qos=Qos.TELEMETRY)
+        await asyncio.sleep(0.1)
+        assert [sample.payload for sample in samples if sample.payload != b"first"] == [b"%d" % n for n in range(300)]
+        assert arrived.empty()
+
     async def test_a_closed_subscription_takes_nothing_more(self, pair: Pair) -> None:
         kept = await subscribed(pair.server, pair.client)
         dropped: list[Sample] = []
