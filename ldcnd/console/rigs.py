@@ -9,7 +9,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import EndpointReply, RigReply
 from ldcnd.console.rig_watch import RigWatch
-from ldcnd.errors import SessionError, UnknownAxis
+from ldcnd.errors import ConfigError, SessionError, UnknownAxis
 from ldcnd.log import get_logger
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
@@ -80,7 +80,7 @@ class Rigs:
             try:
                 async with open_zenoh_session(endpoint.settings) as session:
                     await self.watch(session, endpoint)
-            except SessionError as error:
+            except (SessionError, ConfigError) as error:
                 self._note(endpoint, problem=error.message)
                 await asyncio.sleep(OPEN_AGAIN_S)
 

@@ -27,6 +27,7 @@ from ldcnd.console.rigs import Rigs
 from ldcnd.console.settings import Address, ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.errors import ConfigError
+from ldcnd.messaging.zenoh_config import zenoh_config
 
 END_TIME_S = 1
 """Open pages have so long to go when the console ends."""
@@ -59,8 +60,10 @@ async def serve(settings: ConsoleSettings) -> None:
     """Serve until SIGTERM or SIGINT; SIGUSR1 prints another link.
 
     Raises:
-        ConfigError: the address cannot be listened on, or the certificate cannot be used.
+        ConfigError: the address, the certificate or what was said about Zenoh cannot be used.
     """
+    for endpoint in settings.endpoints:
+        zenoh_config(endpoint.settings)  # what is wrong with it is told now, not tried for ever
     loop = asyncio.get_running_loop()
     values = LatestValues()
     rigs = Rigs(values, settings.rigs)

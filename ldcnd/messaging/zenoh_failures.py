@@ -1,4 +1,4 @@
-"""What an operator is told when Zenoh cannot start or answer: Zenoh names Rust sources, these name endpoints and remedies.
+"""What an operator is told when Zenoh cannot start or answer: endpoints and remedies instead of names of Rust sources.
 
 Source: the messages of Zenoh 1.10.2, as seen; whatever is not recognised is passed on, without its source locations.
 """

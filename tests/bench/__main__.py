@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from tests.bench import bus_efficiency, round_trip, system_calls, virtual_time
+from tests.bench import bus_efficiency, console, round_trip, system_calls, virtual_time
 from tests.bench.bus_efficiency import FLOOR, Result
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
@@ -22,6 +22,7 @@ EFFICIENCY = {
     (19_200, "uvloop"): 0.99,
     (19_200, "asyncio"): 0.99,
 }
+CONSOLE_S, CONSOLE_ROUNDS = 5.0, 3
 
 
 def main() -> None:
@@ -53,7 +54,7 @@ def _processes(rounds: int) -> list[Row]:
         except NoCompiler as error:
             print(f"skipped: {error}")
             return []
-        rows = []
+        rows = console.rows(folder, CONSOLE_S, CONSOLE_ROUNDS)
         for baud in (115_200, 19_200):
             for result in bus_efficiency.measure(programs, folder, baud, rounds):
                 rows += _efficiency_rows(result)

@@ -7,7 +7,6 @@ import socket
 import ssl
 from asyncio.subprocess import PIPE
 from contextlib import AsyncExitStack, asynccontextmanager
-from urllib.parse import urlsplit
 
 import msgpack
 import pytest
@@ -21,7 +20,7 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.replies import StopReply
 from ldcnd.pki.certificates import issue_daemon, new_authority
-from tests.support.browser import console, entries, feed, path_of
+from tests.support.browser import console, entries, feed, hanging_page, path_of
 from tests.support.process import LDCND, ROOT, answering, free_port, process
 from tests.support.router import router
 
@@ -65,23 +64,10 @@ async def connected(page, rig, *, wanted=True):
                 return seen
 
 
-async def hanging_page(browser):
-    """Open a page's WebSocket and never read from it."""
-    at = urlsplit(browser.origin)
-    hanging = socket.socket()
-    hanging.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    hanging.connect((at.hostname, at.port))
-    upgrade = {"origin": browser.origin, "upgrade": "websocket", "connection": "Upgrade"}
-    upgrade |= {"sec-websocket-key": "AAAAAAAAAAAAAAAAAAAAAA==", "sec-websocket-version": "13"}
-    lines = [f"{name}: {text}" for name, text in browser.headers(upgrade).items()]
-    hanging.sendall("\r\n".join(["GET /api/feed?rate=60 HTTP/1.1", *lines, "", ""]).encode())
-    return hanging
-
-
 async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_all_the_same():
     async with bulky_rig() as (endpoint, publish), console("-e", endpoint) as running:
         browser = await running.stranger.enter(running.link)
-        with await hanging_page(browser):
+        with hanging_page(browser):
             async with feed(browser, "?rate=60") as page:
                 await connected(page, "sim")
                 for _ in range(100):  # frames, together far more than the kernel keeps for a page
@@ -173,20 +159,24 @@ async def test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls
     assert (stopped.status, plain.status) == (200, 403)
 
 
-async def test_what_would_let_strangers_in_is_refused_with_the_reason():
+async def test_what_cannot_be_served_or_would_let_strangers_in_is_refused_with_the_reason():
     taken = socket.create_server(("127.0.0.1", 0))
     with taken:
         cases = {
+            ("--listen", "127.0.0.1:0", "-e", "nonsense"): "nonsense",
             ("--listen", "0.0.0.0:0"): "that takes --certificate and --key and --token-file",
             ("--listen", f"127.0.0.1:{taken.getsockname()[1]}"): "cannot listen on 127.0.0.1",
         }
-        for arguments, words in cases.items():
-            running = await asyncio.create_subprocess_exec(*LDCND, "console", *arguments, stdout=PIPE, stderr=PIPE)
+        refused = [
+            await asyncio.create_subprocess_exec(*LDCND, "console", *arguments, stdout=PIPE, stderr=PIPE)
+            for arguments in cases
+        ]
+        for running, words in zip(refused, cases.values(), strict=True):
             async with asyncio.timeout(PATIENCE_S):
                 printed, errors = await running.communicate()
-            assert running.returncode == 78
+            assert (running.returncode, printed) == (78, b"")
             assert words in errors.decode()
-            assert printed == b""
+            assert "Traceback" not in errors.decode()
 
 
 async def test_rigs_are_lost_and_regained_behind_daemons_and_routers(tmp_path):

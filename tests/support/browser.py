@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import socket
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -174,13 +175,26 @@ async def feed(browser: Browser, query: str = "") -> AsyncIterator[ClientConnect
     del headers["host"]
     uri = f"ws://{at.netloc}/api/feed{query}"
     # what the test has not read stands in the way of a goodbye
-    async with connect(uri, additional_headers=headers, compression=None, close_timeout=0.2) as socket:
-        yield socket
+    async with connect(uri, additional_headers=headers, compression=None, close_timeout=0.2) as page:
+        yield page
 
 
-async def entries(socket: ClientConnection) -> list[tuple[str, str, JsonObject | None]]:
+def hanging_page(browser: Browser) -> socket.socket:
+    """Open a page's WebSocket that nobody will ever read from."""
+    at = urlsplit(browser.origin)
+    hanging = socket.socket()
+    hanging.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    hanging.connect((at.hostname, at.port))
+    usual = {"origin": browser.origin, "upgrade": "websocket", "connection": "Upgrade"}
+    usual |= {"sec-websocket-key": "AAAAAAAAAAAAAAAAAAAAAA==", "sec-websocket-version": "13"}
+    lines = [f"{name}: {text}" for name, text in browser.headers(usual).items()]
+    hanging.sendall("\r\n".join(["GET /api/feed?rate=60 HTTP/1.1", *lines, "", ""]).encode())
+    return hanging
+
+
+async def entries(page: ClientConnection) -> list[tuple[str, str, JsonObject | None]]:
     """Return what the next frame tells."""
     async with asyncio.timeout(ASK_TIME_S):
-        frame = await socket.recv(decode=False)
+        frame = await page.recv(decode=False)
     _sent_ns, _dropped, told = msgpack.unpackb(frame)
     return [(rig, topic, sample) for rig, topic, sample in told]
