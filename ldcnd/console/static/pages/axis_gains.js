@@ -7,7 +7,7 @@ import { Mark } from "../parts/state.js";
 import { GAINS } from "../session/contract.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
-import { describe } from "../session/rigs.js";
+import { describeSoon } from "../session/rigs.js";
 
 /** The registers of an axis that are gains, by name. */
 export function gainsOf(axis) {
@@ -48,10 +48,10 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
   async function write() {
     await command(axis, "set_gains", changes);
     setWanted({});
-    await describe();
+    describeSoon();
   }
 
-  return html`<${Table} label="Gains" kind="gains" head=${["Register", "#Present", "New"]} rows=${rows} />
+  return html`<${Table} label=${`Gains of ${axis.name}`} kind="gains" head=${["Register", "#Present", "New"]} rows=${rows} />
     <p class="row"><${Action} act=${write} obstacle=${way} reason=${reason} kind="main">
       ${count ? `Write ${Object.entries(changes).map(([name, value]) => `${name} = ${value}`).join(", ")}` : "Write gains"}<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}`;

@@ -31,8 +31,8 @@ function Line({ rig, bus }) {
     <h3>Chain</h3>
     <${Chain} rig=${rig} bus=${bus} />
     <div class="columns">
-      <div class="column"><h3>Health</h3><${Health} bus=${bus} /></div>
-      <div class="column"><h3>Plan</h3>${plan ? html`<${Plan} plan=${plan} />` : html`<p class="quiet">This line is polled one drive after the other; nothing is promised.</p>`}</div>
+      <div class="column"><h3>Health</h3><${Health} rig=${rig} bus=${bus} /></div>
+      <div class="column"><h3>Plan</h3>${plan ? html`<${Plan} rig=${rig} plan=${plan} />` : html`<p class="quiet">This line is polled one drive after the other; nothing is promised.</p>`}</div>
     </div>
     <h3>Wire log</h3>
     <${WireLog} rig=${rig} bus=${bus.name} />
@@ -49,10 +49,10 @@ function Chain({ rig, bus }) {
     <td>${module.model ?? html`<${Mark} level="warn">not described: never moved<//>`}</td>
     <td class="number">${module.device_id === undefined ? "–" : `${module.device_id}, version ${module.version}`}</td>
   </tr>`);
-  return html`<${Table} label=${`Chain of ${bus.name}`} head=${["Address", "Axis", "Identity", "Model", "#Device"]} rows=${rows} />`;
+  return html`<${Table} label=${`Chain of ${rig.name} on ${bus.name}`} head=${["Address", "Axis", "Identity", "Model", "#Device"]} rows=${rows} />`;
 }
 
-function Health({ bus }) {
+function Health({ rig, bus }) {
   const { health } = bus;
   if (!health) return html`<p class="quiet">No report yet.</p>`;
   const lanes = health.lanes.map((lane) => html`<tr><th scope="row">${lane.lane}</th>
@@ -62,12 +62,12 @@ function Health({ bus }) {
     const lately = bus.lately(name);
     return [name.replaceAll("_", " "), html`${health[name]} <span class=${lately && name !== "exchanges" ? "mark" : "quiet"} data-level="warn">+${lately}</span>`];
   });
-  return html`<${Table} label=${`Lanes of ${bus.name}`} head=${["Lane", "#Waiting", "#Replies", "#Half within", "#99 % within", "#Longest"]} rows=${lanes} />
+  return html`<${Table} label=${`Lanes of ${rig.name} on ${bus.name}`} head=${["Lane", "#Waiting", "#Replies", "#Half within", "#99 % within", "#Longest"]} rows=${lanes} />
     <p class="quiet">Since the daemon started, and within the last minute:</p>
     <${Facts} of=${counters} />`;
 }
 
-function Plan({ plan }) {
+function Plan({ rig, plan }) {
   const polls = plan.polls.map((poll) => html`<tr><th scope="row">${poll.axis}</th>
     <td class="number">${number(poll.rate_hz, 1)} Hz</td><td class="number">${poll.request_bytes} + ${poll.reply_bytes}</td>
     <td class="number">${duration(poll.longest_s)}</td><td class="number">${duration(poll.response_s)}</td>
@@ -77,6 +77,6 @@ function Plan({ plan }) {
       ["room for", `${number(plan.commands_per_s, 0)} commands a second`],
       ["stop answered within", duration(plan.stop_s)], ["after a lost reply", duration(plan.stop_after_loss_s)],
     ]} />
-    <${Table} label=${`Polls of ${plan.bus}`} head=${["Axis", "#Rate", "#Bytes", "#Takes", "#Done within", "Verdict"]} rows=${polls} />
+    <${Table} label=${`Polls of ${rig.name} on ${plan.bus}`} head=${["Axis", "#Rate", "#Bytes", "#Takes", "#Done within", "Verdict"]} rows=${polls} />
     ${plan.remedies.map((remedy) => html`<p class="mark" data-level="warn">${remedy}</p>`)}`;
 }

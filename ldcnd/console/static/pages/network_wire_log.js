@@ -25,7 +25,7 @@ export function WireLog({ rig, bus }) {
         obstacle=${lines ? null : "Fetch it first."}>Save to a file<//>
     </p>
     ${lines && html`<p class="quiet" role="status">${found.length} records${found.length > MOST_SHOWN ? `, the last ${MOST_SHOWN} are shown` : ""}: seconds, event, bytes.</p>
-      <pre class="scrolls" tabindex="0" role="region" aria-label=${`Wire log of ${bus}`}>${found.slice(-MOST_SHOWN).join("\n")}</pre>`}`;
+      <pre class="scrolls" tabindex="0" role="region" aria-label=${`Wire log of ${rig.name} on ${bus}`}>${found.slice(-MOST_SHOWN).join("\n")}</pre>`}`;
 }
 
 /** Fetch reply after reply until there is no more, or it is enough. */

@@ -61,9 +61,9 @@ function RigSection({ rig }) {
 
 function BusSection({ rig, bus }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.info?.bus === bus.name);
-  return html`<section class="bus" aria-label=${`Line ${bus.name}`}>
+  return html`<section class="bus" aria-label=${`Line ${bus.name} of ${rig.name}`}>
     <${BusLine} bus=${bus} />
-    <table class="axes" role="table" aria-label=${`Axes on ${bus.name}`}>
+    <table class="axes" role="table" aria-label=${`Axes of ${rig.name} on ${bus.name}`}>
       <thead role="rowgroup"><tr role="row">${COLUMNS.map((each) => html`<th role="columnheader" scope="col">${each}</th>`)}</tr></thead>
       <tbody role="rowgroup">${axes.map((axis) => html`<${AxisRow} key=${axis.name} axis=${axis} />`)}</tbody>
     </table>

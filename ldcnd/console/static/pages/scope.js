@@ -18,10 +18,10 @@ export function ScopePage() {
   const [chosen, setChosen] = useState(remembered);
   const [windowS, setWindowS] = useState(10);
   const [paused, setPaused] = useState(false);
-  const recording = useRecording(axes, chosen);
+  const keys = chosen ?? atFirst(axes);
+  const recording = useRecording(axes, keys);
 
   function toggle(key, on) {
-    const keys = recording.channels.map((channel) => channel.key);
     remembered = on ? [...keys, key] : keys.filter((each) => each !== key);
     setChosen(remembered);
   }
@@ -34,7 +34,7 @@ export function ScopePage() {
           <${Choice} label="Time across" options=${WINDOWS.map((each) => [each, `${each} s`])} value=${windowS} onChange=${(value) => setWindowS(Number(value))} />
         </div>
         <div class="channels" tabindex="0" role="region" aria-label="Channels of all axes">
-          ${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} recording=${recording} onToggle=${toggle} />`)}
+          ${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} keys=${keys} onToggle=${toggle} />`)}
         </div>
       <//>
       <${Panel} title="Live" class="panel bench-picture">
@@ -45,8 +45,7 @@ export function ScopePage() {
     </div>`;
 }
 
-function AxisChannels({ axis, recording, onToggle }) {
-  const keys = recording.channels.map((channel) => channel.key);
+function AxisChannels({ axis, keys, onToggle }) {
   const full = keys.length >= MOST_CHANNELS;
   return html`<fieldset><legend>${axis.rig.name} · ${axis.name}</legend>
     ${channelsOf(axis).map((channel) => {
@@ -56,19 +55,21 @@ function AxisChannels({ axis, recording, onToggle }) {
   </fieldset>`;
 }
 
-/** Record the chosen channels, or the first axes' positions. */
-function useRecording(axes, chosen) {
+/** The keys of the first axes' positions. */
+function atFirst(axes) {
+  const positions = axes.flatMap(channelsOf).filter(({ item, field }) => item === "position" && field === "value");
+  return positions.slice(0, AT_FIRST).map((channel) => channel.key);
+}
+
+/** Record these channels. */
+function useRecording(axes, keys) {
   const [recording, setRecording] = useState(null);
-  const known = axes.length > 0;
   useEffect(() => {
-    if (!known) return undefined;
+    if (!keys.length && !axes.length) return undefined;
     const all = axes.flatMap(channelsOf);
-    const wanted = chosen
-      ? chosen.map((key) => all.find((channel) => channel.key === key)).filter(Boolean)
-      : all.filter((channel) => channel.field === "value" && channel.item === "position").slice(0, AT_FIRST);
-    const begun = new Recording(wanted);
+    const begun = new Recording(keys.map((key) => all.find((channel) => channel.key === key)).filter(Boolean));
     setRecording(begun);
     return () => begun.close();
-  }, [known, chosen]);
+  }, [axes.length, keys.join()]);
   return recording;
 }

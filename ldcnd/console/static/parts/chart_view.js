@@ -1,6 +1,6 @@
 /** A chart with what belongs to it: legend, two cursors that can be moved by keyboard, zoom, and the way out as files. */
 
-import { html, useEffect, useRef, useState } from "../html.js";
+import { html, useLayoutEffect, useRef, useState } from "../html.js";
 import { Chart } from "./chart.js";
 import { Table } from "./controls.js";
 import { number } from "./format.js";
@@ -22,11 +22,11 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
   const [redraws, setRedraws] = useState(null);
   const looksBack = live ? live.paused || zoom !== null : true;
 
-  useEffect(() => {
+  useLayoutEffect(() => {
     chart.current = new Chart(root.current, { height });
     return () => chart.current.destroy();
   }, [height]);
-  useEffect(() => {
+  useLayoutEffect(() => {
     chart.current.show(curves);
     if (!live) setZoom(null);
   }, [curves]);
@@ -40,12 +40,13 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
     },
     picked: (which, at) => setCursors((now) => ({ ...now, [which]: at })),
   };
-  useEffect(() => {
+  useLayoutEffect(() => {
     chart.current.onZoom = (span) => act.current.zoomed(span);
     chart.current.onPick = (which, at) => act.current.picked(which, at);
   }, []);
 
-  useEffect(() => {
+  // at once with the rendering: the span must not move on below cursors that are being placed
+  useLayoutEffect(() => {
     const drawn = chart.current;
     drawn.cursors = cursors;
     if (looksBack) {

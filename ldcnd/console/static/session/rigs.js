@@ -5,6 +5,7 @@ import { ask, read, rigPath } from "./api.js";
 import { feed } from "./feed.js";
 
 const DESCRIBED_EACH_MS = 5_000;
+const DESCRIBED_ANEW_MS = 1_050;
 const HOLDERS_EACH_MS = 1_000;
 const DRAWN_EACH_MS = 100;
 const SILENT_AFTER_S = 3;
@@ -228,6 +229,11 @@ export async function describe() {
   changed();
 }
 
+/** Read them again as soon as a change can be seen: the console process asks a daemon once a second at most. */
+export function describeSoon() {
+  setTimeout(describe, DESCRIBED_ANEW_MS);
+}
+
 /** Begin to watch; once for a page. */
 export function watch() {
   feed.listen((rig, topic, sample, sentNs) => {
@@ -261,7 +267,11 @@ export async function askHolders() {
 }
 
 function rigNamed(name) {
-  if (!rigs.has(name)) rigs.set(name, new Rig(name));
+  if (!rigs.has(name)) {
+    const all = [...rigs.values(), new Rig(name)].sort((one, other) => one.name.localeCompare(other.name));
+    rigs.clear();
+    for (const rig of all) rigs.set(rig.name, rig);
+  }
   return rigs.get(name);
 }
 

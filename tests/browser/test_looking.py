@@ -1,0 +1,167 @@
+"""What the browser draws, computes and saves, and how it bears losses; each result is compared with the daemon's."""
+
+import csv
+import io
+import re
+
+import pytest
+
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.requests import (
+    HomeMethod,
+    HomeStop,
+    MoveVelocityRequest,
+    PowerRequest,
+    SetGainsRequest,
+    Verb,
+)
+from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
+
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+expect = playwright.expect
+
+pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+
+DRAWN = """
+([pane, name]) => {
+  const canvas = document.querySelectorAll(".chart canvas")[pane];
+  const probe = document.createElement("canvas").getContext("2d");
+  probe.fillStyle = getComputedStyle(document.documentElement).getPropertyValue(name);
+  probe.fillRect(0, 0, 1, 1);
+  const [red, green, blue] = probe.getImageData(0, 0, 1, 1).data;
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  let count = 0;
+  for (let at = 0; at < data.length; at += 4)
+    if (Math.abs(data[at] - red) + Math.abs(data[at + 1] - green) + Math.abs(data[at + 2] - blue) < 24) count += 1;
+  return count > 100;
+}
+"""
+"""Tells whether a pane of the chart has pixels of a colour of the style sheet."""
+MODULE = "(path) => import(path).then((module) => JSON.parse(JSON.stringify({...module})))"
+
+
+async def saved(desk, name):
+    """Return what a button lets the browser save."""
+    async with desk.page.expect_download() as download:
+        await desk.button(name).click()
+    return await (await download.value).path()
+
+
+async def test_a_trace_is_recorded_drawn_and_saved(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("trace/sim/x")
+        await desk.page.get_by_label("Samples", exact=True).fill("60")
+        await desk.button("Record").click()
+        await expect(desk.panel("Captures").get_by_text("60 samples in")).to_be_visible()
+
+        header = await house.sim.rig.trace_header("x")
+        assert (header.phase, header.samples) == (TracePhase.COMPLETE, 60)
+        await desk.page.wait_for_function(DRAWN, arg=[1, "--curve-2"])  # the velocity has the second pane for itself
+
+        path = await saved(desk, "Save CSV")
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+        assert {row["channel"] for row in rows} == {"position", "velocity", "following_error"}
+        assert len(rows) == 180
+        assert {row["capture"] for row in rows} == {header.trace_id}
+        assert (await saved(desk, "Save PNG")).read_bytes().startswith(b"\x89PNG")
+
+        await desk.button("Record").click()
+        await expect(desk.panel("Captures").get_by_text("60 samples in")).to_have_count(2)
+        await expect(desk.page.get_by_role("table").filter(has_text="Curve").locator("tbody tr")).to_have_count(6)
+
+
+async def test_the_scope_follows_a_motion_and_measures_between_cursors(house):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", Verb.POWER, PowerRequest(on=True))
+    async with house.desk() as desk:
+        await desk.open("scope")
+        await expect(desk.page.get_by_text("redraws a second")).to_be_visible()
+        boxes = desk.page.get_by_role("group", name="sim · x")
+        await boxes.get_by_label("velocity").check()
+        await house.sim.rig.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=-3))
+        values = desk.page.get_by_role("row", name="x velocity")
+        await expect(values).to_contain_text(re.compile("−[1-9]"))  # whole counts a servo tick, so not exactly 3
+        await expect(desk.page.get_by_text("redraws a second")).to_be_visible()
+
+        await desk.button("Pause").click()
+        await desk.page.get_by_label("Cursor A").fill("950")
+        await desk.page.get_by_label("Cursor B").fill("960")
+        await expect(desk.page.get_by_text("B − A: 0.1000 s, 10.00 Hz")).to_be_visible()
+        await desk.button("Zoom in").click()
+        await expect(desk.button("Resume")).to_be_visible()
+        rows = list(csv.DictReader(io.StringIO((await saved(desk, "Save CSV")).read_text(encoding="utf-8"))))
+        assert any(row["channel"] == "x velocity" and -6 < float(row["value"]) < -1 for row in rows)
+
+
+async def test_a_test_move_is_judged_and_writes_nothing(house):
+    await house.sim.quiet("y")
+    async with house.desk() as desk:
+        await desk.open("tuning/sim/y")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("y", lambda state: state.enabled)
+        before, gains = await house.sim.position("y"), await house.sim.registers("y")
+
+        await desk.button("Move 1.000 mm and record").click()
+
+        run = desk.page.get_by_role("row", name="Run 1")
+        await expect(run).to_contain_text("trapezoid 1.000")
+        await house.sim.reaches("y", before + 1, within=0.05)
+        cells = await run.get_by_role("cell").all_inner_texts()
+        overshoot, peak, final = (float(cells[at].split()[0].replace("−", "-")) for at in (1, 4, 6))
+        assert 0 <= overshoot < 0.2
+        assert 0.005 < peak < 0.5
+        assert abs(final) < 0.02
+        assert "not settled" not in cells[2]
+        after = await house.sim.registers("y")
+        assert {name: after[name] for name in ("kp", "kd", "ki", "el")} == {
+            name: gains[name] for name in ("kp", "kd", "ki", "el")
+        }
+        await desk.page.wait_for_function(DRAWN, arg=[0, "--curve-1"])
+
+
+async def test_the_daemon_is_lost_and_regained(house):
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await expect(desk.panel("Now")).to_contain_text("good")
+
+        await house.sim.end()
+
+        await expect(desk.panel("Now")).to_contain_text("no data")
+        await expect(desk.page.get_by_text("What follows is what was known last.")).to_be_visible()
+        await expect(desk.button("Take control")).to_be_disabled()
+        await desk.page.get_by_role("button", name="Stop all axes").click()
+        await expect(desk.page.get_by_text("sim: not stopped")).to_contain_text("Use the emergency stop.")
+        desk.troubles.clear()  # the browser complains about what was refused meanwhile
+
+        await house.sim.start()
+
+        await expect(desk.panel("Now")).to_contain_text("good")
+        await expect(desk.page.get_by_label("Position", exact=True)).to_have_text("0.000")  # drives were reset
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        desk.troubles.clear()
+
+
+async def test_the_pages_know_what_the_models_say(house):
+    async with house.desk() as desk:
+        await desk.open("rig")
+        contract = await desk.page.evaluate(MODULE, "/static/session/contract.js")
+
+    gains = SetGainsRequest.model_fields
+    schema = SetGainsRequest.model_json_schema()["properties"]
+    assert set(contract["GAINS"]) == {name for name in gains if gains[name].annotation == (int | None)} - {
+        "sequence",
+        "not_after",
+    }
+    for name, told in contract["GAINS"].items():
+        number = schema[name]["anyOf"][0]
+        assert (told["min"], told["max"]) == (number["minimum"], number["maximum"]), name
+    assert contract["HOME_METHODS"] == list(HomeMethod)
+    assert contract["HOME_STOPS"] == list(HomeStop)
+    assert contract["TRIGGER_KINDS"] == list(TriggerKind)
+    assert set(contract["TRACE_UNDER_WAY"]) < set(TracePhase)
+    assert (contract["MOST_CHANNELS"], contract["MOST_SAMPLES"]) == (MOST_CHANNELS, MOST_SAMPLES)
+    assert contract["COMMAND_STATUSES"] == list(CommandStatus)

@@ -1,0 +1,203 @@
+"""What an operator does in the browser; each result is asked of the daemon, too."""
+
+import pytest
+
+from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply
+from ldcnd.model.requests import HaltRequest, MoveVelocityRequest, PowerRequest, ReadParameterRequest, Verb
+from ldcnd.model.samples import TelemetryItem
+
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+expect = playwright.expect
+
+pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+
+
+async def holder(daemon, axis):
+    told = await daemon.rig.rig_command("holders", HaltRequest(), HolderList)
+    return next(each.client for each in told.holders if each.axis == axis)
+
+
+async def running(daemon, axis, velocity):
+    await daemon.rig.command(axis, Verb.POWER, PowerRequest(on=True))
+    await daemon.rig.command(axis, Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=velocity))
+
+
+async def test_an_axis_is_taken_enabled_and_moved_and_its_number_arrives(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        await desk.panel("Rig sim").get_by_role("link", name="x", exact=True).click()
+        await expect(desk.button("Move")).to_be_disabled()
+        await expect(desk.panel("Move")).to_contain_text("Take control first.")
+
+        await desk.button("Take control").click()
+        await expect(desk.panel("Control")).to_contain_text("Held by this page")
+        assert (await holder(house.sim, "x")).startswith("console-")
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+
+        await desk.panel("Move").get_by_label("Position mm").fill("10")
+        await expect(desk.panel("Move")).to_contain_text("Ends at 10.000 mm")
+        assert await house.sim.position("x") == pytest.approx(0, abs=0.05)  # a preview moves nothing
+        await desk.button("Move").click()
+
+        await expect(desk.page.get_by_label("Position", exact=True)).to_have_text("10.000")
+        await house.sim.reaches("x", 10, within=0.05)
+
+
+async def test_what_would_be_refused_is_said_before_it_is_asked(house):
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.panel("Move").get_by_label("Position mm").fill("400")
+        await expect(desk.panel("Move")).to_contain_text("above the limit 100 mm")
+        await desk.button("Use 100.000").click()
+        await expect(desk.panel("Move")).to_contain_text("Ends at 100.000 mm")
+
+
+async def test_the_button_stops_every_axis_of_every_rig(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("network")
+        await expect(desk.page.get_by_role("heading", name="sim · line0")).to_be_visible()
+        await running(house.sim, "y", 2)
+
+        stop = desk.page.get_by_role("button", name="Stop all axes")
+        await expect(stop).to_contain_text("not an emergency stop")
+        await stop.click()
+
+        report = desk.page.get_by_role("alert").filter(has_text="Stop at")
+        await expect(report).to_contain_text("sim: stopped and latched; confirmed by x, y, z, c.")
+        await expect(report).to_contain_text("mixed: ")
+        state = await house.sim.until("y", lambda state: state.moving == "no")
+        assert state.stop_latched
+        assert (await house.mixed.rig.state("x")).stop_latched
+
+
+async def test_the_key_stops_even_while_somebody_types(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/y")
+        await running(house.sim, "y", -2)
+        await desk.panel("Move").get_by_label("Position mm").fill("7")
+
+        await desk.page.keyboard.press("Escape")
+
+        await expect(desk.page.get_by_text("confirmed by x, y, z, c")).to_be_visible()
+        await expect(desk.panel("Now")).to_contain_text("stop latched yes")
+        state = await house.sim.until("y", lambda state: state.moving == "no")
+        assert state.stop_latched
+
+
+async def test_a_stop_that_gets_lost_is_told_at_once(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        await desk.page.route("**/api/stop", lambda route: route.abort())
+
+        await desk.page.get_by_role("button", name="Stop all axes").click()
+
+        await expect(desk.page.get_by_text("The stop did not get through")).to_contain_text("Use the emergency stop.")
+        assert not (await house.sim.rig.state("x")).stop_latched
+        desk.troubles.clear()  # the browser complains about the lost request
+
+
+async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
+    await house.sim.quiet("z")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/z")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await desk.page.get_by_label("New el").fill("1")
+        await desk.button("Write el = 1").click()
+        await expect(desk.panel("Gains").get_by_role("row", name="el position error limit")).to_contain_text(
+            "1 written"
+        )
+
+        await desk.panel("Move").get_by_label("Move", exact=True).select_option("move_relative")
+        await desk.panel("Move").get_by_label("Distance").fill("2")
+        await desk.button("Move").click()
+
+        faults = desk.panel("Faults")
+        await expect(faults).to_contain_text("position error")
+        await expect(faults).to_contain_text("check for a jam, gains and acceleration, then reset")
+        await expect(faults.get_by_role("link", name="More about position error")).to_have_attribute(
+            "href", "/faults/position_error"
+        )
+        await expect(desk.panel("Can it move?")).to_contain_text("drive fault")
+        told = await house.sim.rig.last("z", TelemetryItem.FAULT)
+        assert told.first.code == "position_error"
+
+        await desk.page.get_by_label("New el").fill("4000")
+        await desk.button("Write el = 4000").click()
+        await desk.button("Reset z").click()
+        await expect(faults).to_have_count(0)
+        await desk.button("Enable").click()
+        await expect(desk.panel("Can it move?")).to_contain_text("Yes")
+        before = await house.sim.position("z")
+        await desk.button("Move").click()
+        await house.sim.reaches("z", before + 2, within=0.05)
+        assert not (await house.sim.rig.last("z", TelemetryItem.FAULT)).active
+
+
+async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
+    await house.sim.quiet("c")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/c")
+        await desk.button("Take control").click()
+        await expect(desk.panel("Control")).to_contain_text("Held by this page")
+
+        taken = AcquireRequest(client="somebody else", axes=("c",), lease_s=60, force=True)
+        lease = await house.sim.rig.rig_command("acquire", taken, LeaseReply)
+
+        await expect(desk.page.get_by_text("Control of c was lost")).to_be_visible()
+        await expect(desk.panel("Control")).to_contain_text("Held by somebody else")
+        await expect(desk.button("Enable")).to_be_disabled()
+        await expect(desk.panel("Control")).to_contain_text("Control is held by somebody else")
+        desk.troubles.clear()  # the browser complains about the refused renewal
+
+        await desk.page.get_by_label("Take it from somebody else").check()
+        await desk.button("Take control").click()
+        await expect(desk.panel("Control")).to_contain_text("Held by this page")
+        assert (await holder(house.sim, "c")).startswith("console-")
+        assert lease.lease
+
+
+async def test_gains_are_written_by_a_click_only(house):
+    await house.sim.quiet("c")
+    async with house.desk() as desk:
+        await desk.open("tuning/sim/c")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("c", lambda state: state.enabled)
+        before = await house.sim.registers("c")
+        wanted = before["kd"] + 100
+        await desk.page.get_by_label("New kd").fill(f"{wanted}")
+        assert await house.sim.registers("c") == before
+
+        await desk.button(f"Write kd = {wanted}").click()
+
+        await expect(desk.panel("Gains").get_by_role("row", name="kd velocity gain")).to_contain_text(f"{wanted}")
+        assert await house.sim.registers("c") == before | {"kd": wanted}
+
+
+async def test_parameters_are_read_compared_and_written(house, tmp_path):
+    dump = tmp_path / "feed.toml"
+    dump.write_text('axis = "feed"\n\n[parameters]\nPn100 = 90  # Speed loop gain\nPn102 = 40\n', encoding="utf-8")
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/feed")
+        await desk.button("Take control").click()
+        await desk.button("Read all").click()
+        await expect(desk.button("Read all again")).to_be_visible()
+        row = desk.page.get_by_role("row", name="Pn100")
+        await expect(row).to_contain_text("80")
+
+        await desk.page.get_by_label("Compare with a file").set_input_files(dump)
+        await expect(row).to_contain_text("differs")
+        await expect(desk.panel("Restore from the file")).to_contain_text("Pn100")
+        await desk.button("Write 1 values").click()
+
+        await expect(desk.panel("Restore from the file")).to_contain_text("1 of 1 written.")
+        request = ReadParameterRequest(parameter="Pn100")
+        reading = await house.mixed.rig.command("feed", Verb.READ_PARAMETER, request, 60)
+        assert (reading.value.active, reading.value.stored) == (90, 80)
