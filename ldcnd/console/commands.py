@@ -3,6 +3,7 @@
 import asyncio
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from starlette.requests import Request
@@ -17,9 +18,10 @@ from ldcnd.errors import LdcndError, MalformedRequest, PayloadTooLarge, UnknownV
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, decode, error_reply
 from ldcnd.model.errors import ErrorReply
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.group_moves import AxisMove, MoveTogetherRequest
 from ldcnd.model.replies import StopReply
 from ldcnd.model.requests import REQUEST_MODELS, Verb
-from ldcnd.model.verbs import AXIS_QUESTIONS, MOVE_TOGETHER, RIG_VERBS, VerbModels
+from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
 BODY_TIME_S = 5.0
 """A page has so long to send what it asks."""
@@ -46,32 +48,61 @@ class StopScope(Frozen):
     """One axis; None means the rig."""
 
 
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """What the console writes on every command.
+
+    Attributes:
+        client: who sends it, whatever the page says.
+        instance: the run of the daemon that it is meant for unless the page says so: the one whose values it shows.
+    """
+
+    client: str
+    instance: str | None
+
+    def around(self, body: bytes, model: type[Frozen]) -> bytes:
+        """Return a request with what its model has of this; what is no request is refused where it is decoded."""
+        try:
+            request = json.loads(body or b"{}")
+        except (ValueError, RecursionError):
+            return body
+        if not isinstance(request, dict):
+            return body
+        moves = request.get("moves")
+        if model is MoveTogetherRequest and isinstance(moves, list):
+            request["moves"] = [self._on(move, AxisMove) if isinstance(move, dict) else move for move in moves]
+        return json.dumps(self._on(request, model)).encode()
+
+    def _on(self, request: dict[str, object], model: type[Frozen]) -> dict[str, object]:
+        written = {"instance": self.instance, **request, "client": self.client}
+        return {name: value for name, value in written.items() if name in request or name in model.model_fields}
+
+
 def command_routes(rigs: Rigs) -> list[Route]:
     """Return what pages may POST."""
 
     async def axis_command(request: Request) -> Response:
-        client, axis = rigs.client(request.path_params["rig"]), request.path_params["axis"]
-        verb = request.path_params["verb"]
+        rig, axis, verb = (request.path_params[name] for name in ("rig", "axis", "verb"))
+        client = rigs.client(rig)
         body = await _body(request)
         if verb in AXIS_QUESTIONS:
             asked = decode(AXIS_QUESTIONS[verb].request, body, Encoding.JSON)
             return _json(await client.axis_question(axis, verb, asked, AXIS_QUESTIONS[verb].reply))
         if verb not in set(Verb):
             raise _unknown(verb)
-        meant = decode(REQUEST_MODELS[Verb(verb)], _signed(body, request.state.visitor.client), Encoding.JSON)
+        model = REQUEST_MODELS[Verb(verb)]
+        envelope = Envelope(request.state.visitor.client, rigs.instance(rig))
+        meant = decode(model, envelope.around(body, model), Encoding.JSON)
         return _json(await client.command(axis, Verb(verb), meant, SLOW_VERBS_S.get(verb, ANSWER_TIME_S)))
 
     async def rig_command(request: Request) -> Response:
-        client = rigs.client(request.path_params["rig"])
-        verb = request.path_params["verb"]
+        rig, verb = (request.path_params[name] for name in ("rig", "verb"))
+        client = rigs.client(rig)
         if verb not in RIG_VERBS:
             raise _unknown(verb)
-        models: VerbModels = RIG_VERBS[verb]
-        body = await _body(request)
-        if verb == MOVE_TOGETHER:
-            body = _each_signed(body, request.state.visitor.client)
-        elif "client" in models.request.model_fields:
-            body = _signed(body, request.state.visitor.client)
+        models = RIG_VERBS[verb]
+        envelope = Envelope(request.state.visitor.client, rigs.instance(rig))
+        body = envelope.around(await _body(request), models.request)
         return _json(await client.rig_command(verb, decode(models.request, body, Encoding.JSON), models.reply))
 
     async def stop(request: Request) -> Response:
@@ -118,30 +149,6 @@ async def _body(request: Request) -> bytes:
     except TimeoutError:
         raise MalformedRequest(f"the request did not come within {BODY_TIME_S:g} s") from None
     return body
-
-
-def _signed(body: bytes, client: str) -> bytes:
-    """Return a request with the name of whoever sends it, whatever it said."""
-    request = _object(body)
-    return body if request is None else json.dumps(request | {"client": client}).encode()
-
-
-def _each_signed(body: bytes, client: str) -> bytes:
-    """Return a request of several moves, each with the name of whoever sends it."""
-    request = _object(body)
-    moves = request and request.get("moves")
-    if not isinstance(moves, list) or not all(isinstance(move, dict) for move in moves):
-        return body
-    return json.dumps({**(request or {}), "moves": [move | {"client": client} for move in moves]}).encode()
-
-
-def _object(body: bytes) -> dict[str, object] | None:
-    """Return a JSON object; None for what is none: that is refused where it is decoded, in the usual words."""
-    try:
-        request = json.loads(body or b"{}")
-    except (ValueError, RecursionError):
-        return None
-    return request if isinstance(request, dict) else None
 
 
 def _unknown(verb: str) -> UnknownVerb:

@@ -1,11 +1,12 @@
 """One rig: whether its daemon is there, what it says about itself, and its values as they come."""
 
 import asyncio
+from collections.abc import Mapping
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import RigReply
-from ldcnd.errors import LdcndError
+from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.log import get_logger
 
 log = get_logger("console")
@@ -36,6 +37,7 @@ class RigWatch:
         self._reply = RigReply(
             name=client.rig, endpoint=endpoint, connected=False, problem="its daemon was not there yet"
         )
+        self._told: Mapping[str, bool | str | None] = {}
         self._described_at_s = -DESCRIPTION_AGE_S
         self._describing = asyncio.Lock()
 
@@ -43,6 +45,11 @@ class RigWatch:
     def connected(self) -> bool:
         """Its daemon is there and has answered."""
         return self._reply.connected
+
+    @property
+    def instance(self) -> str | None:
+        """The run of its daemon that was described last."""
+        return self._reply.daemon.instance if self._reply.daemon else None
 
     def daemon(self, instance: str, *, alive: bool) -> None:
         """Learn that a run of the daemon has come or gone."""
@@ -107,7 +114,7 @@ class RigWatch:
                     "commands": await client.command_list(),
                 }
         except TimeoutError:
-            raise LdcndError(f"rig {client.rig} takes too long to describe itself") from None
+            raise OutcomeUnknown(f"rig {client.rig} takes too long to describe itself") from None
         self._reply = self._reply.model_copy(update=described)
         self._described_at_s = asyncio.get_running_loop().time()
 
@@ -120,8 +127,9 @@ class RigWatch:
 
     def _show(self, *, problem: str | None) -> None:
         connected = bool(self._instances) and (problem is None or len(self._instances) > 1)
-        if (connected, problem) == (self._reply.connected, self._reply.problem):
-            return
-        log.info("rig", rig=self.client.rig, connected=connected, problem=problem)
         self._reply = self._reply.model_copy(update={"connected": connected, "problem": problem})
-        self._values.tell_of_rig(self.client.rig, {"connected": connected, "problem": problem})
+        told = {"connected": connected, "problem": problem, "instance": self.instance}
+        if told != self._told:
+            self._told = told
+            log.info("rig", rig=self.client.rig, **told)
+            self._values.tell_of_rig(self.client.rig, told)

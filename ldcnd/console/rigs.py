@@ -67,16 +67,24 @@ class Rigs:
         """
         return self._watch(rig).client
 
+    def instance(self, rig: str) -> str | None:
+        """Return the run of a rig's daemon that the console shows, or None before it was there."""
+        return self._watch(rig).instance
+
     async def described(self) -> tuple[RigReply, ...]:
-        """Return what the rigs are, all asked at the same time."""
+        """Return what the rigs are, by name; a wanted one that was never there too."""
         async with asyncio.TaskGroup() as group:
             asked = [group.create_task(self._watches[rig].described(), name=f"describe {rig}") for rig in self.names]
-        return tuple(task.result() for task in asked)
+        unseen = [
+            RigReply(name=rig, endpoint="", connected=False, problem="it was not seen yet")
+            for rig in self._wanted - self._watches.keys()
+        ]
+        return tuple(sorted((*(task.result() for task in asked), *unseen), key=lambda rig: rig.name))
 
     async def run(self, endpoint: Endpoint) -> None:
         """Watch what is behind an endpoint until cancelled."""
+        self._note(endpoint, problem="not connected yet")
         while True:
-            self._note(endpoint, problem="not connected yet")
             try:
                 async with open_zenoh_session(endpoint.settings) as session:
                     await self.watch(session, endpoint)
@@ -104,8 +112,13 @@ class Rigs:
                     return
                 watch.daemon(instance, alive=alive)
 
-            async with daemons(session, told):
-                await asyncio.Event().wait()
+            while True:
+                try:
+                    async with daemons(session, told):
+                        await asyncio.Event().wait()
+                except SessionError as error:
+                    self._note(endpoint, problem=error.message)
+                    await asyncio.sleep(OPEN_AGAIN_S)
 
     def _watch(self, rig: str) -> RigWatch:
         if rig not in self._watches:

@@ -63,6 +63,14 @@ async def test_moves_together_go_under_the_visitor_s_name(console):
     assert {event.client for event in events} == {"console-1"}
 
 
+async def test_a_command_is_meant_for_the_daemon_that_the_page_has_seen(console):
+    stale = await console.browser.post(f"{X}/power", {"on": True, "instance": "before the restart"})
+    fresh = await console.browser.post(f"{X}/power", {"on": True})
+
+    assert (stale.status, stale.document["code"]) == (409, "command_expired")
+    assert fresh.status == 200
+
+
 async def test_control_that_is_not_renewed_is_lost(console):
     lease = (await console.browser.post(f"{RIG}/acquire", {"lease_s": 5})).document["lease"]
     other = await console.enter()
