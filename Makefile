@@ -3,7 +3,7 @@ PY := .venv/bin/python
 CONFIG ?= config/simulated.toml
 PYTHON ?= python3
 
-.PHONY: run test check fix docs dist soak bench clean
+.PHONY: run test check fix docs dist soak bench screenshots clean
 
 run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
@@ -43,6 +43,10 @@ soak: .venv/ready
 
 bench: .venv/ready
 	$(PY) -m tests.bench
+
+# the pictures of the documentation; needs chromium
+screenshots: .venv/ready
+	$(PY) -m tests.browser.screenshots docs/images
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

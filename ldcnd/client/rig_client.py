@@ -126,15 +126,6 @@ class RigClient:
         answers = await self._session.query(self._keys.telemetry(axis, item))
         return self._decoded(answers[0], SAMPLE_MODELS[item]) if answers else None
 
-    async def last_values(self) -> list[Sample]:
-        """Return the last value of every telemetry item as it was published; monitors and traces are left out."""
-        answers = await self._session.query(self._keys.telemetry_pattern("*", "*"))
-        return [
-            Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns)
-            for answer in answers
-            if not answer.is_error
-        ]
-
     async def monitors(self, axis: str) -> dict[MonitorName, MonitorSample]:
         """Return the last value of every monitor that an axis publishes."""
         answers = await self._session.query(self._keys.monitor(axis, "*"))

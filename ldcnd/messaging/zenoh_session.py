@@ -42,7 +42,7 @@ from ldcnd.messaging.sweep import Sweep
 from ldcnd.messaging.workers import Workers
 from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.messaging.zenoh_values import TRAVEL, no_answer, to_answers, to_sample, to_stamp
+from ldcnd.messaging.zenoh_values import TRAVEL, to_answers, to_sample, to_stamp
 
 __all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
 
@@ -276,7 +276,7 @@ class ZenohSession(Session):
             raise SessionError(f"{key}: cannot ask: {error}") from error
         except TimeoutError:
             if not collector.items:
-                raise no_answer(key, timeout_s) from None
+                raise zenoh_failures.no_answer(key, timeout_s) from None
         finally:
             if not collector.done.is_set():
                 # waits for a callback that is running, so not here

@@ -5,7 +5,7 @@ from typing import TypedDict
 
 import zenoh
 
-from ldcnd.errors import OutcomeUnknown
+from ldcnd.messaging.zenoh_failures import no_answer
 from ldcnd.messaging.session import Answer, Qos, Sample, SampleKind
 
 
@@ -56,11 +56,6 @@ def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> li
     if len(arrived) < len(answers) and not arrived:
         raise no_answer(key, timeout_s)
     return arrived
-
-
-def no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
-    """Return the error for a query that nobody has answered in time."""
-    return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
 
 
 def to_stamp(at_ns: int | None, stamp_id: zenoh.TimestampId) -> zenoh.Timestamp | None:

@@ -20,7 +20,7 @@ async def follow(client: RigClient, view: RigView) -> None:
             try:
                 daemon = await client.daemon()
                 if daemon.instance != instance:
-                    for sample in await client.last_values():
+                    for sample in await client.last_published():
                         view.take(sample, loop.time())
                     instance = daemon.instance
                 holders = await client.rig_command("holders", HoldersRequest(), HolderList)

@@ -1,4 +1,6 @@
-"""Whether everybody can use the pages: by screen reader, by keyboard, on a narrow screen, in the dark and in the light."""
+"""Whether everybody can use the pages: by screen reader, by keyboard, on a narrow screen, in the dark, in the light."""
+
+import re
 
 import pytest
 
@@ -23,7 +25,7 @@ PAGES = {
 
 
 EVERYTHING = {"resultTypes": ["violations"]}
-COLOURS = EVERYTHING | {"runOnly": ["cat.color"]}
+COLOURS = EVERYTHING | {"runOnly": {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}}
 """Only colours depend on the scheme."""
 
 
@@ -75,7 +77,7 @@ async def test_the_keyboard_reaches_the_page_and_an_axis(house):
 
         await desk.panel("Rig sim").get_by_role("link", name="x", exact=True).focus()
         await desk.page.keyboard.press("Enter")
-        await expect(desk.page).to_have_title("Axis x – ldcnd")
+        await expect(desk.page).to_have_title(re.compile("^Axis x "))
         await expect(desk.page.get_by_role("main")).to_be_focused()  # a screen reader reads on from there
         await desk.button("Move").focus()
         reason = await desk.button("Move").get_attribute("aria-describedby")

@@ -22,6 +22,7 @@ expect = playwright.expect
 
 pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
 
+MINUS = "\N{MINUS SIGN}"
 DRAWN = """
 ([pane, name]) => {
   const canvas = document.querySelectorAll(".chart canvas")[pane];
@@ -81,13 +82,13 @@ async def test_the_scope_follows_a_motion_and_measures_between_cursors(house):
         await boxes.get_by_label("velocity").check()
         await house.sim.rig.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=-3))
         values = desk.page.get_by_role("row", name="x velocity")
-        await expect(values).to_contain_text(re.compile("−[1-9]"))  # whole counts a servo tick, so not exactly 3
+        await expect(values).to_contain_text(re.compile(f"{MINUS}[1-9]"))  # whole counts a servo tick, so not exactly 3
         await expect(desk.page.get_by_text("redraws a second")).to_be_visible()
 
         await desk.button("Pause").click()
         await desk.page.get_by_label("Cursor A").fill("950")
         await desk.page.get_by_label("Cursor B").fill("960")
-        await expect(desk.page.get_by_text("B − A: 0.1000 s, 10.00 Hz")).to_be_visible()
+        await expect(desk.page.get_by_text(re.compile("A: 0.1000 s, 10.00 Hz"))).to_be_visible()
         await desk.button("Zoom in").click()
         await expect(desk.button("Resume")).to_be_visible()
         rows = list(csv.DictReader(io.StringIO((await saved(desk, "Save CSV")).read_text(encoding="utf-8"))))
@@ -109,7 +110,7 @@ async def test_a_test_move_is_judged_and_writes_nothing(house):
         await expect(run).to_contain_text("trapezoid 1.000")
         await house.sim.reaches("y", before + 1, within=0.05)
         cells = await run.get_by_role("cell").all_inner_texts()
-        overshoot, peak, final = (float(cells[at].split()[0].replace("−", "-")) for at in (1, 4, 6))
+        overshoot, peak, final = (float(cells[at].split()[0].replace(MINUS, "-")) for at in (1, 4, 6))
         assert 0 <= overshoot < 0.2
         assert 0.005 < peak < 0.5
         assert abs(final) < 0.02

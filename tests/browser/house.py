@@ -1,0 +1,228 @@
+"""Two real daemons on simulated lines, a real console, a real browser: for tests, pictures and measurements."""
+
+import asyncio
+import json
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.async_api import Browser, Locator, Page, async_playwright, expect
+
+from ldcnd.client.lease import control
+from ldcnd.client.rig_client import RigClient
+from ldcnd.model.requests import HaltRequest, PowerRequest, ResetRequest, Verb
+from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
+from tests.support.process import ROOT, answering, client, free_port, process
+
+CHROMIUM = Path(os.environ.get("LDCND_CHROMIUM", "/usr/bin/chromium"))
+FLAGS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+)
+PATIENCE_S = 45.0
+"""Pages are waited for, never slept for; a busy machine may take its time."""
+LOOKED_EACH_S = 0.05
+
+
+class DaemonUnderTest:
+    """A daemon that can be ended and started again on the same endpoint.
+
+    Attributes:
+        endpoint: where it listens.
+        rig: a client of it, of a session of its own.
+    """
+
+    def __init__(self, config: Path) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.rig: RigClient
+        self._config = config
+        self._running = AsyncExitStack()
+
+    async def start(self) -> None:
+        """Return when every axis answers."""
+        run = process("run", "--config", str(self._config), "--listen", self.endpoint)
+        daemon = await self._running.enter_async_context(run)
+        await answering(daemon, self.endpoint)
+        self.rig = await self._running.enter_async_context(client(self.endpoint))
+
+    async def end(self) -> None:
+        """Return when it has ended."""
+        await self._running.aclose()
+
+    async def until(self, axis: str, wanted: Callable[[StateSample], bool]) -> StateSample:
+        """Wait for a state of an axis, as the daemon tells it."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                state = await self.rig.state(axis)
+                if state and wanted(state):
+                    return state
+                await asyncio.sleep(LOOKED_EACH_S)
+
+    async def reaches(self, axis: str, position: float, within: float) -> None:
+        """Wait until an axis stands at a position, as the daemon tells it."""
+        async with asyncio.timeout(PATIENCE_S):
+            while abs(await self.position(axis) - position) > within:
+                await asyncio.sleep(LOOKED_EACH_S)
+        await self.until(axis, lambda state: state.moving == "no")
+
+    async def position(self, axis: str) -> float:
+        """Return where an axis is."""
+        sample = await self.rig.last(axis, TelemetryItem.POSITION)
+        assert isinstance(sample, PositionSample)
+        return sample.value
+
+    async def registers(self, axis: str) -> dict[str, int | None]:
+        """Return what the daemon knows of a drive's registers."""
+        info = next(each for each in await self.rig.axes() if each.axis == axis)
+        return {each.name: each.value for each in info.registers}
+
+    async def quiet(self, *axes: str) -> None:
+        """Leave axes disabled, without a latch, a fault or a holder, whatever was done to them before."""
+        async with control(self.rig, "the test", *axes, lease_s=60, force=True) as held:
+            for axis in axes:
+                await held.command(axis, Verb.HALT, HaltRequest())
+                await self.until(axis, lambda state: state.moving == "no")
+                await held.command(axis, Verb.RESET, ResetRequest())
+                await held.command(axis, Verb.POWER, PowerRequest(on=False))
+
+
+@dataclass
+class Desk:
+    """One operator, whose browser was let in.
+
+    Attributes:
+        page: what he sees.
+        url: of the console, without a path.
+        asked: every address that the browser asked for.
+        troubles: what the page complained about.
+    """
+
+    page: Page
+    url: str
+    asked: list[str] = field(default_factory=list)
+    troubles: list[str] = field(default_factory=list)
+
+    async def open(self, place: str) -> None:
+        """Open a page of the console, named by its address behind the hash."""
+        await self.page.goto(f"{self.url}/#/{place}")
+
+    def button(self, name: str) -> Locator:
+        """Return the button that is called exactly so."""
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def panel(self, title: str) -> Locator:
+        """Return the part of the page under this heading."""
+        return self.page.get_by_role("region", name=title, exact=True)
+
+    def strangers(self) -> list[str]:
+        """Return the addresses asked for that are not the console's."""
+        home = urlsplit(self.url).netloc
+        return [
+            url for url in self.asked if urlsplit(url).scheme not in {"blob", "data"} and urlsplit(url).netloc != home
+        ]
+
+
+@dataclass
+class House:
+    """What the browser tests share.
+
+    Attributes:
+        browser: without any context.
+        sim: the daemon of the simulated rig.
+        mixed: the daemon of the rig of two families.
+        link: the console's one-time link.
+        url: of the console, without a path.
+    """
+
+    browser: Browser
+    sim: DaemonUnderTest
+    mixed: DaemonUnderTest
+    link: str
+    _cookies: list[dict[str, object]] = field(default_factory=list)
+
+    @property
+    def url(self) -> str:
+        """Of the console, without a path."""
+        at = urlsplit(self.link)
+        return f"{at.scheme}://{at.netloc}"
+
+    @asynccontextmanager
+    async def desk(self, scheme: str = "dark", width: int = 1400, height: int = 900) -> AsyncIterator[Desk]:
+        """Let one more browser in, the first by the link; nothing that it asks for may lie elsewhere."""
+        context = await self.browser.new_context(
+            color_scheme=scheme, viewport={"width": width, "height": height}, reduced_motion="reduce"
+        )
+        context.set_default_timeout(PATIENCE_S * 1e3)
+        try:
+            page = await context.new_page()
+            desk = Desk(page, self.url)
+            context.on("request", lambda request: desk.asked.append(request.url))
+            page.on("websocket", lambda socket: desk.asked.append(socket.url))
+            page.on("pageerror", lambda error: desk.troubles.append(str(error)))
+            page.on("console", lambda told: desk.troubles.append(told.text) if told.type == "error" else None)
+            if not self._cookies:
+                await page.goto(self.link)
+                self._cookies = await context.cookies()
+            await context.add_cookies(self._cookies)
+            yield desk
+            assert not desk.strangers()
+            assert not desk.troubles
+        finally:
+            await context.close()
+
+
+@asynccontextmanager
+async def console(*endpoints: str) -> AsyncIterator[str]:
+    """Run `ldcnd console` on a free port; yields the link that it prints."""
+    connect = [word for endpoint in endpoints for word in ("-e", endpoint)]
+    async with process("console", *connect, "--listen", "127.0.0.1:0", "--json") as running:
+        assert running.stdout
+        async with asyncio.timeout(PATIENCE_S):
+            told = await running.stdout.readline()
+        yield json.loads(told)["link"]
+
+
+@asynccontextmanager
+async def open_browser() -> AsyncIterator[Browser]:
+    """Run a browser until the context ends."""
+    if not CHROMIUM.exists():
+        pytest.skip(f"no browser at {CHROMIUM}: install chromium, or say where one is in LDCND_CHROMIUM")
+    async with async_playwright() as drives:
+        browser = await drives.chromium.launch(
+            executable_path=str(CHROMIUM), args=list(FLAGS), timeout=PATIENCE_S * 1e3
+        )
+        yield browser
+        await browser.close()
+
+
+@asynccontextmanager
+async def open_house(folder: Path) -> AsyncIterator[House]:
+    """Run daemons, console and browser until the context ends.
+
+    Args:
+        folder: for what the daemons keep.
+    """
+    text = (ROOT / "config" / "mixed.toml").read_text(encoding="utf-8")
+    mixed_config = folder / "mixed.toml"
+    mixed_config.write_text(text.replace('state_dir = "state"', f'state_dir = "{folder}"'), encoding="utf-8")
+    sim, mixed = DaemonUnderTest(ROOT / "config" / "simulated.toml"), DaemonUnderTest(mixed_config)
+    async with AsyncExitStack() as stack:
+        browser = await stack.enter_async_context(open_browser())
+        for daemon in (sim, mixed):
+            stack.push_async_callback(daemon.end)
+        async with asyncio.TaskGroup() as group:
+            for daemon in (sim, mixed):
+                group.create_task(daemon.start(), name=daemon.endpoint)
+        link = await stack.enter_async_context(console(sim.endpoint, mixed.endpoint))
+        expect.set_options(timeout=PATIENCE_S * 1e3)
+        yield House(browser, sim, mixed, link)
