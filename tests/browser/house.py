@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.async_api import Browser, Locator, Page, async_playwright, expect
+from playwright.async_api import Browser, ConsoleMessage, Locator, Page, async_playwright, expect
 
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
@@ -169,7 +169,7 @@ class House:
             context.on("request", lambda request: desk.asked.append(request.url))
             page.on("websocket", lambda socket: desk.asked.append(socket.url))
             page.on("pageerror", lambda error: desk.troubles.append(str(error)))
-            page.on("console", lambda told: desk.troubles.append(told.text) if told.type == "error" else None)
+            page.on("console", lambda told: desk.troubles.append(told.text) if is_trouble(told) else None)
             if not self._cookies:
                 await page.goto(self.link)
                 self._cookies = await context.cookies()
@@ -179,6 +179,11 @@ class House:
             assert not desk.troubles
         finally:
             await context.close()
+
+
+def is_trouble(told: ConsoleMessage) -> bool:
+    """Tell whether a page complains about itself; that a request was refused is no fault of a page."""
+    return told.type == "error" and not told.text.startswith(("Failed to load resource", "WebSocket connection to"))
 
 
 @asynccontextmanager

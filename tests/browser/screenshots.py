@@ -22,7 +22,7 @@ async def rig(house: House, desk: Desk) -> None:
     for axis in ("x", "y", "z"):
         await client.command(axis, Verb.POWER, PowerRequest(on=True))
     await client.command("y", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=41.25))
-    await client.command("z", Verb.SET_GAINS, SetGainsRequest(el=1))
+    await client.command("z", Verb.SET_GAINS, SetGainsRequest(el=5))
     await client.command("z", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5))
     await house.sim.reaches("y", 41.25, within=0.05)
     await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=60, velocity=5))

@@ -163,7 +163,7 @@ function Restore({ axis, values, file, onWritten }) {
   return html`<${Panel} title="Restore from the file" note=${`${UNIT_NUMBER} is left out: it holds the unit number.`}>
     <${Choice} label="Memory" options=${MEMORIES} value=${memory} onChange=${setMemory} />
     <p>${changes.map(({ parameter }) => parameter).join(", ")}</p>
-    <p class="row"><${Action} act=${restore} obstacle=${way} kind="main">Write ${changes.length} values<//></p>
+    <p class="row"><${Action} act=${restore} obstacle=${way} kind="main">Write ${changes.length === 1 ? "1 value" : `${changes.length} values`}<//></p>
     <div role="status">${told.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
 }

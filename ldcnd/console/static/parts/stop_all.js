@@ -53,7 +53,8 @@ export function StopAll() {
 function outcome(rig, reply) {
   if (!reply.axes) return { bad: true, text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
   const missing = reply.axes.filter((axis) => !reply.confirmed.includes(axis));
-  const confirmed = reply.confirmed.length ? `confirmed by ${reply.confirmed.join(", ")}` : "confirmed by no drive";
+  const answered = reply.axes.filter((axis) => reply.confirmed.includes(axis));
+  const confirmed = answered.length ? `confirmed by ${answered.join(", ")}` : "confirmed by no drive";
   if (!missing.length) return { bad: false, text: `${rig}: stopped and latched; ${confirmed}.` };
   return {
     bad: true,

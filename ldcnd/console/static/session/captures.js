@@ -11,6 +11,8 @@ const MOST_KEPT = 12;
 const ARMING_MS = 35_000;
 /** Beyond its own time-out a trace may be uploaded from a slow drive. */
 const UPLOAD_S = 120;
+/** Samples from before the trigger are gathered first. */
+const ARMED_S = 30;
 const MEASURED = new Set(["position", "velocity", "following_error", "adc"]);
 
 /** A finished trace. */
@@ -53,8 +55,14 @@ export function signalsOf(axis) {
 
 /** Arm a trace; returns once the daemon has granted it, with a promise of its capture. */
 export async function arm(axis, request) {
-  const granted = await command(axis, "trace", request, ARMING_MS);
-  return { granted, finished: finished(axis, granted.trace_id, (request.timeout_s ?? 30) + UPLOAD_S) };
+  const { trace_id: id } = await command(axis, "trace", request, ARMING_MS);
+  return { id, finished: finished(axis, id, (request.timeout_s ?? 30) + UPLOAD_S) };
+}
+
+/** Wait until a trace with a trigger counts triggers: what is to be recorded may begin. */
+export async function watchful(axis, id) {
+  const header = await reached(axis, id, (phase) => phase !== "filling", ARMED_S);
+  if (header.phase !== "waiting") throw new Refusal({ message: `The trace is ${header.phase} before anything has happened.` }, 0);
 }
 
 /** Take a trace and keep it. */
@@ -85,22 +93,22 @@ export async function fetchLast(axis) {
 }
 
 async function finished(axis, traceId, patienceS) {
-  const header = await ended(axis, traceId, patienceS);
+  const header = await reached(axis, traceId, (phase) => !TRACE_UNDER_WAY.includes(phase), patienceS);
   if (header.phase !== "complete") {
     throw new Refusal({ message: `The trace is ${header.phase.replace("_", " ")}: ${header.problem ?? "no samples"}.` }, 0);
   }
   return fetchLast(axis);
 }
 
-/** Wait until the header says that the trace has ended. */
-function ended(axis, traceId, patienceS) {
+/** Wait until the header of a trace is in a phase that is wanted. */
+function reached(axis, traceId, wanted, patienceS) {
   return new Promise((resolve, reject) => {
     const look = () => {
       const header = axis.trace;
-      if (header?.trace_id === traceId && !TRACE_UNDER_WAY.includes(header.phase)) end(resolve, header);
+      if (header?.trace_id === traceId && wanted(header.phase)) end(resolve, header);
     };
     const leave = feed.listen(() => look());
-    const late = new Refusal({ message: "The trace did not end in time.", remedy: "Abort it, and look at the line." }, 0);
+    const late = new Refusal({ message: "The trace did not get on in time.", remedy: "Abort it, and look at the line" }, 0);
     const timer = setTimeout(() => end(reject, late), patienceS * 1e3);
     function end(settle, outcome) {
       leave();

@@ -1,15 +1,17 @@
 /** Control over axes: leases that live as long as this page renews them, and commands under them. */
 
-import { ask, askAtOnce, axisPath, Refusal, rigPath } from "./api.js";
+import { ask, askAtOnce, axisPath, rigPath } from "./api.js";
 import { askHolders, changed, rigs } from "./rigs.js";
 
 const LEASE_S = 5;
 const RENEWED_EACH_MS = 1_500;
+const RENEWAL_PATIENCE_MS = 4_000;
 const ENDED = new Set(["lease_expired", "lease_unknown", "lease_held"]);
 
 /** Control of one axis. */
 class Lease {
   sequence = 0;
+  renewing = false;
   renewedAtMs = performance.now();
 
   constructor(rig, axis, token) {
@@ -85,17 +87,21 @@ export function keepControl() {
   });
 }
 
-async function renewAll() {
-  for (const lease of [...held.values()]) await renew(lease);
+function renewAll() {
+  for (const lease of held.values()) if (!lease.renewing) renew(lease);
 }
 
 async function renew(lease) {
+  const askedAtMs = performance.now();
+  lease.renewing = true;
   try {
-    await askAtOnce(`${rigPath(lease.rig.name)}/rig/renew`, lease.body, { patienceMs: RENEWED_EACH_MS });
-    lease.renewedAtMs = performance.now();
+    await askAtOnce(`${rigPath(lease.rig.name)}/rig/renew`, lease.body, { patienceMs: RENEWAL_PATIENCE_MS });
+    lease.renewedAtMs = askedAtMs;
   } catch (error) {
     const outlived = performance.now() - lease.renewedAtMs > LEASE_S * 1e3;
-    if ((error instanceof Refusal && ENDED.has(error.code)) || outlived) forget(lease, error);
+    if (ENDED.has(error.code) || outlived) forget(lease, error);
+  } finally {
+    lease.renewing = false;
   }
 }
 

@@ -1,7 +1,7 @@
-/** Test moves: a trace is armed, the move is commanded once, and the samples are judged. */
+/** Test moves: a trace waits for the axis to move, the move is commanded once, and the samples are judged. */
 
 import { Refusal } from "./api.js";
-import { arm } from "./captures.js";
+import { arm, watchful } from "./captures.js";
 import { command, question } from "./control.js";
 import { judge } from "./response.js";
 import { changed } from "./rigs.js";
@@ -15,6 +15,8 @@ const CHANNELS = ["position", "following_error", "velocity"];
 const INTERVAL_S = 0.005;
 const MOST_SAMPLES = 4_000;
 const LEAD_S = 0.1;
+/** The axis has begun to move when it has come so much of the way. */
+const BEGUN = 0.05;
 
 export const MOVES = {
   trapezoid: { title: "trapezoid", hint: "a relative move with the axis defaults" },
@@ -39,8 +41,10 @@ export async function runTest(axis, { kind, distance, settleS }) {
   if (start === undefined) throw new Refusal({ message: "Where the axis is is not known." }, 0);
   const limits = kind === "steep" ? { velocity: axis.info.limits.velocity, acceleration: axis.info.limits.acceleration } : {};
   const profileS = kind === "step" ? 0 : await planned(axis, { distance, ...limits });
-  const { finished } = await armFor(axis, LEAD_S + profileS + settleS, INTERVAL_S);
+  const trigger = { channel: "position", kind: distance > 0 ? "rising" : "falling", level: start + BEGUN * distance };
+  const { id, finished } = await armFor(axis, trigger, LEAD_S + profileS + settleS, INTERVAL_S);
   finished.catch(() => {}); // awaited below; a refused move leaves before that
+  await watchful(axis, id);
   const reply = kind === "step"
     ? await command(axis, "track", { position: start + distance })
     : await command(axis, "move_relative", { distance, ...limits });
@@ -55,12 +59,13 @@ async function planned(axis, body) {
 }
 
 /** Arm a trace of so many seconds, as dense as the line allows; tracing moves nothing, so it may be asked for twice. */
-async function armFor(axis, seconds, intervalS) {
+async function armFor(axis, trigger, seconds, intervalS) {
   const samples = Math.min(MOST_SAMPLES, Math.ceil(seconds / intervalS));
+  const request = { channels: CHANNELS, samples, interval_s: intervalS, trigger, pre_trigger: Math.ceil(LEAD_S / intervalS) };
   try {
-    return await arm(axis, { channels: CHANNELS, samples, interval_s: intervalS });
+    return await arm(axis, request);
   } catch (error) {
-    if (error.code === "value_out_of_range" && error.nearest > intervalS) return armFor(axis, seconds, error.nearest);
+    if (error.code === "value_out_of_range" && error.nearest > intervalS) return armFor(axis, trigger, seconds, error.nearest);
     throw error;
   }
 }
