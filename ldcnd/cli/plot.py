@@ -9,7 +9,7 @@ import click
 
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
-from ldcnd.cli.trace_file import column_title
+from ldcnd.client.trace_file import column_title
 from ldcnd.errors import ConfigError
 from ldcnd.model.events import FINAL, CommandEvent, CommandStatus
 

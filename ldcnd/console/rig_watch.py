@@ -60,7 +60,7 @@ class RigWatch:
         """Watch until cancelled."""
         while True:
             try:
-                async with self.client.published(self._values.take, LINGER_S):
+                async with self.client.published(self._values.take, linger_s=LINGER_S):
                     await self._follow()
             except LdcndError as error:
                 self._show(problem=error.message)

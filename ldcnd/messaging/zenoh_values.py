@@ -5,8 +5,8 @@ from typing import TypedDict
 
 import zenoh
 
-from ldcnd.messaging.zenoh_failures import no_answer
 from ldcnd.messaging.session import Answer, Qos, Sample, SampleKind
+from ldcnd.messaging.zenoh_failures import no_answer
 
 
 class Travel(TypedDict):

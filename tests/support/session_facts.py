@@ -50,7 +50,7 @@ class SampleFacts:
     async def test_samples_that_may_linger_arrive_in_order_and_none_after_the_end(self, pair: Pair) -> None:
         await subscribed(pair.server, pair.client)
         arrived: asyncio.Queue[Sample] = asyncio.Queue()
-        declaration = await pair.client.subscribe("ldcn/bench1/tele/x/*", arrived.put_nowait, keep=1000, linger_s=0.02)
+        declaration = await pair.client.subscribe("ldcn/bench1/tele/x/*", arrived.put_nowait, kept=1000, linger_s=0.02)
         while arrived.empty():
             pair.server.publish(POSITION, b"first", encoding=JSON, qos=Qos.TELEMETRY)
             await asyncio.sleep(0.01)
