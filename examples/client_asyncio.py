@@ -15,7 +15,7 @@ async def main(endpoint: str = "tcp/127.0.0.1:7447", axis: str = "x") -> None:
     # the lease is renewed by itself; the axis halts when this program disappears
     async with open_rig(at(endpoint)) as rig, control(rig, "example", axis, lease_s=1.0) as held:
         await held.command(axis, Verb.POWER, PowerRequest(on=True))
-        move = await held.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        move = await held.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0, velocity=2.0))
         async with follow(rig, move) as motion:
             async for step in motion:
                 print(f"{step.position:8.3f} {step.unit}, {step.left:8.3f} to go")

@@ -12,7 +12,7 @@ def main(endpoint: str = "tcp/127.0.0.1:7447", axis: str = "x") -> None:
     """Move an axis to 5 and show how far it is, then ask for too much."""
     with open_rig(at(endpoint)) as rig, rig.control("example", axis, lease_s=1.0) as held:
         held.command(axis, Verb.POWER, PowerRequest(on=True))
-        move = held.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        move = held.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0, velocity=2.0))
         with rig.follow(move) as motion:
             for step in motion:
                 print(f"{step.position:8.3f} {step.unit}, {step.left:8.3f} to go")

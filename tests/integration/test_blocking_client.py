@@ -64,7 +64,7 @@ async def test_a_program_without_a_loop_does_what_one_with_a_loop_does():
                 with pytest.raises(LeaseHeld), rig.control("bob", "x"):
                     pass
                 held.command("x", Verb.POWER, PowerRequest(on=True))
-                move = held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=3.0))
+                move = held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=3.0, velocity=2.0))
                 with rig.follow(move) as motion:
                     steps = list(motion)
                 end = rig.wait_for_end("x", move.command_id)

@@ -1,6 +1,8 @@
 """What a survey of several rigs tells: all of them, and what is wrong with each."""
 
 import asyncio
+import signal
+from asyncio.subprocess import DEVNULL, PIPE
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
@@ -13,8 +15,12 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.errors import MalformedRequest
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.axes import LinkState
+from tests.support.process import LDCND
 from tests.support.rig import EPOCH_NS, SIMULATED
+from tests.support.session_pair import free_endpoint
 
 
 def named(rig: str) -> RigConfig:
@@ -120,3 +126,21 @@ async def test_nobody_there_is_an_empty_list():
 def test_a_key_of_no_rig_is_refused(key):
     with pytest.raises(MalformedRequest):
         Keys.of(key)
+
+
+@pytest.mark.real_time
+async def test_the_fleet_is_shown_again_and_again_until_it_is_enough():
+    endpoint = free_endpoint()
+    async with open_zenoh_session(ZenohSettings(listen=(endpoint,))):
+        words = (*LDCND, "fleet", "--watch", "0.5", "--connect", endpoint)
+        watching = await asyncio.create_subprocess_exec(*words, stdout=DEVNULL, stderr=PIPE)
+        try:
+            assert watching.stderr
+            async with asyncio.timeout(40):
+                told = [await watching.stderr.readline() for _ in range(2)]
+        finally:
+            watching.send_signal(signal.SIGINT)
+            await watching.communicate()
+
+    assert told == [b"no rig answers\n"] * 2
+    assert watching.returncode == 130
