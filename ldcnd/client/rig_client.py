@@ -42,10 +42,14 @@ class Samples:
 
     Attributes:
         dropped: how many samples the reader was too slow for.
+        missed: how many the network dropped, as the numbers of those that came tell. A daemon that is started anew
+            begins with number 0; what its former run said last is not counted.
     """
 
     def __init__(self, keys: Keys) -> None:
         self.dropped = 0
+        self.missed = 0
+        self._next: dict[str, int] = {}
         self._keys = keys
         self._kept: deque[tuple[str, Measurement]] = deque(maxlen=KEPT_SAMPLES)
         self._ready = asyncio.Event()
@@ -58,6 +62,8 @@ class Samples:
         if address.item not in ITEMS:
             return  # events, and what newer daemons publish
         measurement = decode_received(SAMPLE_MODELS[TelemetryItem(address.item)], sample.payload, sample.encoding)
+        self.missed += max(0, measurement.seq - self._next.get(sample.key, measurement.seq))
+        self._next[sample.key] = measurement.seq + 1
         self.dropped += len(self._kept) == KEPT_SAMPLES
         self._kept.append((address.axis, measurement))
         self._ready.set()

@@ -69,6 +69,20 @@ async def test_a_sample_with_fields_that_are_news_is_understood(newer: Newer) ->
     assert sample.value == 1.5
 
 
+async def test_samples_that_the_network_dropped_are_counted_for_each_key(newer: Newer) -> None:
+    def publish(key: str, seq: int) -> None:
+        newer.session.publish(key, text(SAMPLE | {"seq": seq}), encoding=JSON, qos=Qos.TELEMETRY)
+
+    async with newer.client.samples() as samples:
+        for seq in (7, 8, 11, 12, 0, 1, 3):  # two are missing, the daemon was started anew, one is missing
+            publish(POSITION, seq)
+            publish(KEYS.telemetry("y", "position"), seq if seq < 11 else seq - 2)
+        for _ in range(14):
+            await anext(samples)
+
+    assert (samples.missed, samples.dropped) == (4, 0)
+
+
 async def test_an_error_that_is_news_is_raised_in_words(newer: Newer) -> None:
     refusal = text({"code": "moon_is_full", "message": "wait for the new moon", "retryable": True})
     await newer.answers(KEYS.daemon, present)
