@@ -38,10 +38,10 @@ class Network:
         """
         try:
             _ip("netns", "add", self._namespace(name))
-        except (OSError, subprocess.CalledProcessError) as error:
+            self._hosts.append(name)
+            _ip("-n", self._namespace(name), "link", "set", "lo", "up")
+        except (OSError, subprocess.SubprocessError) as error:
             raise NoNamespaces(f"cannot make network namespaces: {error}") from error
-        self._hosts.append(name)
-        _ip("-n", self._namespace(name), "link", "set", "lo", "up")
 
     def add_link(self, one: str, other: str) -> None:
         """Connect two namespaces.
