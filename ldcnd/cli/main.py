@@ -7,6 +7,7 @@ from typing import NoReturn
 import click
 
 from ldcnd.errors import ConfigError, LdcndError, SessionError
+from ldcnd.fault_pages import page_of_error
 
 EXIT_FAILED = 1
 """The daemon refused, or something failed; the message says what."""
@@ -89,5 +90,7 @@ def main() -> NoReturn:
         print(f"{error.message} [{error.code}]", file=sys.stderr)
         if error.remedy:
             print(f"  {error.remedy}", file=sys.stderr)
+        if page := page_of_error(error):
+            print(f"  more: ldcnd fault {page.rpartition('/')[2]}", file=sys.stderr)
         sys.exit(EXIT_UNREACHABLE if isinstance(error, SessionError) else EXIT_FAILED)
     sys.exit(0)

@@ -14,7 +14,10 @@ def command(target: Target, axis: str) -> None:
     """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
     reply = target.run(lambda client: client.why(axis))
     lines = [f"{axis}: {'nothing is in the way of a motion' if reply.can_move else 'cannot move now'}"]
-    lines += [f"  {cause.text}{f' -> {cause.remedy}' if cause.remedy else ''}" for cause in reply.causes]
+    for cause in reply.causes:
+        lines.append(f"  {cause.text}{f' -> {cause.remedy}' if cause.remedy else ''}")
+        if cause.page:
+            lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
     if reply.first_fault:
         lines.append(f"  first fault since the last reset: {reply.first_fault}")
     target.show(reply, "\n".join(lines))

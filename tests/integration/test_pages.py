@@ -93,7 +93,7 @@ def test_every_link_leads_somewhere(page) -> None:
 async def test_the_tutorials_can_be_followed(tmp_path) -> None:
     async with PageReader(tmp_path) as reader:
         await reader.follow(ROOT / FIRST_RIG, NOT_RUN)
-        assert "not referenced" in reader.printed
+        assert "more: ldcnd fault not_referenced" in reader.printed
         assert "a stop was asked for" in reader.printed
 
     async with PageReader(tmp_path) as reader:

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd import errors
-from ldcnd.cli.main import cli
+from ldcnd.cli.main import cli, main
 from ldcnd.daemon.axis_tracker import LINK_LOST, LOOP_OPENED, AxisTracker
 from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
 from ldcnd.drivers.smartstep.alarms import ALARMS, AlarmKind
@@ -127,6 +127,21 @@ def test_the_published_fault_names_its_page():
 def test_a_code_without_a_page_has_none():
     assert page_of("../errors") is None
     assert page_text("nonsense") is None
+
+
+def test_the_command_line_leads_from_an_error_to_its_page(monkeypatch, capsys):
+    def refuse(**_options):
+        raise DriveFault("axis x: still the stop input is open", value="stop_input", remedy="close it")
+
+    monkeypatch.setattr(cli, "main", refuse)
+    with pytest.raises(SystemExit, match="1"):
+        main()
+
+    assert capsys.readouterr().err.splitlines() == [
+        "axis x: still the stop input is open [drive_fault]",
+        "  close it",
+        "  more: ldcnd fault stop_input",
+    ]
 
 
 def test_the_command_line_shows_a_page_and_lists_all():
