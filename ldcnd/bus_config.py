@@ -74,6 +74,8 @@ class BusConfig(Frozen):
     """What the adapter keeps each reply back, for the plan: 1 for FTDI in low-latency mode, 0 for a UART on board."""
     overload: Literal["refuse", "skip"] = "refuse"
     """Rates that the line may not be able to keep: refused before anything is opened, or polls skip turns."""
+    order: Literal["deadline", "phase"] = "phase"
+    """Between polls that are equally urgent: who is due longest, or whose servo cycle ends first, so that more fit."""
     start: StartPolicy = StartPolicy.RESET
     """Whether the drives are reset at start, or taken over as they are; a line that was lost is always taken over."""
     adopt_fallback: AdoptFallback = AdoptFallback.REFUSE

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 from ldcnd.bus.exchange_queue import ExchangeQueue, Lane
 from ldcnd.bus.line import Line, Phase
 from ldcnd.bus.mute_nodes import MuteNodes
+from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
@@ -37,7 +38,8 @@ class Bus:
         self.resync = Resync()
         self._opener = opener
         self._loop = asyncio.get_running_loop()
-        self._queue: ExchangeQueue[Job] = ExchangeQueue()
+        self._order = PhaseOrder(settings.cycle) if settings.cycle else None
+        self._queue: ExchangeQueue[Job] = ExchangeQueue(self._order.choose if self._order else None)
         self._pollers: set[Poller[Any]] = set()  # also those whose poll is on the wire
         self._mute = MuteNodes()
         self._line: Line | None = None  # None while the port is not open
@@ -242,7 +244,7 @@ class Bus:
         turn = self._queue.take(now_s)
         if isinstance(turn, Poller):
             wanted_at_s = turn.due_at_s
-            return PollTurn(turn, turn.next_exchange(now_s), wanted_at_s)
+            return PollTurn(turn, turn.next_exchange(now_s), wanted_at_s, self._order)
         if turn is not None:
             turn.attempts_left -= 1
         return turn

@@ -8,6 +8,19 @@ adapters pass bytes on a little late."""
 
 
 @dataclass(frozen=True, slots=True)
+class ServoCycle:
+    """What decides when drives answer that do so at the end of a cycle, each of its own.
+
+    Attributes:
+        length_s: nominal.
+        stretch: by how much the bytes of a reply take longer than at the line's nominal rate.
+    """
+
+    length_s: float
+    stretch: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class BusSettings:
     """What the bus must know of its line.
 
@@ -20,6 +33,7 @@ class BusSettings:
         echo: the adapter returns our own bytes before the reply.
         paced: bytes take real time on this line, so that what comes too early is foreign; false only for
             far ends that answer faster than the baud rate allows.
+        cycle: of the drives, to order polls by; None when they have none, or when polls are not to be ordered by it.
     """
 
     name: str
@@ -29,3 +43,4 @@ class BusSettings:
     attempts: int = 3
     echo: bool = False
     paced: bool = True
+    cycle: ServoCycle | None = None

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poller import Poller
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Exchange, Timing
@@ -46,14 +47,19 @@ class Turn(ABC):
 class PollTurn(Turn):
     """A poller's turn; it is never sent again, the poller's next turn comes soon enough."""
 
-    __slots__ = ("poller",)
+    __slots__ = ("order", "poller")
 
-    def __init__(self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float) -> None:
+    def __init__(
+        self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float, order: PhaseOrder | None = None
+    ) -> None:
         super().__init__(exchange, Lane.POLL, wanted_at_s)
         self.poller = poller
+        self.order = order
 
     def completed(self, reply: bytes, timing: Timing) -> None:
         """See `Turn`."""
+        if self.order and reply:
+            self.order.observe(self.exchange.node, timing)
         try:
             value = self.exchange.decode(reply)
         except BadReply as error:

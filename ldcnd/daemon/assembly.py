@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
+from ldcnd.bus.settings import BusSettings, ServoCycle
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, SimulatedLineConfig
 from ldcnd.daemon.axis_service import AxisService
@@ -26,6 +26,7 @@ from ldcnd.daemon.rig import Rig
 from ldcnd.daemon.smartstep_line import build_line, open_ledger
 from ldcnd.drivers.driver import AxisDriver, AxisSpec, Gains
 from ldcnd.drivers.ldcn.network import RESET_BAUD
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
 from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.drivers.line import GroupSpec, LineSpec, ModuleEntry
 from ldcnd.drivers.registry import FAMILIES
@@ -117,7 +118,12 @@ def _build_bus(
         return BusService(line, units, services, port=settings.port, family=settings.family)
     opening_baud = settings.baud if settings.port.startswith(SOCKET) else RESET_BAUD
     bus = Bus(
-        BusSettings(settings.name, opening_baud, margin_s=settings.margin_ms / 1000),
+        BusSettings(
+            settings.name,
+            opening_baud,
+            margin_s=settings.margin_ms / 1000,
+            cycle=_cycle(settings) if settings.order == "phase" else None,
+        ),
         _opener(config, settings, opening_baud, chains),
     )
     specs = tuple(_spec(axis) for axis in settings.axis)
@@ -125,6 +131,11 @@ def _build_bus(
     axes = tuple(make_axis(axis, bus, network.axes[axis.name]) for axis in settings.axis)
     demands = {axis.name: Demand() for axis in settings.axis} if config.telemetry.on_demand else NO_DEMANDS
     return BusService(bus, network, axes, port=settings.port, family=settings.family, demands=demands)
+
+
+def _cycle(settings: BusConfig) -> ServoCycle:
+    node_baud = actual_baud(baud_divisor(settings.baud, BaudCodes(settings.divisors)))
+    return ServoCycle(SERVO_CYCLE_S, settings.baud / node_baud)
 
 
 def _spec(axis: AxisConfig) -> AxisSpec:

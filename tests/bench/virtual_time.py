@@ -41,8 +41,8 @@ def rows(seconds: float) -> list[Row]:
     return found
 
 
-def saturating(drives: int) -> RigConfig:
-    """Return a rig that wants more polls than its line can carry."""
+def saturating(drives: int, **bus_settings: object) -> RigConfig:
+    """Return a rig that wants more polls than its line can carry, with other settings of its line."""
     axes = [
         {
             "name": f"a{number}",
@@ -54,7 +54,7 @@ def saturating(drives: int) -> RigConfig:
         }
         for number in range(1, drives + 1)
     ]
-    bus = {"name": "line0", "port": "sim:line0", "baud": 115_200, "overload": "skip", "axis": axes}
+    bus = {"name": "line0", "port": "sim:line0", "baud": 115_200, "overload": "skip", "axis": axes, **bus_settings}
     modules = [{"model": "ls182ap"}] * drives
     return RigConfig.model_validate({"rig": "bench", "bus": [bus], "sim": [{"name": "line0", "module": modules}]})
 

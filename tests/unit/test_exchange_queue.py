@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from itertools import pairwise
 
 import pytest
 
@@ -194,3 +195,50 @@ def test_draining_returns_every_job_and_forgets_the_pollers():
     assert [ticket.name for ticket in drained] == ["stop0", "command0", "command1", "background0"]
     assert queue.take(10.0) is None
     assert queue.next_due_s() == float("inf")
+
+
+def chosen(now_s: float, deadlines_s: list[float], turns: int) -> list[int]:
+    """Let somebody who always wants the highest node choose; return who goes. A poll is due again at once."""
+    queue: ExchangeQueue[Ticket] = ExchangeQueue(lambda polls, _now_s: max(polls, key=lambda poll: poll.node))
+    for node, deadline_s in enumerate(deadlines_s, 1):
+        poller = ToyPoller(node, 1.0)
+        poller.deadline_at_s = deadline_s
+        queue.schedule(poller, 0.0)
+    nodes = []
+    for _ in range(turns):
+        taken = queue.take(now_s)
+        assert isinstance(taken, Poller)
+        nodes.append(taken.node)
+        queue.schedule(taken, now_s)
+    return nodes
+
+
+def test_the_choice_is_among_polls_with_the_earliest_deadline():
+    assert chosen(1.0, [2.0, 2.0, 3.0, 9.0], 1) == [2]
+
+
+def test_there_is_no_choice_while_deadlines_differ():
+    assert chosen(1.0, [2.0, 3.0, 4.0], 1) == [1]
+
+
+def test_among_late_polls_the_choice_is_free_and_nobody_is_passed_over_for_two_rounds():
+    nodes = chosen(5.0, [float(number) / 10 for number in range(8)], 800)
+
+    gaps = [
+        later - earlier
+        for node in range(1, 9)
+        for earlier, later in pairwise([turn for turn, other in enumerate(nodes) if other == node])
+    ]
+    assert nodes.count(8) == max(nodes.count(node) for node in range(1, 9))
+    assert min(gaps) >= 4
+    assert max(gaps) <= 16
+
+
+def test_a_poll_that_was_unscheduled_is_not_chosen():
+    queue: ExchangeQueue[Ticket] = ExchangeQueue(lambda polls, _now_s: polls[-1])
+    kept, gone = ToyPoller(1, 1.0), ToyPoller(2, 1.0)
+    for poller in (kept, gone):
+        queue.schedule(poller, 0.0)
+    queue.unschedule(gone)
+
+    assert [queue.take(1.0), queue.take(1.0)] == [kept, None]

@@ -6,7 +6,7 @@ import random
 import pytest
 
 from ldcnd.bus.cost import Cost
-from ldcnd.bus.exchange_queue import ExchangeQueue
+from ldcnd.bus.exchange_queue import Choose, ExchangeQueue
 from ldcnd.bus.poll_plan import Poll, Urgent, largest, plan_line
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s
@@ -34,9 +34,11 @@ class Turns(Poller[None]):
     missed = deliver
 
 
-def observed_s(tasks: list[PeriodicTask], starts_s: list[float], until_s: float) -> list[float]:
+def observed_s(
+    tasks: list[PeriodicTask], starts_s: list[float], until_s: float, choose: Choose | None = None
+) -> list[float]:
     """Let the real queue order the tasks; return the longest time of each from being due to being over."""
-    queue: ExchangeQueue = ExchangeQueue()
+    queue: ExchangeQueue = ExchangeQueue(choose)
     turns = [Turns(task, start) for task, start in zip(tasks, starts_s, strict=True)]
     longest = dict.fromkeys(turns, 0.0)
     for each in turns:
@@ -112,6 +114,26 @@ def test_no_poll_is_ever_later_than_its_bound(seed):
         starts_s = [dice.choice([0.0, dice.uniform(0.0, task.period_s)]) for task in tasks]
         for seen_s, bound_s in zip(observed_s(tasks, starts_s, 4.0), bounds_s, strict=True):
             assert seen_s <= bound_s + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_poll_is_later_than_its_bound_whoever_chooses_among_equals(seed):
+    dice = random.Random(seed)
+    tasks = []
+    while load_of(tasks) < 0.9:
+        tasks.append(PeriodicTask(dice.choice([0.03, 0.06, 0.12]), dice.uniform(0.8, 4.0) * MS))
+    bounds_s = response_times_s(tasks)
+    chosen = []
+
+    def choose(polls, _now_s):
+        chosen.append(len(polls))
+        return dice.choice(polls)
+
+    for _ in range(5):
+        starts_s = [dice.choice([0.0, 0.0, 0.01]) for _ in tasks]
+        for seen_s, bound_s in zip(observed_s(tasks, starts_s, 4.0, choose), bounds_s, strict=True):
+            assert seen_s <= bound_s + 1e-9
+    assert max(chosen) > 3
 
 
 def test_the_bound_is_reached():

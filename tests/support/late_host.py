@@ -1,0 +1,79 @@
+"""A host that is late, on the jumping clock: it writes a little after it means to and notes replies a little after they
+have come.
+"""
+
+import asyncio
+import random
+
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.line import SimulatedLine, open_simulated_line
+from ldcnd.transport.transport import Receiver, Transport
+
+
+class LateHost(Transport, Receiver):
+    """A transport to a simulated line; half of each delay lies before the request, half behind the reply.
+
+    In order: nothing overtakes what was written or received before it.
+    """
+
+    def __init__(self, line: SimulatedLine, least_s: float, most_s: float, seed: int) -> None:
+        self._line = line
+        self._range_s = (least_s / 2, most_s / 2)
+        self._dice = random.Random(seed)
+        self._loop = asyncio.get_running_loop()
+        self._receiver: Receiver | None = None
+        self._written_by_s = self._received_by_s = 0.0
+        self._pending: set[asyncio.TimerHandle] = set()
+
+    def attach(self, receiver: Receiver) -> None:
+        """See `Transport`."""
+        self._receiver = receiver
+        self._line.attach(self)
+
+    def write(self, data: bytes) -> None:
+        """See `Transport`."""
+        self._written_by_s = at_s = max(self._written_by_s, self._loop.time() + self._dice.uniform(*self._range_s))
+        self._later(at_s, lambda: self._line.write(data))
+
+    def expect(self, reply_bytes: int) -> None:
+        """See `Transport`."""
+        self._line.expect(reply_bytes)
+
+    def discard_input(self) -> None:
+        """See `Transport`."""
+        self._line.discard_input()
+
+    def set_baud(self, baud: int) -> None:
+        """See `Transport`."""
+        self._line.set_baud(baud)
+
+    async def close(self) -> None:
+        """See `Transport`."""
+        for handle in self._pending:
+            handle.cancel()
+        await self._line.close()
+
+    def data_received(self, data: bytes) -> None:
+        """See `Receiver`."""
+        self._received_by_s = at_s = max(self._received_by_s, self._loop.time() + self._dice.uniform(*self._range_s))
+        if self._receiver:
+            receiver = self._receiver
+            self._later(at_s, lambda: receiver.data_received(data))
+
+    def transport_lost(self, reason: str) -> None:
+        """See `Receiver`."""
+        if self._receiver:
+            self._receiver.transport_lost(reason)
+
+    def _later(self, at_s: float, action: object) -> None:
+        def run() -> None:
+            self._pending.discard(handle)
+            action()  # type: ignore[operator]  # any callable without arguments
+
+        handle = self._loop.call_at(at_s, run)
+        self._pending.add(handle)
+
+
+async def open_late_host(chain: Chain, least_s: float, most_s: float, seed: int = 1) -> LateHost:
+    """Open the line to a chain through a host that takes so long between a reply and the next request."""
+    return LateHost(await open_simulated_line(chain), least_s, most_s, seed)
