@@ -72,8 +72,12 @@ class BusConfig(Frozen):
     """Added to every reply's deadline: host scheduling and adapter latency."""
     adapter_latency_ms: float = Field(default=1.0, ge=0, le=100)
     """What the adapter keeps each reply back, for the plan: 1 for FTDI in low-latency mode, 0 for a UART on board."""
-    overload: Literal["refuse", "skip"] = "refuse"
-    """Rates that the line may not be able to keep: refused before anything is opened, or polls skip turns."""
+    overload: Literal["refuse", "skip"] | None = None
+    """Rates that the line may not be able to keep: refused before anything is opened, or polls skip turns; left out: \
+refuse, and skip for smartstep, where the drives' speed only shows on site."""
+    stop_probe_hz: float = Field(default=0.5, ge=0, le=20)
+    """How often it is measured how long a stop would wait, by a question in its place; ldcn only, 0 for never. \
+None where polls would miss their turns for it."""
     order: Literal["deadline", "phase"] = "phase"
     """Between polls that are equally urgent: who is due longest, or whose servo cycle ends first, so that more fit."""
     start: StartPolicy = StartPolicy.RESET
@@ -90,6 +94,11 @@ class BusConfig(Frozen):
     """What is on the line besides the axes."""
     group: tuple[GroupConfig, ...] = Field(default=(), max_length=15)
     """Axes that start and stop together."""
+
+    @property
+    def skips(self) -> bool:
+        """Whether rates that the line may not be able to keep are let pass."""
+        return self.overload == "skip" or (self.overload is None and self.family == "smartstep")
 
     @model_validator(mode="after")
     def _unique_addresses(self) -> Self:

@@ -49,6 +49,8 @@ class SmartStepUnitConfig(Frozen):
     """deny forbids it; otherwise EEPROM is written when a request names it."""
     eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
     """Writes of one parameter until further ones are refused."""
+    planned_response_s: float = Field(default=0.02, ge=0, le=5)
+    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
     first_character_s: float = Field(default=0.3, gt=0, le=5)
     """The longest wait for a reply; the manual says 0.2 s."""
     encoder_counts_per_rev: int = Field(default=8000, gt=0)

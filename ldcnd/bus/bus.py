@@ -11,7 +11,7 @@ from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
-from ldcnd.bus.turn import Job, PollTurn, Turn
+from ldcnd.bus.turn import Job, PollTurn, StopProbe, Turn
 from ldcnd.bus.wire_log import WireEvent, WireLog
 from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
 from ldcnd.exchange import Exchange
@@ -85,6 +85,22 @@ class Bus:
         """
         self._require_changeable()
         return await self._submit(exchange, Lane.COMMAND, at_baud=baud)
+
+    async def probe_stop_wait(self) -> None:
+        """Measure how long a single stop would have to wait now: its place is taken by a question that moves nothing.
+
+        Real stops overtake it. What it finds is in `BusStatistics.stop_wait`. Without a node to ask, nothing is done.
+
+        Raises:
+            BusDown, ReplyTimeout, PacketRejected, BadReply: as `execute`; the question is not repeated.
+        """
+        exchange = self.resync.probe(self._mute.failing())
+        if exchange is None or self._line is None or not self._queue.takes_probe():
+            return
+        future: asyncio.Future[Any] = self._loop.create_future()
+        self._queue.push_probe(StopProbe(exchange, Lane.STOP, self._loop.time(), future, attempts=1))
+        self._kick()
+        await future
 
     def add_poller(self, poller: Poller[Any]) -> None:
         """Let a poller take part from its `due_at_s` on; adding it again only moves its turn.
@@ -247,6 +263,8 @@ class Bus:
             return PollTurn(turn, turn.next_exchange(now_s), wanted_at_s, self._order)
         if turn is not None:
             turn.attempts_left -= 1
+            if isinstance(turn, StopProbe):
+                self.statistics.stop_wait.add(now_s - turn.wanted_at_s)
         return turn
 
     def next_due_s(self) -> float:

@@ -60,6 +60,7 @@ class ExchangeQueue(Generic[JobT]):
 
     def __init__(self, choose: Choose | None = None) -> None:
         self._choose = choose
+        self._probe: JobT | None = None
         self._turn = 0
         self._late: list[tuple[int, float, Poller[Any]]] = []  # since which turn, and since when it is due
         self._jobs: dict[Lane, deque[JobT]] = {lane: deque() for lane in LANE_LIMITS}
@@ -90,6 +91,14 @@ class ExchangeQueue(Generic[JobT]):
     def push_front(self, job: JobT, lane: Lane) -> None:
         """Give a job that has to be sent again the next turn of its lane."""
         self._jobs[lane].appendleft(job)
+
+    def takes_probe(self) -> bool:
+        """Tell whether a probe would be alone: no stop waits, and no other probe."""
+        return self._probe is None and not self.stop_waits()
+
+    def push_probe(self, job: JobT) -> None:
+        """Let a job wait as the only stop would: behind every stop and in front of everything else."""
+        self._probe = job
 
     def waiting(self, lane: Lane) -> list[JobT]:
         """Return the jobs of a lane, first to go first."""
@@ -123,6 +132,9 @@ class ExchangeQueue(Generic[JobT]):
         """Remove and return what goes on the wire now, or None when nothing is due."""
         if stop := self._take_job(Lane.STOP):
             return stop
+        probe, self._probe = self._probe, None
+        if probe and not probe.abandoned:
+            return probe
         poll_due = self._poll_is_due(now_s)
         if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (
             command := self._take_job(Lane.COMMAND)
@@ -147,7 +159,9 @@ class ExchangeQueue(Generic[JobT]):
         self._later.clear()
         self._due.clear()
         self._late.clear()
-        drained = [job for lane in sorted(self._jobs) for job in self._jobs[lane]]
+        drained = [self._probe] if self._probe else []
+        self._probe = None
+        drained += [job for lane in sorted(self._jobs) for job in self._jobs[lane]]
         for waiting in self._jobs.values():
             waiting.clear()
         return drained

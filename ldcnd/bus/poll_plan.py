@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from ldcnd.bus.cost import Cost
-from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s
+from ldcnd.bus.response_times import FULL, PeriodicTask, busy_periods_s, load_of, meets_deadlines, response_times_s
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
@@ -25,6 +25,8 @@ class Poll:
         rate_hz: how often at most.
         cost: of the exchange with all these items.
         mean_s: of the exchange with what it asks for on average.
+        request_bytes: what is sent.
+        reply_bytes: what comes back at most.
     """
 
     axis: str
@@ -32,6 +34,8 @@ class Poll:
     rate_hz: float
     cost: Cost
     mean_s: float
+    request_bytes: int = 0
+    reply_bytes: int = 0
 
     @property
     def task(self) -> PeriodicTask:
@@ -48,12 +52,16 @@ class Urgent:
         stop_s: longest stop exchange.
         recovery_s: from a reply's deadline to the instant at which the line may be used by a stop: the flush.
         margin_s: by which a reply's deadline exceeds its longest time.
+        search_s: longest question to a drive that has been lost; it is asked while one is missing only.
+        probe: of the stop lane; None for none.
     """
 
     command_s: float
     stop_s: float
     recovery_s: float
     margin_s: float
+    search_s: float = 0.0
+    probe: PeriodicTask | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,21 +102,36 @@ class LinePlan:
         return not self.late
 
 
-def plan_line(polls: Sequence[Poll], urgent: Urgent) -> LinePlan:
-    """Work out what a line promises."""
+def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True) -> LinePlan:
+    """Work out what a line promises.
+
+    Args:
+        polls: what is asked of it.
+        urgent: what goes before them.
+        by_deadline: the earliest deadline goes first; otherwise polls take turns.
+    """
     tasks = [poll.task for poll in polls]
+    probes = [urgent.probe] if urgent.probe else []
     longest_s = max([urgent.command_s, *(task.cost_s for task in tasks)])
     stop_s = longest_s + urgent.stop_s
     return LinePlan(
         polls=tuple(polls),
-        responses_s=tuple(response_times_s(tasks)),
-        load=load_of(tasks),
-        mean_load=math.fsum(poll.rate_hz * poll.mean_s for poll in polls),
-        commands_per_s=_most_commands_per_s(tasks, urgent.command_s),
+        responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else busy_periods_s(tasks, probes)),
+        load=load_of([*tasks, *probes]),
+        mean_load=math.fsum(poll.rate_hz * poll.mean_s for poll in polls) + load_of(probes),
+        commands_per_s=_most_commands_per_s(tasks, probes, urgent.command_s, by_deadline=by_deadline),
         stop_wait_s=longest_s,
         stop_s=stop_s,
-        stop_after_loss_s=stop_s + urgent.margin_s + urgent.recovery_s,
+        stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
     )
+
+
+def in_time(tasks: Sequence[PeriodicTask], urgent: Sequence[PeriodicTask], *, by_deadline: bool) -> bool:
+    """Tell whether every task is always over before its next turn."""
+    if by_deadline:
+        return meets_deadlines(tasks, *urgent)
+    bounds_s = busy_periods_s(tasks, urgent)
+    return all(bound_s <= task.period_s for bound_s, task in zip(bounds_s, tasks, strict=True))
 
 
 def largest(fits: Callable[[float], bool], least: float, most: float) -> float | None:
@@ -132,9 +155,15 @@ def largest(fits: Callable[[float], bool], least: float, most: float) -> float |
     return least
 
 
-def _most_commands_per_s(tasks: Sequence[PeriodicTask], command_s: float) -> float:
-    room = (FULL - load_of(tasks)) / command_s
+def _most_commands_per_s(
+    tasks: Sequence[PeriodicTask], probes: Sequence[PeriodicTask], command_s: float, *, by_deadline: bool
+) -> float:
+    room = (FULL - load_of([*tasks, *probes])) / command_s
     least = room / 2**STEPS
     if room <= 0.0:
         return 0.0
-    return largest(lambda rate: meets_deadlines(tasks, PeriodicTask(1.0 / rate, command_s)), least, room) or 0.0
+
+    def fits(rate: float) -> bool:
+        return in_time(tasks, [*probes, PeriodicTask(1.0 / rate, command_s)], by_deadline=by_deadline)
+
+    return largest(fits, least, room) or 0.0

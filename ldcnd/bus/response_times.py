@@ -38,53 +38,71 @@ def load_of(tasks: Sequence[PeriodicTask]) -> float:
     return math.fsum(task.cost_s / task.period_s for task in tasks)
 
 
-def response_times_s(tasks: Sequence[PeriodicTask], blocking_s: float = 0.0) -> list[float]:
+def response_times_s(
+    tasks: Sequence[PeriodicTask], blocking_s: float = 0.0, urgent: Sequence[PeriodicTask] = ()
+) -> list[float]:
     """Return for each task how long after it was due its exchange can be over at the latest.
 
     Args:
         tasks: all polls of a line.
         blocking_s: longest other exchange that can have begun just before.
+        urgent: what goes before all of them whenever it is there.
 
     Returns:
         Seconds, in the order of `tasks`; infinity for all of them when the line is full.
     """
-    if load_of(tasks) > FULL:
+    if load_of([*tasks, *urgent]) > FULL:
         return [math.inf] * len(tasks)
     classes = _classes(tasks)
-    busy_s = _busy_period_s(tasks, max([blocking_s, *(task.cost_s for task in tasks)]))
+    busy_s = _busy_period_s([*tasks, *urgent], max([blocking_s, *(task.cost_s for task in tasks)]))
+    ahead = [(each.period_s, each.cost_s, int(busy_s / each.period_s) + 1) for each in urgent]
     known: dict[PeriodicTask, float] = {}
     for task in tasks:
         if task not in known:
             known[task] = 0.0
             for at_s in _offsets_s(task, classes, busy_s):
-                known[task] = _response_s(task, at_s, classes, blocking_s, known[task])
+                known[task] = _response_s(task, at_s, classes, blocking_s, known[task], ahead)
     return [known[task] for task in tasks]
 
 
-def meets_deadlines(tasks: Sequence[PeriodicTask], commands: PeriodicTask | None = None) -> bool:
+def meets_deadlines(tasks: Sequence[PeriodicTask], *urgent: PeriodicTask) -> bool:
     """Tell whether every task is always over before its next turn.
 
-    The demand of all deadlines up to an instant, one exchange that is on the wire and the commands until then must fit
-    before that instant; exact without commands (Jeffay, Stanat, Martel, "On non-preemptive scheduling of periodic and
-    sporadic tasks", RTSS 1991), sufficient with them.
+    The demand of all deadlines up to an instant, one less urgent exchange that is on the wire, and what goes before all
+    polls until then must fit before that instant; exact without the last (Jeffay, Stanat, Martel, "On non-preemptive
+    scheduling of periodic and sporadic tasks", RTSS 1991), sufficient with it.
     """
-    everything = [*tasks, commands] if commands else list(tasks)
+    everything = [*tasks, *urgent]
     if load_of(everything) > FULL:
         return False
     classes = _classes(tasks)
-    command_s = commands.cost_s if commands else 0.0
-    busy_s = _busy_period_s(everything, max([command_s, *(task.cost_s for task in tasks)]))
+    urgent_s = max((each.cost_s for each in urgent), default=0.0)
+    busy_s = _busy_period_s(everything, max([urgent_s, *(task.cost_s for task in tasks)]))
     deadlines_s = {turn * period_s for period_s in classes for turn in range(1, int(busy_s / period_s) + 2)}
     for at_s in deadlines_s:
         demand_s = math.fsum(int(at_s / period_s + _ALMOST) * each.cost_s for period_s, each in classes.items())
-        if commands:
-            demand_s += (int(at_s / commands.period_s) + 1) * command_s
+        demand_s += math.fsum((int(at_s / each.period_s) + 1) * each.cost_s for each in urgent)
         longest_s = max(
             [each.longest_s for period_s, each in classes.items() if period_s > at_s + _ALMOST], default=0.0
         )
-        if demand_s + max(command_s, longest_s) > at_s + _ALMOST:
+        if demand_s + longest_s > at_s + _ALMOST:
             return False
     return True
+
+
+def busy_periods_s(tasks: Sequence[PeriodicTask], urgent: Sequence[PeriodicTask] = ()) -> list[float]:
+    """Return a bound like `response_times_s` for a line whose polls take turns in whatever order.
+
+    A line that never idles while something is due has done all that is due by the end of a busy period, the longest of
+    which begins with everything due at once.
+
+    Returns:
+        Seconds, in the order of `tasks`; infinity for all of them when the line is full.
+    """
+    everything = [*tasks, *urgent]
+    if load_of(everything) > FULL:
+        return [math.inf] * len(tasks)
+    return [_busy_period_s(everything, 0.0)] * len(tasks)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +145,18 @@ def _offsets_s(task: PeriodicTask, classes: Mapping[float, _Class], busy_s: floa
 
 
 def _response_s(
-    task: PeriodicTask, at_s: float, classes: Mapping[float, _Class], blocking_s: float, known_s: float
+    task: PeriodicTask,
+    at_s: float,
+    classes: Mapping[float, _Class],
+    blocking_s: float,
+    known_s: float,
+    ahead: Sequence[tuple[float, float, int]],
 ) -> float:
     """Return the response of the turn that is due at this offset, or `known_s` if that is longer."""
     deadline_s = at_s + task.period_s
     less_urgent = [each.longest_s for period_s, each in classes.items() if period_s > deadline_s + _ALMOST]
     before_s = max([blocking_s, *less_urgent]) + math.floor(at_s / task.period_s + _ALMOST) * task.cost_s
-    rivals = []
+    rivals = list(ahead)
     for period_s, each in classes.items():
         cost_s = each.cost_s - task.cost_s if period_s == task.period_s else each.cost_s
         turns = math.floor(deadline_s / period_s + _ALMOST)

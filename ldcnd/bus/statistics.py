@@ -57,6 +57,8 @@ class BusStatistics:
     bytes_in: int = 0
     wire_busy_s: float = 0.0
     """Time that requests and replies spent on the wire, servo wait and turn-around not counted."""
+    stop_wait: LatencyHistogram = field(default_factory=LatencyHistogram)
+    """From queueing a probe of the stop lane to its first bit."""
     latency: dict[int, LatencyHistogram] = field(
         default_factory=lambda: {lane: LatencyHistogram() for lane in range(4)}
     )

@@ -151,3 +151,9 @@ class Job(Turn):
             )
         )
         return False
+
+
+class StopProbe(Job):
+    """A harmless question in the place of a stop, to see how long one would wait."""
+
+    __slots__ = ()

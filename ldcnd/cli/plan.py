@@ -27,19 +27,23 @@ def command(config: Path, *, as_json: bool) -> None:
 
 
 def _table(bus: BusPlan) -> str:
+    assumed = f"{_ms(bus.turnaround_s)} host, {_ms(bus.adapter_latency_s)} adapter, for each exchange"
+    stops = [
+        f"  stop         {_ms(bus.stop_wait_s)} to its first bit, {_ms(bus.stop_s)} to the drive's answer",
+        f"               {_ms(bus.stop_after_loss_s)} to the answer after a lost reply",
+    ]
     lines = [
         f"bus {bus.bus}, {bus.baud} baud (drives: {bus.node_baud:.0f}): {'holds' if bus.holds else 'CANNOT HOLD'}",
         f"  load         {bus.load:6.1%} at worst, {bus.mean_load:.1%} on average",
         f"  commands     {bus.commands_per_s:6.0f} /s before a poll misses its turn",
-        f"  stop         {_ms(bus.stop_wait_s)} to its first bit, {_ms(bus.stop_s)} to the drive's answer",
-        f"               {_ms(bus.stop_after_loss_s)} to the answer after a lost reply",
-        f"  assumed      {_ms(bus.turnaround_s)} host, {_ms(bus.adapter_latency_s)} adapter, for each exchange",
-        f"  {'axis':12} {'item':10} {'rate':>8} {'bytes':>7} {'on line':>10} {'read within':>12}",
+        *(stops if bus.family == "ldcn" else ["  stop         nothing on this line can move or stop a drive"]),
+        f"  assumed      {assumed}",
+        f"  {'axis':12} {'item':20} {'rate':>8} {'bytes':>7} {'on line':>10} {'read within':>12}",
     ]
     for poll in bus.polls:
         size = f"{poll.request_bytes}/{poll.reply_bytes}"
         lines += [
-            f"  {poll.axis:12} {item.item:10} {item.rate_hz:5g} Hz {size:>7} {_ms(poll.longest_s):>10}"
+            f"  {poll.axis:12} {item.item:20} {item.rate_hz:5g} Hz {size:>7} {_ms(poll.longest_s):>10}"
             f" {_ms(item.response_s):>12}{'' if poll.holds else '  late'}"
             for item in poll.items
         ]

@@ -21,6 +21,7 @@ from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.demand import Demand
 from ldcnd.daemon.event_log import EventLog
 from ldcnd.daemon.ledger import Ledger
+from ldcnd.daemon.planning import with_probes_that_fit
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.daemon.rig import Rig
 from ldcnd.daemon.smartstep_line import build_line, open_ledger
@@ -130,7 +131,15 @@ def _build_bus(
     network = FAMILIES[settings.family](bus, specs, settings.baud, _line(settings))
     axes = tuple(make_axis(axis, bus, network.axes[axis.name]) for axis in settings.axis)
     demands = {axis.name: Demand() for axis in settings.axis} if config.telemetry.on_demand else NO_DEMANDS
-    return BusService(bus, network, axes, port=settings.port, family=settings.family, demands=demands)
+    return BusService(
+        bus,
+        network,
+        axes,
+        port=settings.port,
+        family=settings.family,
+        demands=demands,
+        stop_probe_hz=with_probes_that_fit(settings).stop_probe_hz,
+    )
 
 
 def _cycle(settings: BusConfig) -> ServoCycle:

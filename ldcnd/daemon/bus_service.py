@@ -49,6 +49,7 @@ class BusService:
         port: str,
         family: str,
         demands: Mapping[str, Demand] = NO_DEMANDS,
+        stop_probe_hz: float = 0.0,
     ) -> None:
         self.bus = bus
         self.demands = demands
@@ -59,6 +60,7 @@ class BusService:
         self.report: BringUpReport | None = None
         self.problem = "not opened yet"
         self._pollers: dict[str, Poller[Any]] = {}
+        self._stop_probe_hz = stop_probe_hz
         self._was_up = False
         self._up = asyncio.Event()
         self._down = asyncio.Event()
@@ -71,6 +73,8 @@ class BusService:
         async with asyncio.TaskGroup() as group:
             group.create_task(self.bus.run(), name=f"bus {name}")
             group.create_task(self._supervise(), name=f"bring up {name}")
+            if self._stop_probe_hz:
+                group.create_task(self._probe_stop_lane(1.0 / self._stop_probe_hz), name=f"stop probes {name}")
             for axis in self.axes:
                 group.create_task(axis.run(), name=f"axis {axis.config.name}")
                 group.create_task(axis.traces.run(), name=f"traces {axis.config.name}")
@@ -150,6 +154,16 @@ class BusService:
                     self._poll(axis, now_s)
             if not heard:
                 pause_s = min((now_s - began_s + self.bus.fence_s) / LOOK_SHARE, LONGEST_LOOK_S)
+
+    async def _probe_stop_lane(self, period_s: float) -> None:
+        """Keep measuring how long a stop would wait."""
+        while True:
+            await asyncio.sleep(period_s)
+            await self.wait_up()
+            try:
+                await self.bus.probe_stop_wait()
+            except LdcndError as error:  # a lost reply is counted and told by those who look after the drive
+                log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
 
     async def _closed_within(self, pause_s: float) -> bool:
         try:

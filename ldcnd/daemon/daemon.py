@@ -23,6 +23,7 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Declaration, Load, Session
 from ldcnd.model.axes import LinkState
 from ldcnd.model.meta import DaemonInfo
+from ldcnd.model.plan import RigPlan
 from ldcnd.model.samples import TelemetryItem
 
 log = get_logger("daemon")
@@ -61,9 +62,9 @@ class Daemon:
         self._ending = asyncio.Event()
         self._declarations: list[Declaration] = []
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
-        self._describing = Describing(
-            rig, self._keys, publisher, self._info, lambda: self._config, plan_rig(config), self._health
-        )
+        plan = plan_rig(config)
+        self._health.stop_bounds_s = _stop_bounds_s(plan)
+        self._describing = Describing(rig, self._keys, publisher, self._info, lambda: self._config, plan, self._health)
 
     @property
     def config(self) -> RigConfig:
@@ -77,7 +78,8 @@ class Daemon:
     def reconfigure(self, config: RigConfig) -> None:
         """Take other limits, speeds and rates of axes; everything else is as before, see `plan_reload`."""
         self._config = config
-        self._describing.plan = plan_rig(config)
+        self._describing.plan = plan = plan_rig(config)
+        self._health.stop_bounds_s = _stop_bounds_s(plan)
         axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
         for bus in self.rig.buses:
             bus.reconfigure(axes)
@@ -199,3 +201,7 @@ class Daemon:
 
 def _told(bus: BusService, axis: AxisService, item: TelemetryItem, present: bool) -> None:  # noqa: FBT001 - as above
     bus.subscribed(axis, item, present=present)
+
+
+def _stop_bounds_s(plan: RigPlan) -> dict[str, float]:
+    return {bus.bus: bus.stop_wait_s for bus in plan.buses if bus.family == "ldcn"}

@@ -12,7 +12,7 @@ from ldcnd.daemon.rig import Rig
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Load
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth, StopWaitHealth
 from ldcnd.model.samples import TelemetryItem
 
 EepromWrites = Callable[[AxisService], int | None]
@@ -36,6 +36,7 @@ class HealthWatch:
 
     Attributes:
         latest: the newest report of each key.
+        stop_bounds_s: what the plan promises of stops, by line.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class HealthWatch:
         eeprom_writes: EepromWrites,
     ) -> None:
         self.latest: dict[str, Frozen] = {}
+        self.stop_bounds_s: Mapping[str, float] = {}
         self._rig = rig
         self._keys = keys
         self._publisher = publisher
@@ -126,7 +128,17 @@ class HealthWatch:
             stray_bytes=statistics.stray_bytes,
             losses=statistics.losses,
             lanes=tuple(_lane(service, lane) for lane in Lane),
+            stop_wait=self._stop_wait(service),
             axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t, period_s) for axis in service.axes),
+        )
+
+    def _stop_wait(self, service: BusService) -> StopWaitHealth:
+        waits = service.bus.statistics.stop_wait
+        return StopWaitHealth(
+            bound_s=self.stop_bounds_s.get(service.bus.settings.name),
+            probes=sum(waits.counts),
+            p99_s=waits.quantile_s(0.99),
+            longest_s=waits.longest_s,
         )
 
     def _axis(self, axis: AxisService, asked_hz: Mapping[TelemetryItem, float], t: int, period_s: float) -> AxisHealth:

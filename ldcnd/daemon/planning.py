@@ -6,30 +6,31 @@ polls. Reckoned with the longest replies and waits; see docs/explanation/timing.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from ldcnd.axis_config import AxisConfig
-from ldcnd.bus.cost import Cost, LineTiming, cost_of
-from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, largest, plan_line
-from ldcnd.bus.response_times import meets_deadlines
+from ldcnd.bus.cost import LineTiming, cost_of
+from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, in_time, largest, plan_line
+from ldcnd.bus.response_times import PeriodicTask
 from ldcnd.bus_config import BAUDS, BusConfig
 from ldcnd.config import RigConfig
+from ldcnd.daemon import smartstep_plan
 from ldcnd.daemon.axis_poller import wanted_rates_hz
 from ldcnd.drivers.ldcn.costs import price_list
+from ldcnd.drivers.ldcn.network import RESET_BAUD
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.errors import ConfigError, ValueOutOfRange
 from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigPlan
 from ldcnd.model.samples import TelemetryItem
 
-PLANNED_FAMILY = "ldcn"
 SLOWEST_HZ = 0.01
 
 
 def plan_rig(config: RigConfig) -> RigPlan:
-    """Plan every line that polls by rates; a line of another family paces itself."""
-    buses = tuple(plan_bus(bus) for bus in config.bus if bus.family == PLANNED_FAMILY)
+    """Plan every line."""
+    buses = tuple(plan_bus(bus) for bus in config.bus)
     return RigPlan(rig=config.rig, holds=all(bus.holds for bus in buses), buses=buses)
 
 
@@ -48,30 +49,69 @@ def require_plan(config: RigConfig) -> RigPlan:
 
 def plan_bus(bus: BusConfig) -> BusPlan:
     """Plan one line."""
-    prices = _prices(bus, bus.baud)
-    timing = _timing(bus, bus.baud, prices)
-    polls = _polls(bus, timing, prices)
-    plan = plan_line(polls, _urgent(bus, timing, prices))
+    bus = with_probes_that_fit(bus)
+    line = _line(bus)
+    by_deadline = bus.family == "ldcn"
+    plan = plan_line(line.polls, line.urgent, by_deadline=by_deadline)
     return BusPlan(
         bus=bus.name,
-        baud=bus.baud,
-        node_baud=timing.node_baud,
-        turnaround_s=timing.turnaround_s,
-        adapter_latency_s=timing.adapter_latency_s,
+        family=bus.family,
+        baud=round(line.timing.host_baud),
+        node_baud=line.timing.node_baud,
+        turnaround_s=line.timing.turnaround_s,
+        adapter_latency_s=line.timing.adapter_latency_s,
         load=plan.load,
         mean_load=plan.mean_load,
         commands_per_s=plan.commands_per_s,
         stop_wait_s=plan.stop_wait_s,
         stop_s=plan.stop_s,
         stop_after_loss_s=plan.stop_after_loss_s,
+        stop_probe_hz=bus.stop_probe_hz if by_deadline else 0.0,
         holds=plan.holds,
-        overload=bus.overload,
-        remedies=() if plan.holds else tuple(_remedies(bus, polls)),
-        polls=tuple(_described(bus, plan, prices)),
+        overload="skip" if bus.skips else "refuse",
+        remedies=() if plan.holds else tuple(_remedies(_without_probes(bus))),
+        polls=tuple(_described(bus, plan)),
     )
 
 
+def with_probes_that_fit(bus: BusConfig) -> BusConfig:
+    """Return the line without probes of its stop lane if nothing but them would make polls miss their turns."""
+    if bus.family != "ldcn" or not bus.stop_probe_hz or _line(bus).fits:
+        return bus
+    return _without_probes(bus) if _line(_without_probes(bus)).fits else bus
+
+
+def _without_probes(bus: BusConfig) -> BusConfig:
+    return bus.model_copy(update={"stop_probe_hz": 0.0})
+
+
 # -- what the line is asked to carry ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """What a line is asked to carry, and how fast it is."""
+
+    timing: LineTiming
+    polls: list[Poll]
+    urgent: Urgent
+    by_deadline: bool
+
+    @property
+    def fits(self) -> bool:
+        probes = [self.urgent.probe] if self.urgent.probe else []
+        return in_time([poll.task for poll in self.polls], probes, by_deadline=self.by_deadline)
+
+
+def _line(bus: BusConfig) -> _Line:
+    if bus.family == "smartstep":
+        timing = smartstep_plan.line_timing(bus)
+        return _Line(
+            timing, smartstep_plan.polls_of(bus, timing), smartstep_plan.urgent_of(bus, timing), by_deadline=False
+        )
+    prices = _prices(bus, bus.baud)
+    timing = _timing(bus, bus.baud, prices)
+    return _Line(timing, _polls(bus, timing, prices), _urgent(bus, timing, prices), by_deadline=True)
 
 
 def _prices(bus: BusConfig, baud: int) -> Mapping[str, PriceList]:
@@ -99,12 +139,10 @@ def _polls(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) 
         mean_s = bare_s + math.fsum(extra_s[item] * rates_hz[item] / rate_hz for item in rates_hz)
         items = tuple(item.value for item in rates_hz)
         # drives in analog positioning send their converter's value with every reply
-        polls.append(Poll(axis.name, items, rate_hz, _longest(price, timing), mean_s))
+        longest = price.reading(frozenset(TelemetryItem))
+        size = len(longest.request), longest.reply_bytes
+        polls.append(Poll(axis.name, items, rate_hz, cost_of(longest, timing), mean_s, *size))
     return polls
-
-
-def _longest(price: PriceList, timing: LineTiming) -> Cost:
-    return cost_of(price.reading(frozenset(TelemetryItem)), timing)
 
 
 def _urgent(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> Urgent:
@@ -116,40 +154,48 @@ def _urgent(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList])
         stop_s=max((stop.longest_s for stop in stops), default=0.0),
         recovery_s=max(len(price.flush) * byte_s + price.settle_s for price in prices.values()),
         margin_s=bus.margin_ms / 1000,
+        search_s=cost_of(_slowest(prices).probe, replace(timing, host_baud=RESET_BAUD, node_baud=RESET_BAUD)).longest_s,
+        probe=_probe(bus, timing, prices),
     )
+
+
+def _slowest(prices: Mapping[str, PriceList]) -> PriceList:
+    return next(iter(prices.values()))  # asking who somebody is costs the same whoever it is
+
+
+def _probe(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> PeriodicTask | None:
+    if not bus.stop_probe_hz:
+        return None
+    return PeriodicTask(1.0 / bus.stop_probe_hz, cost_of(_slowest(prices).probe, timing).longest_s)
 
 
 # -- what would make it fit ------------------------------------------------------------------------------------------
 
 
-def _remedies(bus: BusConfig, polls: Sequence[Poll]) -> list[str]:
+def _remedies(bus: BusConfig) -> list[str]:
     """Return changes of one setting each, any of which is enough."""
-    remedies = []
-    cap = largest(lambda hz: _fits(_capped(polls, hz)), SLOWEST_HZ, max(poll.rate_hz for poll in polls))
+    line, remedies = _line(bus), []
+    cap = largest(
+        lambda hz: replace(line, polls=_capped(line.polls, hz)).fits,
+        SLOWEST_HZ,
+        max(poll.rate_hz for poll in line.polls),
+    )
     if cap is not None:
         shown = math.floor(cap * 100) / 100 if cap < 10 else math.floor(cap * 10) / 10  # noqa: PLR2004 - digits
         remedies.append(f"no rate above {shown:g} Hz")
     for baud in BAUDS:
-        if baud > bus.baud and _reached(bus, baud):
-            prices = _prices(bus, baud)
-            if _fits(_polls(bus, _timing(bus, baud, prices), prices)):
-                remedies.append(f"baud = {baud}")
-                break
-    if bus.adapter_latency_ms:
-        prices = _prices(bus, bus.baud)
-        timing = replace(_timing(bus, bus.baud, prices), adapter_latency_s=0.0)
-        if _fits(_polls(bus, timing, prices)):
-            remedies.append("adapter_latency_ms = 0, with an adapter that passes replies on at once")
+        faster = bus.model_copy(update={"baud": baud})
+        if bus.family == "ldcn" and baud > bus.baud and _reached(bus, baud) and _line(faster).fits:
+            remedies.append(f"baud = {baud}")
+            break
+    if bus.adapter_latency_ms and _line(bus.model_copy(update={"adapter_latency_ms": 0.0})).fits:
+        remedies.append("adapter_latency_ms = 0, with an adapter that passes replies on at once")
     remedies.append('overload = "skip": polls then come as often as the line allows')
     return remedies
 
 
 def _capped(polls: Sequence[Poll], most_hz: float) -> list[Poll]:
     return [replace(poll, rate_hz=min(poll.rate_hz, most_hz)) for poll in polls]
-
-
-def _fits(polls: Sequence[Poll]) -> bool:
-    return meets_deadlines([poll.task for poll in polls])
 
 
 def _reached(bus: BusConfig, baud: int) -> bool:
@@ -165,30 +211,28 @@ def _reached(bus: BusConfig, baud: int) -> bool:
 # -- saying it -------------------------------------------------------------------------------------------------------
 
 
-def _described(bus: BusConfig, plan: LinePlan, prices: Mapping[str, PriceList]) -> list[PollPlan]:
-    described = []
+def _described(bus: BusConfig, plan: LinePlan) -> list[PollPlan]:
     axes = {axis.name: axis for axis in bus.axis}
-    for poll, response_s in zip(plan.polls, plan.responses_s, strict=True):
-        axis = axes[poll.axis]
-        longest = prices[axis.model].reading(frozenset(TelemetryItem))
-        described.append(
-            PollPlan(
-                axis=poll.axis,
-                address=axis.address,
-                request_bytes=len(longest.request),
-                reply_bytes=longest.reply_bytes,
-                rate_hz=poll.rate_hz,
-                longest_s=poll.cost.longest_s,
-                response_s=_bounded(response_s),
-                holds=response_s <= poll.task.period_s,
-                items=tuple(_items(axis, poll, response_s)),
-            )
+    return [
+        PollPlan(
+            axis=poll.axis,
+            address=axes[poll.axis].address,
+            request_bytes=poll.request_bytes,
+            reply_bytes=poll.reply_bytes,
+            rate_hz=poll.rate_hz,
+            longest_s=poll.cost.longest_s,
+            response_s=_bounded(response_s),
+            holds=response_s <= poll.task.period_s,
+            items=tuple(_items(axes[poll.axis], poll, response_s)),
         )
-    return described
+        for poll, response_s in zip(plan.polls, plan.responses_s, strict=True)
+    ]
 
 
 def _items(axis: AxisConfig, poll: Poll, response_s: float) -> list[ItemPlan]:
     """Slower items ride along with the nearest poll, so they may be due half a poll period before it."""
+    if len(poll.items) == 1:
+        return [ItemPlan(item=poll.items[0], rate_hz=poll.rate_hz, response_s=_bounded(response_s))]
     riding_s = poll.task.period_s / 2
     return [
         ItemPlan(

@@ -58,7 +58,7 @@ def build_line(
         UnitSpec(
             AxisSpec(axis.name, axis.address, axis.model, None),
             profiles[axis.name],
-            _rates_hz(axis),
+            rates_hz(axis),
             EepromRules(ledger, axis.smartstep.eeprom_budget),
         )
         for axis in settings.axis
@@ -85,15 +85,16 @@ def _profile(settings: BusConfig, axis: AxisConfig) -> SmartStepProfile:
     return profile
 
 
-def _rates_hz(axis: AxisConfig) -> Mapping[Item, float]:
+def rates_hz(axis: AxisConfig) -> Mapping[Item, float]:
+    """Return what is read of a unit and how often."""
     rates = axis.rates
-    rates_hz: dict[Item, float] = {
+    wanted: dict[Item, float] = {
         Basic.STATE: rates.state,
         Basic.VELOCITY: rates.velocity or rates.state,  # whether it moves is part of the state
         Basic.POSITION: rates.position or rates.state / 10,
     }
-    rates_hz.update(axis.smartstep.monitors.items())
-    return rates_hz
+    wanted.update(axis.smartstep.monitors.items())
+    return wanted
 
 
 def _opener(config: RigConfig, settings: BusConfig, profile: SmartStepProfile, chains: Mapping[str, Chain]) -> Opener:

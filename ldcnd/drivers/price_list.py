@@ -16,6 +16,7 @@ class PriceList:
         node_baud: the rate at which the drive answers when it is told to use the nominal one.
         reading: the exchange that reads these telemetry items, and the drive's state with them.
         commands: every other exchange that is made while the line is in use, by name, in its longest form.
+        probe: what is asked in the place of a stop, to see how long one would wait.
         stop: what brings a motor to rest; None for drives that the line cannot move.
         flush: what clears the line after a loss, `settle_s` the pause behind it.
     """
@@ -23,6 +24,7 @@ class PriceList:
     node_baud: float
     reading: Callable[[frozenset[TelemetryItem]], Exchange[Any]]
     commands: Mapping[str, Exchange[Any]]
+    probe: Exchange[Any]
     stop: Exchange[Any] | None
     flush: bytes
     settle_s: float

@@ -41,6 +41,19 @@ class ItemHealth(Frozen):
     """How often it was published in the last period."""
 
 
+class StopWaitHealth(Frozen):
+    """How long a single stop waits for the line, to its first bit: measured by questions in its place."""
+
+    bound_s: float | None = Field(ge=0)
+    """What the plan promises while no reply is lost; null where the line has no plan."""
+    probes: int = Field(ge=0)
+    """How often it was measured since the daemon started."""
+    p99_s: float = Field(ge=0)
+    """99 % waited no longer."""
+    longest_s: float = Field(ge=0)
+    """The longest one; after a lost reply it may exceed the bound."""
+
+
 class AxisHealth(Frozen):
     """How fresh an axis's samples are."""
 
@@ -93,6 +106,8 @@ class BusHealth(Frozen):
     """How often the port was lost."""
     lanes: tuple[LaneHealth, ...]
     """The most urgent first."""
+    stop_wait: StopWaitHealth
+    """What a stop would have to wait."""
     axes: tuple[AxisHealth, ...]
     """The axes on the line."""
 

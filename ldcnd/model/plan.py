@@ -44,6 +44,8 @@ class BusPlan(Frozen):
 
     bus: str
     """Its name."""
+    family: str
+    """The drive family on it."""
     baud: int
     """Nominal rate."""
     node_baud: float
@@ -64,6 +66,8 @@ class BusPlan(Frozen):
     """The same to the end of the drive's reply."""
     stop_after_loss_s: float
     """To the end of the drive's reply when the exchange before it is lost."""
+    stop_probe_hz: float
+    """So often it is measured how long a stop would wait; counted in the load."""
     holds: bool
     """No poll can come too late."""
     overload: str

@@ -18,6 +18,7 @@ from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import decode
+from ldcnd.model.health import BusHealth
 from ldcnd.model.plan import RigPlan
 from tests.support.rig import SIMULATED, running_rig
 
@@ -100,7 +101,7 @@ def test_one_fast_axis_does_not_have_to_wait_for_many_slow_ones():
     document = config(axes=31, position=1.0, velocity=1.0, adc=1.0, state=1.0).model_dump()
     document["bus"][0]["axis"][0]["rates"] = {"position": 100.0}
 
-    (bus,) = plan_rig(RigConfig.model_validate(document)).buses
+    (bus,) = plan_rig(RigConfig.model_validate(with_probes(document, 0.0))).buses
 
     assert bus.holds
     assert bus.polls[0].response_s == pytest.approx(2 * bus.polls[0].longest_s)
@@ -138,6 +139,77 @@ async def test_no_stop_of_the_running_daemon_waits_longer_than_planned():
 
         latency = bus.statistics.latency[Lane.STOP]
         assert 0.7 * planned.stop_s < latency.longest_s <= planned.stop_s
+
+
+async def test_probes_measure_the_wait_of_a_stop_on_a_busy_line_and_the_bound_holds():
+    document = config(axes=4, position=60.0, velocity=60.0, adc=5.0, state=5.0).model_dump()
+    rig_config = RigConfig.model_validate(with_probes(document, 19.0))
+    (planned,) = require_plan(rig_config).buses
+    dice = random.Random(5)
+
+    async with running_rig(rig_config) as rig:
+        bus = rig.daemon.rig.buses[0].bus
+        for _ in range(400):
+            await asyncio.sleep(dice.uniform(0.003, 0.02))
+            await bus.execute(START)
+        (answer,) = await rig.session.query("ldcn/sim/meta/health/line0")
+        waits = decode(BusHealth, answer.payload, answer.encoding).stop_wait
+
+    assert planned.stop_probe_hz == 19.0
+    assert waits.probes > 60
+    assert waits.bound_s == planned.stop_wait_s
+    assert 0.4 * planned.stop_wait_s < waits.longest_s <= planned.stop_wait_s
+    assert 0.0 < waits.p99_s <= waits.longest_s
+
+
+def test_probes_are_part_of_the_plan():
+    document = config(axes=4, position=40.0).model_dump()
+    (without,) = plan_rig(RigConfig.model_validate(with_probes(document, 0.0))).buses
+    (with_them,) = plan_rig(RigConfig.model_validate(with_probes(document, 20.0))).buses
+
+    assert with_them.load - without.load == pytest.approx(20.0 * 0.00155, rel=0.1)
+    assert with_them.polls[0].response_s > without.polls[0].response_s
+    assert with_them.commands_per_s < without.commands_per_s
+
+
+def test_probes_are_left_out_where_polls_would_miss_their_turns_for_them():
+    (bus,) = require_plan(config(axes=1, position=300.0)).buses
+
+    assert bus.holds
+    assert bus.stop_probe_hz == 0.0
+
+
+def with_probes(document, hz):
+    document["bus"][0]["stop_probe_hz"] = hz
+    return document
+
+
+def smartstep(overload: str | None = None, **rates: float) -> RigConfig:
+    """A rig of two SmartSteps on one simulated line without an adapter."""
+    wanted = {"position": 0.0, "velocity": 0.0, **rates}
+    axes = [{"name": f"s{unit}", "address": unit, "model": "smartstep", "rates": wanted} for unit in (1, 2)]
+    bus = {"name": "steps", "port": "sim:steps", "family": "smartstep", "adapter_latency_ms": 0.0, "axis": axes}
+    sim = {"name": "steps", "unit": [{"number": unit} for unit in (1, 2)]}
+    return RigConfig.model_validate({"rig": "sim", "bus": [{**bus, "overload": overload}], "sim": [sim]})
+
+
+def test_a_smartstep_line_is_planned_word_by_word():
+    (bus,) = require_plan(smartstep(velocity=1.0, state=0.5)).buses
+
+    words_s = {poll.items[0].item: poll.longest_s for poll in bus.polls if poll.axis == "s1"}
+    assert bus.holds
+    assert words_s["velocity"] == pytest.approx(28 * 10 / 9600 + 0.02 + 0.005)
+    assert words_s["state"] == pytest.approx(3 * words_s["velocity"])
+    assert bus.load == pytest.approx(2 * sum(poll.rate_hz * poll.longest_s for poll in bus.polls) / 2)
+
+
+def test_a_smartstep_line_is_let_pass_unless_it_is_told_to_refuse():
+    assert not require_plan(smartstep(velocity=10.0, state=5.0)).holds
+    with pytest.raises(ConfigError, match="no rate above") as refused:
+        require_plan(smartstep("refuse", velocity=10.0, state=5.0))
+
+    hz = float(refused.value.message.split("no rate above ")[1].split(" Hz")[0])
+    assert require_plan(smartstep("refuse", velocity=hz, state=hz, position=hz / 10)).holds
 
 
 async def test_the_load_on_average_is_what_the_wire_shows():

@@ -242,3 +242,23 @@ def test_a_poll_that_was_unscheduled_is_not_chosen():
     queue.unschedule(gone)
 
     assert [queue.take(1.0), queue.take(1.0)] == [kept, None]
+
+
+def test_a_probe_of_the_stop_lane_goes_before_everything_but_stops():
+    queue = filled(command=1)
+    always_due(queue)
+    queue.push_probe(Ticket("probe"))
+    queue.push(Ticket("stop"), Lane.STOP)
+
+    assert not queue.takes_probe()
+    assert order(queue, 3) == ["stop", "probe", "command0"]
+    assert queue.takes_probe()
+
+
+def test_a_probe_is_no_stop_and_is_drained_like_any_job():
+    queue = filled(command=1)
+    queue.push_probe(Ticket("probe"))
+
+    assert not queue.stop_waits()
+    assert [job.name for job in queue.drain()] == ["probe", "command0"]
+    assert queue.takes_probe()

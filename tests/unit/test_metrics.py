@@ -10,13 +10,14 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from ldcnd.metrics.exposition import FRESH_S, HealthCollector
 from ldcnd.model.axes import LinkState
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9)
 BUS = BusHealth(
     t=1, seq=0, bus="line0", up=True, utilisation=0.25, exchanges=1000, timeouts=3, corrupt_replies=2,
     rejected_packets=0, resent=4, resynchronisations=5, stray_bytes=6, losses=1,
+    stop_wait=StopWaitHealth(bound_s=0.004, probes=10, p99_s=0.002, longest_s=0.003),
     lanes=(
         LaneHealth(
             lane="poll", waiting=7, exchanges=900, p50_s=0.002, p99_s=0.008, longest_s=0.02,

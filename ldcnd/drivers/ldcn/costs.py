@@ -12,6 +12,7 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.identities import read_identity
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
 from ldcnd.drivers.ldcn.rates import NULLS, NULLS_SETTLE_S
 from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_divisor
@@ -49,6 +50,7 @@ def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> Pr
         node_baud=actual_baud(baud_divisor(baud, codes)),
         reading=partial(_reading, node),
         commands=MappingProxyType(common | (_servo_commands(node) if full else {})),
+        probe=read_identity(ANY_ADDRESS),
         stop=commands.stop_motor(node, StopControl.AMP_ENABLE | StopControl.SMOOTH) if full else None,
         flush=NULLS,
         settle_s=NULLS_SETTLE_S,

@@ -10,13 +10,18 @@ from typing import Any
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.drivers.smartstep import commands
 from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TraceRegister
+from ldcnd.drivers.smartstep.monitors import COUNTERS
 from ldcnd.drivers.smartstep.operating_modes import OperatingMode
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.strings import string_reference
+from ldcnd.drivers.smartstep.unit_poller import BASIC_WORDS, Item
 from ldcnd.exchange import Exchange
+from ldcnd.model.monitors import MonitorName
 from ldcnd.model.samples import TelemetryItem
 
 BAUD = 9600
+COUNTER_WORDS = 3
+"""High half, low half, high half again."""
 ANY_UNIT = 1
 """The price is the same for every unit."""
 
@@ -37,10 +42,18 @@ def price_list(profile: SmartStepProfile = SMARTSTEP) -> PriceList:
         commands=MappingProxyType(
             {name: commands.with_response_time(exchange, profile) for name, exchange in exchanges.items()}
         ),
+        probe=commands.with_response_time(commands.probe(ANY_UNIT), profile),
         stop=None,
         flush=commands.FLUSH,
         settle_s=profile.quiet_s,
     )
+
+
+def words_of(item: Item) -> int:
+    """Return how many words an item is; a counter near a carry takes more."""
+    if isinstance(item, MonitorName):
+        return COUNTER_WORDS if item in COUNTERS else 1
+    return len(BASIC_WORDS[item]) if item in BASIC_WORDS else COUNTER_WORDS
 
 
 def _reading(profile: SmartStepProfile, _items: frozenset[TelemetryItem]) -> Exchange[Any]:
