@@ -17,6 +17,7 @@ from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line
+from ldcnd.transport.transport import Opener
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig
 
 UP_WITHIN_S = 60.0
@@ -68,8 +69,17 @@ class ChainRig(RunningRig):
 
 
 @asynccontextmanager
-async def rig_on(chain: Chain, config: RigConfig, *, up: bool = True) -> AsyncIterator[ChainRig]:
-    """Run a daemon on this chain until the context ends; without `up` its line may stay down."""
+async def rig_on(
+    chain: Chain, config: RigConfig, *, up: bool = True, opener: Opener | None = None
+) -> AsyncIterator[ChainRig]:
+    """Run a daemon on this chain until the context ends; without `up` its line may stay down.
+
+    Args:
+        chain: the drives.
+        config: the rig.
+        up: its line is up when the context begins.
+        opener: opens another way to the chain.
+    """
     loop = asyncio.get_running_loop()
     broker = MemoryBroker()
 
@@ -78,7 +88,7 @@ async def rig_on(chain: Chain, config: RigConfig, *, up: bool = True) -> AsyncIt
 
     async with broker.session() as session, broker.session() as client_session:
         daemon = build_daemon(config, session, now_ns, "test")
-        daemon.rig.buses[0].bus._opener = lambda: open_simulated_line(chain)
+        daemon.rig.buses[0].bus._opener = opener or (lambda: open_simulated_line(chain))
         async with asyncio.TaskGroup() as group:
             running = group.create_task(daemon.run(), name="daemon")
             rig = ChainRig(daemon, RigClient(client_session, config.rig), client_session, broker, running)

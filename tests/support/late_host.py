@@ -14,6 +14,9 @@ class LateHost(Transport, Receiver):
     """A transport to a simulated line; half of each delay lies before the request, half behind the reply.
 
     In order: nothing overtakes what was written or received before it.
+
+    Attributes:
+        busy_s: for how long a request was under way, from the wish to send it to the note that its reply is there.
     """
 
     def __init__(self, line: SimulatedLine, least_s: float, most_s: float, seed: int) -> None:
@@ -22,6 +25,8 @@ class LateHost(Transport, Receiver):
         self._dice = random.Random(seed)
         self._loop = asyncio.get_running_loop()
         self._receiver: Receiver | None = None
+        self.busy_s = 0.0
+        self._asked_at_s = 0.0
         self._written_by_s = self._received_by_s = 0.0
         self._pending: set[asyncio.TimerHandle] = set()
 
@@ -32,6 +37,7 @@ class LateHost(Transport, Receiver):
 
     def write(self, data: bytes) -> None:
         """See `Transport`."""
+        self._asked_at_s = self._loop.time()
         self._written_by_s = at_s = max(self._written_by_s, self._loop.time() + self._dice.uniform(*self._range_s))
         self._later(at_s, lambda: self._line.write(data))
 
@@ -57,6 +63,7 @@ class LateHost(Transport, Receiver):
         """See `Receiver`."""
         self._received_by_s = at_s = max(self._received_by_s, self._loop.time() + self._dice.uniform(*self._range_s))
         if self._receiver:
+            self.busy_s += at_s - self._asked_at_s
             receiver = self._receiver
             self._later(at_s, lambda: receiver.data_received(data))
 
