@@ -32,7 +32,10 @@ def command(recording: Path, axis: str, output: Path) -> None:
     from ldcnd.recording.reading import Recording  # noqa: PLC0415
 
     file = Recording(recording)
-    plot_axis(axis_history(file, axis), output)
+    history = axis_history(file, axis)
+    plot_axis(history, output)
+    if history.not_understood:
+        click.echo(f"{history.not_understood} messages of another version were left out", err=True)
     if file.damages:
         tell_damages(recording, file.damages)
         sys.exit(EXIT_INCOMPLETE)

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from mcap.records import Channel, Message
+from pydantic import ValidationError
 
 from ldcnd.errors import UnknownAxis
 from ldcnd.model.axes import Quality
@@ -39,6 +40,7 @@ class AxisHistory:
         axis: its name.
         series: the quantities, in the order in which they were first published.
         events: what became of its commands, in order.
+        not_understood: how many messages were not what this version knows, such as those of a much older one.
         faults: from when to when a fault stood that stops the motor, UTC in ns since 1970; an end of None is not known.
     """
 
@@ -46,6 +48,7 @@ class AxisHistory:
         self.axis = axis
         self.series: list[Series] = []
         self.events: list[CommandEvent] = []
+        self.not_understood = 0
         self.faults: list[tuple[int, int | None]] = []
 
     def add(self, key: str, data: bytes) -> None:
@@ -54,7 +57,12 @@ class AxisHistory:
         if model is None:
             return
         recorded = LogMessage if model is CommandEvent else model
-        match recorded.model_validate_json(data, extra="ignore"):
+        try:
+            message = recorded.model_validate_json(data, extra="ignore")
+        except ValidationError:
+            self.not_understood += 1
+            return
+        match message:
             case LogMessage() as log:
                 self.events.append(log.event)
             case FaultSample() as sample:

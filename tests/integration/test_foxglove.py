@@ -22,7 +22,16 @@ POSITION = PositionSample(
     t=T_NS, t_error_ns=0, seq=0, quality="good", value=1.5, unit="mm", counts=1500, following_error=None
 )
 EVENT = CommandEvent(
-    t=T_NS, seq=0, axis="x", command_id="a-1", verb="halt", client="ann", status=CommandStatus.FAILED, reason="mute"
+    t=T_NS,
+    seq=0,
+    run="r",
+    number=0,
+    axis="x",
+    command_id="a-1",
+    verb="halt",
+    client="ann",
+    status=CommandStatus.FAILED,
+    reason="mute",
 )
 
 

@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.model.axes import AxisState
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
-from ldcnd.recording.axis_history import axis_history
+from ldcnd.recording.axis_history import AxisHistory, axis_history
 from ldcnd.recording.reading import Recording
 from tests.support.recordings import recorded_rig
 from tests.support.rig import SIMULATED
@@ -46,6 +46,15 @@ async def test_a_recorded_axis_is_drawn_with_its_commands_and_without_what_nobod
     assert [event.verb for event in history.events if event.status is CommandStatus.DONE] == ["power", "move_absolute"]
     assert drawn.exit_code == 0, drawn.output
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_messages_of_another_version_are_left_out_and_counted():
+    history = AxisHistory("x")
+
+    history.add("ldcn/sim/tele/x/position", b'{"t": 1, "place": 2.0}')
+    history.add("ldcn/sim/tele/x/something_new", b"{}")
+
+    assert (history.series, history.not_understood) == ([], 1)
 
 
 async def test_an_axis_that_is_not_in_the_recording_is_named_with_those_that_are(tmp_path):
