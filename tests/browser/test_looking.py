@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from ldcnd.cli.params import load_values
 from ldcnd.client.traces import fetch_trace
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.requests import (
@@ -166,3 +167,40 @@ async def test_the_pages_know_what_the_models_say(house):
     assert set(contract["TRACE_UNDER_WAY"]) < set(TracePhase)
     assert (contract["MOST_CHANNELS"], contract["MOST_SAMPLES"]) == (MOST_CHANNELS, MOST_SAMPLES)
     assert contract["COMMAND_STATUSES"] == list(CommandStatus)
+
+
+async def test_what_the_pages_compute_is_what_one_computes_by_hand(house, tmp_path):
+    seconds = [index / 100 for index in range(101)]
+    position = [0.0] * 10 + [0.5, 1.2, 1.1] + [1.01] * 88  # commanded at 0.09 s to go to 1 without a profile
+    error = [0.0] * 9 + [1.0, 0.5, -0.2, -0.1] + [-0.01] * 88
+    move = {"seconds": seconds, "position": position, "error": error, "start": 0, "target": 1, "band": 0.05}
+    values = [{"parameter": "Pn100", "name": "Speed loop gain", "stored": 80, "active": 90}]
+    async with house.desk() as desk:
+        await desk.open("rig")
+        judged = await desk.page.evaluate(
+            "(move) => import('/static/session/response.js').then(({ judge }) => judge(move))",
+            move | {"profileS": 0.02},
+        )
+        text = await desk.page.evaluate(
+            "(values) => import('/static/session/parameter_file.js').then(({ asToml }) => asToml('feed', values))",
+            values,
+        )
+        read = await desk.page.evaluate(
+            "(text) => import('/static/session/parameter_file.js').then(({ fromToml }) => [...fromToml(text)])", text
+        )
+
+    assert judged == pytest.approx(
+        {
+            "beganAtS": 0.08,
+            "overshoot": 0.2,
+            "overshootShare": 0.2,
+            "settlingS": 0.13 - 0.08 - 0.02,
+            "riseS": 0.01,
+            "peakError": 1.0,
+            "rmsError": ((1.0 + 0.25 + 0.04 + 0.01 + 88 * 0.0001) / 93) ** 0.5,
+            "finalError": -0.01,
+        }
+    )
+    dump = tmp_path / "feed.toml"
+    dump.write_text(text, encoding="utf-8")
+    assert dict(read) == load_values(dump) == {"Pn100": 80}

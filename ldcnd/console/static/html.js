@@ -1,7 +1,15 @@
 /** What pages are made of: the one place that knows where Preact comes from. */
 
 export {
-  html, render, useCallback, useEffect, useErrorBoundary, useLayoutEffect, useMemo, useRef, useState,
+  html,
+  render,
+  useCallback,
+  useEffect,
+  useErrorBoundary,
+  useLayoutEffect,
+  useMemo,
+  useRef,
+  useState,
 } from "./vendor/htm/standalone.module.js";
 
 import { useState } from "./vendor/htm/standalone.module.js";

@@ -34,7 +34,8 @@ function place() {
 
 function Navigation({ at }) {
   return html`<nav aria-label="Pages">
-    ${PAGES.map(([page, title]) => html`<a href=${`#/${page}`} aria-current=${at.page === page ? "page" : null}>${title}</a>`)}
+    ${PAGES.map(([page, title]) => html`<a
+      href=${`#/${page}`} aria-current=${at.page === page ? "page" : null}>${title}</a>`)}
   </nav>`;
 }
 
@@ -45,7 +46,8 @@ function Summary() {
   const mine = controlled();
   return html`<p class="summary" role="status">
     ${feed.live ? "" : html`<${Mark} level="bad">No data from the console process<//> `}
-    <${Mark} level=${worst}>${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : "Nothing needs attention"}<//>
+    <${Mark} level=${worst}>
+      ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : "Nothing needs attention"}<//>
     ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
   </p>`;
 }
@@ -82,7 +84,10 @@ function Console() {
     document.title = `${at.page === "axis" ? `Axis ${at.axis}` : title} – ldcnd`;
   }, [at.page, at.axis]);
 
-  return html`<a class="skip" href="#main" onClick=${(event) => { event.preventDefault(); main.current.focus(); }}>Skip to the page</a>
+  return html`<a class="skip" href="#main" onClick=${(event) => {
+    event.preventDefault();
+    main.current.focus();
+  }}>Skip to the page</a>
     <header class="top">
       <span class="brand">ldcnd</span>
       <${Navigation} at=${at} />

@@ -22,7 +22,8 @@ export function AxisPage({ at }) {
       <p class="quiet">${info.identity ?? info.model}, address ${info.address} on ${info.bus}</p>
       <p class="links"><a href="#/scope">Scope</a> <a href=${`#/trace/${axis.rig.name}/${axis.name}`}>Trace</a>
         ${axis.can("set_gains") && html` <a href=${`#/tuning/${axis.rig.name}/${axis.name}`}>Tuning</a>`}
-        ${axis.can("list_parameters") && html` <a href=${`#/parameters/${axis.rig.name}/${axis.name}`}>Parameters</a>`}</p>
+        ${axis.can("list_parameters") && html` <a
+          href=${`#/parameters/${axis.rig.name}/${axis.name}`}>Parameters</a>`}</p>
     </header>
     ${axis.rig.worth && html`<p class="notice mark" data-level="bad">${axis.rig.worth.why} What follows is what was known last.</p>`}
     <${FaultPanel} axis=${axis} />

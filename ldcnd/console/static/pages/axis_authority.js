@@ -14,10 +14,12 @@ export function AuthorityPanel({ axis }) {
   return html`<${Panel} title="Control">
     <p>Held by <${HolderWord} axis=${axis} />${mine ? "; it ends by itself when this page goes." : "."}</p>
     <p class="row">
-      ${mine
-        ? html`<${Action} act=${() => release(axis)}>Release control<//>`
-        : html`<${Action} act=${() => take(axis, force)} kind="main"
-            obstacle=${obstacle(axis, "none") ?? (others && !force ? `${axis.holder} has it: tick to take it away.` : null)}>Take control<//>`}
+      ${
+        mine
+          ? html`<${Action} act=${() => release(axis)}>Release control<//>`
+          : html`<${Action} act=${() => take(axis, force)} kind="main"
+            obstacle=${obstacle(axis, "none") ?? (others && !force ? `${axis.holder} has it: tick to take it away.` : null)}>Take control<//>`
+      }
       ${others && html`<${Tick} label=${`Take it from ${axis.holder}`} checked=${force} onChange=${setForce} />`}
     </p>
     ${axis.can("power") && html`<${Power} axis=${axis} />`}
@@ -48,10 +50,12 @@ function Endings({ axis }) {
   const toHalt = obstacle(axis, "halt");
   return html`<h3>End a motion</h3>
     <p class="row">
-      <${Action} act=${() => command(axis, "halt")} obstacle=${toHalt} reason=${reasons} title="Decelerate and hold; no latch">Halt<//>
+      <${Action} act=${() => command(axis, "halt")} obstacle=${toHalt} reason=${reasons}
+        title="Decelerate and hold; no latch">Halt<//>
       <${Action} act=${() => stopAxis(axis)} kind="warn" onDone=${(reply) => setTold(confirmation(axis, reply))}
         title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
-      <${Action} act=${() => command(axis, "quick_stop")} kind="warn" title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
+      <${Action} act=${() => command(axis, "quick_stop")} kind="warn"
+        title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
     </p>
     ${toHalt && html`<${Reason} id=${reasons} text=${`Halt: ${toHalt}`} />`}
     <p role="status">${told}</p>
@@ -59,5 +63,7 @@ function Endings({ axis }) {
 }
 
 function confirmation(axis, reply) {
-  return reply.confirmed.includes(axis.name) ? "Stopped; the drive confirmed it." : "Stop sent; the drive has NOT confirmed it.";
+  return reply.confirmed.includes(axis.name)
+    ? "Stopped; the drive confirmed it."
+    : "Stop sent; the drive has NOT confirmed it.";
 }

@@ -11,13 +11,21 @@ export function FaultPanel({ axis }) {
   const { faults } = axis;
   const first = axis.samples.fault?.first;
   return html`<div role="alert">
-    ${faults.length > 0 && html`<section class="faults" aria-label="Faults">
+    ${
+      faults.length > 0 &&
+      html`<section class="faults" aria-label="Faults">
       <h2>${faults.length === 1 ? "A fault stands" : `${faults.length} faults stand`}</h2>
-      ${first && !faults.some((each) => each.code === first.code) && html`<p>First of all came
-        <a href=${faultPage(first.code)}>${words(first.code)}</a> at ${clock(first.since)}: ${first.text}.</p>`}
+      ${
+        first &&
+        !faults.some((each) => each.code === first.code) &&
+        html`<p>First of all came
+        <a href=${faultPage(first.code)}>${words(first.code)}</a> at ${clock(first.since)}: ${first.text}.</p>`
+      }
       <ul>${faults.map((fault) => html`<${FaultItem} fault=${fault} first=${first} />`)}</ul>
-      <p class="row"><${Action} act=${() => command(axis, "reset")} obstacle=${obstacle(axis, "reset")}>Reset ${axis.name}<//></p>
-    </section>`}
+      <p class="row"><${Action} act=${() => command(axis, "reset")}
+        obstacle=${obstacle(axis, "reset")}>Reset ${axis.name}<//></p>
+    </section>`
+    }
   </div>`;
 }
 
@@ -38,13 +46,22 @@ export function WhyPanel({ axis }) {
   const { state } = axis;
   const lease = leaseOf(axis);
   const situation = JSON.stringify([
-    state?.state, state?.link, state?.stop_latched, state?.referenced, state?.enabled,
-    axis.faults.map((each) => each.code), axis.holder, lease, axis.rig.connected,
+    state?.state,
+    state?.link,
+    state?.stop_latched,
+    state?.referenced,
+    state?.enabled,
+    axis.faults.map((each) => each.code),
+    axis.holder,
+    lease,
+    axis.rig.connected,
   ]);
   useEffect(() => {
     let wanted = true;
     question(axis, "why", { lease }).then(
-      (reply) => wanted && (setWhy(reply), setRefusal(null)), (error) => wanted && setRefusal(error));
+      (reply) => wanted && (setWhy(reply), setRefusal(null)),
+      (error) => wanted && setRefusal(error),
+    );
     return () => {
       wanted = false;
     };
@@ -52,11 +69,17 @@ export function WhyPanel({ axis }) {
 
   return html`<${Panel} title="Can it move?">
     <div aria-live="polite">
-      ${why && !refusal && (why.can_move
-        ? html`<p>Yes: a motion within the limits would be accepted.</p>`
-        : html`<p>No. In the order in which it has to be cleared:</p><ol class="causes">${why.causes.map((cause) => html`<li>
+      ${
+        why &&
+        !refusal &&
+        (why.can_move
+          ? html`<p>Yes: a motion within the limits would be accepted.</p>`
+          : html`<p>No. In the order in which it has to be cleared:</p><ol class="causes">${why.causes.map(
+              (cause) => html`<li>
             <a href=${faultPage(cause.code)}>${words(cause.code)}</a> <span>${cause.text}.</span>
-            ${cause.remedy && html`<p class="quiet">To clear it: ${cause.remedy}.</p>`}</li>`)}</ol>`)}
+            ${cause.remedy && html`<p class="quiet">To clear it: ${cause.remedy}.</p>`}</li>`,
+            )}</ol>`)
+      }
       ${why?.first_fault && html`<p class="quiet">First since the last reset: ${why.first_fault}.</p>`}
     </div>
     <${RefusalText} refusal=${refusal} />

@@ -33,17 +33,21 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
   const reason = useId();
   const gains = gainsOf(axis);
   const changes = Object.fromEntries(
-    Object.entries(wanted).filter(([name, value]) => value !== null && value !== gains[name]?.value));
+    Object.entries(wanted).filter(([name, value]) => value !== null && value !== gains[name]?.value),
+  );
   const count = Object.keys(changes).length;
   const way = obstacle(axis, "set_gains") ?? (count ? null : "No new value differs from the present one.");
 
-  const rows = Object.values(gains).map(({ name, value, provenance }) => html`<tr key=${name}>
+  const rows = Object.values(gains).map(
+    ({ name, value, provenance }) => html`<tr key=${name}>
     <th scope="row">${name} <small>${GAINS[name].title}</small></th>
     <td class="number">${number(value, 0)} <small><${ProvenanceWord} provenance=${provenance} /></small></td>
-    <td><input type="number" min=${GAINS[name].min} max=${GAINS[name].max} step="1" aria-label=${`New ${name}`} value=${wanted[name] ?? ""}
+    <td><input type="number" min=${GAINS[name].min} max=${GAINS[name].max} step="1" aria-label=${`New ${name}`}
+      value=${wanted[name] ?? ""}
       onInput=${({ target }) => setWanted({ ...wanted, [name]: target.value === "" ? null : Number(target.value) })} />
       <small>${GAINS[name].min} to ${GAINS[name].max} ${GAINS[name].unit}</small></td>
-  </tr>`);
+  </tr>`,
+  );
 
   async function write() {
     await command(axis, "set_gains", changes);
@@ -51,8 +55,15 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
     describeSoon();
   }
 
-  return html`<${Table} label=${`Gains of ${axis.name}`} kind="gains" head=${["Register", "#Present", "New"]} rows=${rows} />
+  return html`<${Table} label=${`Gains of ${axis.name}`} kind="gains" head=${["Register", "#Present", "New"]}
+    rows=${rows} />
     <p class="row"><${Action} act=${write} obstacle=${way} reason=${reason} kind="main">
-      ${count ? `Write ${Object.entries(changes).map(([name, value]) => `${name} = ${value}`).join(", ")}` : "Write gains"}<//></p>
+      ${
+        count
+          ? `Write ${Object.entries(changes)
+              .map(([name, value]) => `${name} = ${value}`)
+              .join(", ")}`
+          : "Write gains"
+      }<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}`;
 }

@@ -35,12 +35,16 @@ export function HomePanel({ axis }) {
       ${field("Longest search", "s", "timeout_s")}
       ${field("Longest search", unit, "distance")}
     </div>
-    <p class="row"><${Action} act=${() => command(axis, "home", values)} obstacle=${way} reason=${toHome} kind="main">Home<//></p>
+    <p class="row"><${Action} act=${() => command(axis, "home", values)} obstacle=${way} reason=${toHome}
+      kind="main">Home<//></p>
     ${way && html`<${Reason} id=${toHome} text=${way} />`}
-    ${axis.can("set_position") && html`<h3>Or tell it where it is</h3>
+    ${
+      axis.can("set_position") &&
+      html`<h3>Or tell it where it is</h3>
       <div class="fields"><${Field} label="This is position" unit=${unit} value=${name} onChange=${setName} /></div>
       <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} obstacle=${naming}
         reason=${toSet} title="Nothing moves; afterwards the axis is referenced">Set position<//></p>
-      ${naming && html`<${Reason} id=${toSet} text=${naming} />`}`}
+      ${naming && html`<${Reason} id=${toSet} text=${naming} />`}`
+    }
   <//>`;
 }

@@ -22,9 +22,14 @@ export function LimitsPanel({ axis }) {
 }
 
 export function RegistersPanel({ axis }) {
-  const rows = axis.info.registers.filter(({ name }) => !(name in GAINS)).map(({ name, value, provenance }) => html`<tr>
-    <th scope="row">${name}</th><td class="number">${number(value, 0)}</td><td><${ProvenanceWord} provenance=${provenance} /></td></tr>`);
-  return html`<${Panel} title="Registers" note="These drives cannot be read back: this is what the daemon knows of the rest of their registers.">
+  const rows = axis.info.registers
+    .filter(({ name }) => !(name in GAINS))
+    .map(
+      ({ name, value, provenance }) => html`<tr>
+    <th scope="row">${name}</th><td class="number">${number(value, 0)}</td><td><${ProvenanceWord} provenance=${provenance} /></td></tr>`,
+    );
+  return html`<${Panel} title="Registers"
+    note="These drives cannot be read back: this is what the daemon knows of the rest of their registers.">
     <${Table} label=${`Registers of ${axis.name}`} head=${["Register", "#Raw value", "Known by"]} rows=${rows} />
   <//>`;
 }

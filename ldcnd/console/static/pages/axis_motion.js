@@ -10,14 +10,40 @@ const PAUSE_MS = 250;
 /** Registers are whole numbers; so large a share of a value is worth a word. */
 const NOTICED = 1e-4;
 const KINDS = {
-  move_absolute: { title: "to a position", field: "position", label: "Position", unit: (unit) => unit, previewed: true },
-  move_relative: { title: "by a distance", field: "distance", label: "Distance", unit: (unit) => unit, previewed: true },
-  move_velocity: { title: "at a velocity", field: "velocity", label: "Velocity", unit: (unit) => `${unit}/s`, previewed: true },
+  move_absolute: {
+    title: "to a position",
+    field: "position",
+    label: "Position",
+    unit: (unit) => unit,
+    previewed: true,
+  },
+  move_relative: {
+    title: "by a distance",
+    field: "distance",
+    label: "Distance",
+    unit: (unit) => unit,
+    previewed: true,
+  },
+  move_velocity: {
+    title: "at a velocity",
+    field: "velocity",
+    label: "Velocity",
+    unit: (unit) => `${unit}/s`,
+    previewed: true,
+  },
   set_pwm: { title: "with a raw duty", field: "duty", label: "Duty, −1 to 1", unit: () => "", previewed: false },
-  move_analog: { title: "to a sensor value", field: "target", label: "Target", unit: () => "A/D count", previewed: false },
+  move_analog: {
+    title: "to a sensor value",
+    field: "target",
+    label: "Target",
+    unit: () => "A/D count",
+    previewed: false,
+  },
 };
 const BUFFERING = [
-  ["refuse", "refuse it"], ["aborting", "halt, then move"], ["buffered", "wait for its end"],
+  ["refuse", "refuse it"],
+  ["aborting", "halt, then move"],
+  ["buffered", "wait for its end"],
 ];
 
 export function MovePanel({ axis }) {
@@ -33,18 +59,26 @@ export function MovePanel({ axis }) {
 
   return html`<${Panel} title="Move">
     <div class="fields">
-      <${Choice} label="Move" options=${kinds.map((each) => [each, KINDS[each].title])} value=${verb} onChange=${setVerb} />
+      <${Choice} label="Move" options=${kinds.map((each) => [each, KINDS[each].title])} value=${verb}
+        onChange=${setVerb} />
       <${Field} label=${label} unit=${unit(axis.info.unit)} value=${values[field]} onChange=${set(field)} />
-      ${verb === "set_pwm"
-        ? html`<${Field} label="For" unit="s" value=${values.duration_s} onChange=${set("duration_s")} />`
-        : html`${verb !== "move_velocity" && html`<${Field} label="Velocity" unit=${`${axis.info.unit}/s`} value=${values.speed}
-              onChange=${set("speed")} hint="empty: the axis default" />`}
+      ${
+        verb === "set_pwm"
+          ? html`<${Field} label="For" unit="s" value=${values.duration_s} onChange=${set("duration_s")} />`
+          : html`${
+              verb !== "move_velocity" &&
+              html`<${Field} label="Velocity" unit=${`${axis.info.unit}/s`} value=${values.speed}
+              onChange=${set("speed")} hint="empty: the axis default" />`
+            }
             <${Field} label="Acceleration" unit=${`${axis.info.unit}/s²`} value=${values.acceleration}
-              onChange=${set("acceleration")} hint="empty: the axis default" />`}
-      ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING} value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
+              onChange=${set("acceleration")} hint="empty: the axis default" />`
+      }
+      ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING}
+        value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
     </div>
     ${previewed && html`<${Preview} axis=${axis} body=${body} field=${field} onNearest=${set(field)} />`}
-    <p class="row"><${Action} act=${() => command(axis, verb, body)} obstacle=${way} reason=${reason} kind="main">Move<//></p>
+    <p class="row"><${Action} act=${() => command(axis, verb, body)} obstacle=${way} reason=${reason}
+      kind="main">Move<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
 }
@@ -71,7 +105,9 @@ function Preview({ axis, body, field, onNearest }) {
     let wanted = true;
     const timer = setTimeout(() => {
       question(axis, "plan", JSON.parse(asked)).then(
-        (reply) => wanted && setPlan(reply), (error) => wanted && setRefusal(error));
+        (reply) => wanted && setPlan(reply),
+        (error) => wanted && setRefusal(error),
+      );
     }, PAUSE_MS);
     return () => {
       wanted = false;
@@ -81,8 +117,11 @@ function Preview({ axis, body, field, onNearest }) {
 
   return html`<div class="preview" aria-live="polite">
     <h3>What it would do</h3>
-    ${plan ? html`<${Planned} axis=${axis} plan=${plan} field=${field} onNearest=${onNearest} />`
-      : html`<p class="quiet">${asked ? "Asking the daemon…" : "Type a value: the daemon says what would come of it."}</p>`}
+    ${
+      plan
+        ? html`<${Planned} axis=${axis} plan=${plan} field=${field} onNearest=${onNearest} />`
+        : html`<p class="quiet">${asked ? "Asking the daemon…" : "Type a value: the daemon says what would come of it."}</p>`
+    }
     <${RefusalText} refusal=${refusal} />
   </div>`;
 }
@@ -93,13 +132,20 @@ function Planned({ axis, plan, field, onNearest }) {
   if (plan.refusal) {
     const { nearest } = plan.refusal;
     return html`<p><span class="mark" data-level="bad">refused</span> ${plan.refusal.message}
-      ${nearest !== null && plan.refusal.code === "position_limit" && field === "position" &&
-        html` <button type="button" class="plain" onClick=${() => onNearest(nearest)}>Use ${number(nearest, decimals)}</button>`}</p>`;
+      ${
+        nearest !== null &&
+        plan.refusal.code === "position_limit" &&
+        field === "position" &&
+        html` <button type="button" class="plain"
+          onClick=${() => onNearest(nearest)}>Use ${number(nearest, decimals)}</button>`
+      }</p>`;
   }
-  const rounding = (value, error) => Math.abs(error) > NOTICED * Math.abs(value) && ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)`;
+  const rounding = (value, error) =>
+    Math.abs(error) > NOTICED * Math.abs(value) && ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)`;
   const held = (value, error, of) => `${number(value, 3)} ${of}${rounding(value, error) || ""}`;
   return html`<p>${plan.position === null ? "Goes on until it is told otherwise" : `Ends at ${number(plan.position, decimals)} ${unit}`},
     ${" "}at ${held(plan.velocity, plan.velocity_error, `${unit}/s`)}, with ${held(plan.acceleration, plan.acceleration_error, `${unit}/s²`)}${
-      plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`}.
+      plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`
+    }.
     ${" "}<span class="quiet">${plan.packets.length} packets, ${duration(plan.bus_s)} on the line at most.</span></p>`;
 }

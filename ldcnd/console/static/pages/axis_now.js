@@ -46,7 +46,8 @@ function StatusLamps({ state }) {
     <${Lamp} label="loop closed" on=${state?.enabled} />
     <${Lamp} label="referenced" on=${state?.referenced} />
     <${Lamp} label="moves" on=${state && state.moving !== "unknown" ? state.moving === "yes" : null} />
-    <${Lamp} label="answers" on=${state && state.link !== "down"} yes=${state?.link} no="down" level=${state?.link === "degraded" ? "warn" : ""} />
+    <${Lamp} label="answers" on=${state && state.link !== "down"} yes=${state?.link} no="down"
+      level=${state?.link === "degraded" ? "warn" : ""} />
     <${Lamp} label="stop latched" on=${state?.stop_latched} level="warn" />
     <${Lamp} label="error stop" on=${state && state.state === "error_stop"} level="bad" />
   </ul>`;
@@ -58,8 +59,11 @@ function Monitors({ axis }) {
   return html`<h3>Monitors</h3>
     <${Facts} of=${monitors.map(([name, sample]) => [
       sample.title,
-      sample.unit || !sample.high ? html`${number(sample.value, 0)} <span class="unit">${sample.unit}</span>`
-        : sample.high.length ? sample.high.join(", ") : "none high",
+      sample.unit || !sample.high
+        ? html`${number(sample.value, 0)} <span class="unit">${sample.unit}</span>`
+        : sample.high.length
+          ? sample.high.join(", ")
+          : "none high",
     ])} />`;
 }
 
@@ -70,8 +74,10 @@ function Signals({ axis }) {
   if (axis.info.family === "smartstep" || !names.length) return null;
   return html`<h3>Drive signals</h3>
     <ul class="lamps" aria-label="Drive signals">
-      ${names.map((name) => html`<${Lamp} label=${words(name)} on=${snapshot?.values[name] ?? null} yes="high" no="low" />`)}
+      ${names.map((name) => html`<${Lamp}
+        label=${words(name)} on=${snapshot?.values[name] ?? null} yes="high" no="low" />`)}
     </ul>
-    <p class="row"><${Action} act=${() => readSignals(axis)} obstacle=${obstacle(axis, "trace")} onDone=${setSnapshot}>Read signals<//>
+    <p class="row"><${Action} act=${() => readSignals(axis)} obstacle=${obstacle(axis, "trace")}
+      onDone=${setSnapshot}>Read signals<//>
       <small>${snapshot ? `As they were at ${clock(snapshot.at)}.` : "Takes a trace of two samples; it replaces the last trace."}</small></p>`;
 }

@@ -17,27 +17,37 @@ export function EventsPage() {
   const all = [...useRigs().values()];
   const [only, setOnly] = useState({ axis: "", status: "", text: "" });
   const [refusal, setRefusal] = useState(null);
-  const connected = all.filter((rig) => rig.connected).map((rig) => rig.name).join();
+  const connected = all
+    .filter((rig) => rig.connected)
+    .map((rig) => rig.name)
+    .join();
   useEffect(() => {
     for (const rig of all) if (rig.connected) earlier(rig).catch(setRefusal);
   }, [connected]);
 
   const set = (name) => (value) => setOnly({ ...only, [name]: value ?? "" });
-  const axes = all.flatMap((rig) => [...rig.axes.values()]).map((axis) => [`${axis.rig.name}/${axis.name}`, `${axis.rig.name} · ${axis.name}`]);
-  const found = all.flatMap((rig) => rig.events.map((event) => ({ rig, event })))
-    .filter((each) => matches(each, only)).sort((one, other) => other.event.t - one.event.t);
+  const axes = all
+    .flatMap((rig) => [...rig.axes.values()])
+    .map((axis) => [`${axis.rig.name}/${axis.name}`, `${axis.rig.name} · ${axis.name}`]);
+  const found = all
+    .flatMap((rig) => rig.events.map((event) => ({ rig, event })))
+    .filter((each) => matches(each, only))
+    .sort((one, other) => other.event.t - one.event.t);
 
   return html`<h1>Events</h1>
     <${Panel} title="Commands and how they ended">
       <div class="fields">
         <${Choice} label="Axis" options=${[["", "all"], ...axes]} value=${only.axis} onChange=${set("axis")} />
-        <${Choice} label="Status" options=${[["", "all"], ...COMMAND_STATUSES.map((each) => [each, each])]} value=${only.status} onChange=${set("status")} />
+        <${Choice} label="Status" options=${[["", "all"], ...COMMAND_STATUSES.map((each) => [each, each])]}
+          value=${only.status} onChange=${set("status")} />
         <${Field} label="Find" type="search" value=${only.text} onChange=${set("text")} />
       </div>
-      <p class="row"><${Action} act=${() => save(new Blob([csvOf(found)], { type: "text/csv" }), "events.csv")} obstacle=${found.length ? null : "There is nothing to save."}>Save CSV<//></p>
+      <p class="row"><${Action} act=${() => save(new Blob([csvOf(found)], { type: "text/csv" }), "events.csv")}
+        obstacle=${found.length ? null : "There is nothing to save."}>Save CSV<//></p>
       <${RefusalText} refusal=${refusal} />
       <p class="quiet" role="status">${found.length} events${found.length > MOST_SHOWN ? `, the latest ${MOST_SHOWN} are shown` : ""}.</p>
-      <${Table} label="Events" head=${["When", "Axis", "Command", "Status", "By", "Reason"]} rows=${found.slice(0, MOST_SHOWN).map(Row)} />
+      <${Table} label="Events" head=${["When", "Axis", "Command", "Status", "By", "Reason"]}
+        rows=${found.slice(0, MOST_SHOWN).map(Row)} />
     <//>`;
 }
 
@@ -45,14 +55,18 @@ function Row({ rig, event }) {
   return html`<tr key=${`${rig.name}/${event.axis}/${event.seq}`}>
     <td class="time">${dateAndClock(event.t)}</td>
     <td><a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a></td>
-    <td>${words(event.verb)}</td><td><${Mark} level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
+    <td>${words(event.verb)}</td><td><${Mark}
+      level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
     <td>${event.reason ?? ""}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
 }
 
 function matches({ rig, event }, { axis, status, text }) {
   if (axis && axis !== `${rig.name}/${event.axis}`) return false;
   if (status && status !== event.status) return false;
-  return [event.axis, event.verb, event.client, event.reason, event.code, event.command_id].join(" ").toLowerCase().includes(text.toLowerCase());
+  return [event.axis, event.verb, event.client, event.reason, event.code, event.command_id]
+    .join(" ")
+    .toLowerCase()
+    .includes(text.toLowerCase());
 }
 
 /** Ask for what happened before this page was there. */
@@ -65,6 +79,19 @@ async function earlier(rig) {
 function csvOf(found) {
   const cell = (value) => `"${String(value ?? "").replaceAll('"', '""')}"`;
   const rows = found.map(({ rig, event }) =>
-    [dateAndClock(event.t), rig.name, event.axis, event.verb, event.status, event.client, event.reason, event.code, event.command_id].map(cell).join());
+    [
+      dateAndClock(event.t),
+      rig.name,
+      event.axis,
+      event.verb,
+      event.status,
+      event.client,
+      event.reason,
+      event.code,
+      event.command_id,
+    ]
+      .map(cell)
+      .join(),
+  );
   return `${["when,rig,axis,command,status,client,reason,code,command_id", ...rows].join("\n")}\n`;
 }

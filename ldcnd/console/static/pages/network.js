@@ -7,12 +7,22 @@ import { Mark } from "../parts/state.js";
 import { useRigs } from "../session/rigs.js";
 import { WireLog } from "./network_wire_log.js";
 
-const COUNTERS = ["exchanges", "timeouts", "corrupt_replies", "rejected_packets", "resent", "resynchronisations", "stray_bytes", "losses"];
+const COUNTERS = [
+  "exchanges",
+  "timeouts",
+  "corrupt_replies",
+  "rejected_packets",
+  "resent",
+  "resynchronisations",
+  "stray_bytes",
+  "losses",
+];
 
 export function NetworkPage() {
   const lines = [...useRigs().values()].flatMap((rig) => [...rig.buses.values()].map((bus) => ({ rig, bus })));
   return html`<h1>Network</h1>
-    ${lines.length ? lines.map(({ rig, bus }) => html`<${Line} key=${`${rig.name}/${bus.name}`} rig=${rig} bus=${bus} />`) : html`<p>No line is known yet.</p>`}`;
+    ${lines.length ? lines.map(({ rig, bus }) => html`<${Line}
+      key=${`${rig.name}/${bus.name}`} rig=${rig} bus=${bus} />`) : html`<p>No line is known yet.</p>`}`;
 }
 
 function Line({ rig, bus }) {
@@ -23,10 +33,14 @@ function Line({ rig, bus }) {
     ${info.up ? null : html`<p class="notice mark" data-level="bad">Down: ${info.problem}</p>`}
     ${info.remarks.map((remark) => html`<p class="mark" data-level="warn">${remark}</p>`)}
     <${Facts} of=${[
-      ["port", info.port], ["rate", `${info.baud} baud`], ["state", info.up ? "up" : "down"],
+      ["port", info.port],
+      ["rate", `${info.baud} baud`],
+      ["state", info.up ? "up" : "down"],
       ["drives were", { reset: "reset: positions count from 0", adoption: "taken over as they were" }[info.started_by]],
-      ["in use", percent(bus.health?.utilisation)], ["99 % of polls within", duration(info.poll_p99_s)],
-      ["99 % of stops within", info.stop_longest_s ? duration(info.stop_p99_s) : "no stop yet"], ["longest stop", info.stop_longest_s ? duration(info.stop_longest_s) : "no stop yet"],
+      ["in use", percent(bus.health?.utilisation)],
+      ["99 % of polls within", duration(info.poll_p99_s)],
+      ["99 % of stops within", info.stop_longest_s ? duration(info.stop_p99_s) : "no stop yet"],
+      ["longest stop", info.stop_longest_s ? duration(info.stop_longest_s) : "no stop yet"],
     ]} />
     <h3>Chain</h3>
     <${Chain} rig=${rig} bus=${bus} />
@@ -40,43 +54,64 @@ function Line({ rig, bus }) {
 }
 
 function Chain({ rig, bus }) {
-  const found = bus.info.modules.length ? bus.info.modules
-    : [...rig.axes.values()].filter((axis) => axis.info?.bus === bus.name).map(({ info }) => ({ address: info.address, title: info.identity ?? "has not answered", model: info.model, axis: info.axis }));
-  const rows = found.map((module) => html`<tr>
+  const found = bus.info.modules.length
+    ? bus.info.modules
+    : [...rig.axes.values()]
+        .filter((axis) => axis.info?.bus === bus.name)
+        .map(({ info }) => ({
+          address: info.address,
+          title: info.identity ?? "has not answered",
+          model: info.model,
+          axis: info.axis,
+        }));
+  const rows = found.map(
+    (module) => html`<tr>
     <th scope="row">${module.address}</th>
     <td>${module.axis ? html`<a href=${`#/axis/${rig.name}/${module.axis}`}>${module.axis}</a>` : html`<span class="quiet">no axis</span>`}</td>
     <td>${module.title}</td>
     <td>${module.model ?? html`<${Mark} level="warn">not described: never moved<//>`}</td>
     <td class="number">${module.device_id === undefined ? "–" : `${module.device_id}, version ${module.version}`}</td>
-  </tr>`);
-  return html`<${Table} label=${`Chain of ${rig.name} on ${bus.name}`} head=${["Address", "Axis", "Identity", "Model", "#Device"]} rows=${rows} />`;
+  </tr>`,
+  );
+  return html`<${Table} label=${`Chain of ${rig.name} on ${bus.name}`}
+    head=${["Address", "Axis", "Identity", "Model", "#Device"]} rows=${rows} />`;
 }
 
 function Health({ rig, bus }) {
   const { health } = bus;
   if (!health) return html`<p class="quiet">No report yet.</p>`;
-  const lanes = health.lanes.map((lane) => html`<tr><th scope="row">${lane.lane}</th>
+  const lanes = health.lanes.map(
+    (lane) => html`<tr><th scope="row">${lane.lane}</th>
     <td class="number">${lane.waiting}</td><td class="number">${lane.exchanges}</td>
-    <td class="number">${duration(lane.p50_s)}</td><td class="number">${duration(lane.p99_s)}</td><td class="number">${duration(lane.longest_s)}</td></tr>`);
+    <td class="number">${duration(lane.p50_s)}</td><td class="number">${duration(lane.p99_s)}</td><td class="number">${duration(lane.longest_s)}</td></tr>`,
+  );
   const counters = COUNTERS.map((name) => {
     const lately = bus.lately(name);
-    return [name.replaceAll("_", " "), html`${health[name]} <span class=${lately && name !== "exchanges" ? "mark" : "quiet"} data-level="warn">+${lately}</span>`];
+    return [
+      name.replaceAll("_", " "),
+      html`${health[name]} <span class=${lately && name !== "exchanges" ? "mark" : "quiet"} data-level="warn">+${lately}</span>`,
+    ];
   });
-  return html`<${Table} label=${`Lanes of ${rig.name} on ${bus.name}`} head=${["Lane", "#Waiting", "#Replies", "#Half within", "#99 % within", "#Longest"]} rows=${lanes} />
+  return html`<${Table} label=${`Lanes of ${rig.name} on ${bus.name}`}
+    head=${["Lane", "#Waiting", "#Replies", "#Half within", "#99 % within", "#Longest"]} rows=${lanes} />
     <p class="quiet">Since the daemon started, and within the last minute:</p>
     <${Facts} of=${counters} />`;
 }
 
 function Plan({ rig, plan }) {
-  const polls = plan.polls.map((poll) => html`<tr><th scope="row">${poll.axis}</th>
+  const polls = plan.polls.map(
+    (poll) => html`<tr><th scope="row">${poll.axis}</th>
     <td class="number">${number(poll.rate_hz, 1)} Hz</td><td class="number">${poll.request_bytes} + ${poll.reply_bytes}</td>
     <td class="number">${duration(poll.longest_s)}</td><td class="number">${duration(poll.response_s)}</td>
-    <td><${Mark} level=${poll.holds ? "" : "warn"}>${poll.holds ? "holds" : "can be late"}<//></td></tr>`);
+    <td><${Mark} level=${poll.holds ? "" : "warn"}>${poll.holds ? "holds" : "can be late"}<//></td></tr>`,
+  );
   return html`<${Facts} of=${[
-      ["polls take", `${percent(plan.mean_load)} on average, ${percent(plan.load)} at most`],
-      ["room for", `${number(plan.commands_per_s, 0)} commands a second`],
-      ["stop answered within", duration(plan.stop_s)], ["after a lost reply", duration(plan.stop_after_loss_s)],
-    ]} />
-    <${Table} label=${`Polls of ${rig.name} on ${plan.bus}`} head=${["Axis", "#Rate", "#Bytes", "#Takes", "#Done within", "Verdict"]} rows=${polls} />
+    ["polls take", `${percent(plan.mean_load)} on average, ${percent(plan.load)} at most`],
+    ["room for", `${number(plan.commands_per_s, 0)} commands a second`],
+    ["stop answered within", duration(plan.stop_s)],
+    ["after a lost reply", duration(plan.stop_after_loss_s)],
+  ]} />
+    <${Table} label=${`Polls of ${rig.name} on ${plan.bus}`}
+      head=${["Axis", "#Rate", "#Bytes", "#Takes", "#Done within", "Verdict"]} rows=${polls} />
     ${plan.remedies.map((remedy) => html`<p class="mark" data-level="warn">${remedy}</p>`)}`;
 }

@@ -18,7 +18,9 @@ const PATIENCE_MS = 65_000;
 const UNIT_NUMBER = "Pn000";
 
 export function ParametersPage({ at }) {
-  const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.can("list_parameters"));
+  const axes = [...useRigs().values()]
+    .flatMap((rig) => [...rig.axes.values()])
+    .filter((axis) => axis.can("list_parameters"));
   const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis) ?? axes[0];
   if (!axis) {
     return html`<h1>Parameters</h1><p>No drive with readable parameters is known. LDCN and NMC drives have write-only
@@ -44,16 +46,20 @@ function Memories({ axis }) {
   const rows = merged(listed, values, file).filter((row) => matches(row, only));
 
   return html`
-    <${Panel} title=${`Memories of ${axis.name}`} note="RAM is in use and forgotten at power-off. EEPROM endures 10,000 writes.">
+    <${Panel} title=${`Memories of ${axis.name}`}
+      note="RAM is in use and forgotten at power-off. EEPROM endures 10,000 writes.">
       <p class="row">
-        <${Action} act=${readAll} onDone=${setValues} obstacle=${obstacle(axis, "parameters")} kind="main">${values ? "Read all again" : "Read all"}<//>
+        <${Action} act=${readAll} onDone=${setValues} obstacle=${obstacle(axis, "parameters")}
+          kind="main">${values ? "Read all again" : "Read all"}<//>
         <${Action} act=${() => save(new Blob([asToml(axis.name, values)], { type: "text/plain" }), `${axis.name}.toml`)}
           obstacle=${values ? null : "Read all first."}>Save to a file<//>
       </p>
       <${FilePicker} file=${file} onFile=${setFile} />
       <div class="fields">
-        <${Field} label="Find" type="search" value=${only.text} onChange=${(text) => setOnly({ ...only, text: text ?? "" })} />
-        <${Tick} label="Only what differs" checked=${only.differing} onChange=${(differing) => setOnly({ ...only, differing })} />
+        <${Field} label="Find" type="search" value=${only.text}
+          onChange=${(text) => setOnly({ ...only, text: text ?? "" })} />
+        <${Tick} label="Only what differs" checked=${only.differing}
+          onChange=${(differing) => setOnly({ ...only, differing })} />
       </div>
       <${RefusalText} refusal=${refusal} />
       <${Table} label="Parameters" head=${["Number", "Name", "#RAM", "#EEPROM", "#File", "#Factory", "Range", "#EEPROM writes"]}
@@ -69,7 +75,10 @@ function merged(listed, values, file) {
   const known = new Map(listed.map((info) => [info.parameter, info]));
   const read = new Map(values?.map((value) => [value.parameter, value]));
   return (values ?? listed).map(({ parameter }) => ({
-    parameter, info: known.get(parameter), value: read.get(parameter), filed: file?.values.get(parameter),
+    parameter,
+    info: known.get(parameter),
+    value: read.get(parameter),
+    filed: file?.values.get(parameter),
     name: known.get(parameter)?.name ?? read.get(parameter)?.name,
   }));
 }
@@ -94,11 +103,14 @@ function Row({ row }) {
   return html`<tr>
     <th scope="row">${parameter}</th><td>${name}${info?.power_cycle && html` <small>from the next power-on</small>`}</td>
     <td class="number">${shown(value?.active, info)}</td>
-    <td class="number">${shown(value?.stored, info)}${value && value.active !== value.stored && html` <${Mark} level="warn">differs<//>`}</td>
-    <td class="number">${shown(filed, info)}${filed !== undefined && value && filed !== value.active && html` <${Mark} level="warn">differs<//>`}</td>
+    <td class="number">${shown(value?.stored, info)}${value && value.active !== value.stored && html` <${Mark}
+      level="warn">differs<//>`}</td>
+    <td class="number">${shown(filed, info)}${filed !== undefined && value && filed !== value.active && html` <${Mark}
+      level="warn">differs<//>`}</td>
     <td class="number quiet">${shown(info?.default, info)}</td>
     <td class="quiet">${info?.lowest == null ? "–" : `${shown(info.lowest, info)} to ${shown(info.highest, info)}`}${info?.unit ? ` ${info.unit}` : ""}${
-      info?.confidence && info.confidence !== "S" ? " (not from the manual)" : ""}</td>
+      info?.confidence && info.confidence !== "S" ? " (not from the manual)" : ""
+    }</td>
     <td class="number">${value?.eeprom_writes ?? "–"}</td>
   </tr>`;
 }
@@ -122,21 +134,28 @@ function FilePicker({ file, onFile }) {
     <${RefusalText} refusal=${problem} /></div>`;
 }
 
-const MEMORIES = [["ram", "RAM: in use at once, lost at power-off"], ["eeprom", "EEPROM: for good, wears it"]];
+const MEMORIES = [
+  ["ram", "RAM: in use at once, lost at power-off"],
+  ["eeprom", "EEPROM: for good, wears it"],
+];
 
 function Change({ axis, values, listed, onWritten }) {
   const [set, setSet] = useState({ parameter: values[0].parameter, memory: "ram" });
   const info = listed.find((each) => each.parameter === set.parameter);
-  const way = obstacle(axis, "write_parameter") ?? (set.value === null || set.value === undefined ? "A value is missing." : null);
+  const way =
+    obstacle(axis, "write_parameter") ?? (set.value === null || set.value === undefined ? "A value is missing." : null);
   return html`<${Panel} title="Change one">
     <div class="fields">
       <${Choice} label="Parameter" options=${values.map((each) => [each.parameter, `${each.parameter} ${each.name}`])}
         value=${set.parameter} onChange=${(parameter) => setSet({ ...set, parameter })} />
-      <${Field} label="New value" unit=${info?.unit ?? ""} value=${set.value} min="0" max="65535" step="1" onChange=${(value) => setSet({ ...set, value })}
+      <${Field} label="New value" unit=${info?.unit ?? ""} value=${set.value} min="0" max="65535" step="1"
+        onChange=${(value) => setSet({ ...set, value })}
         hint=${info?.digits ? `as a number; it is shown by digits: ${shown(set.value, info)}` : null} />
-      <${Choice} label="Memory" options=${MEMORIES} value=${set.memory} onChange=${(memory) => setSet({ ...set, memory })} />
+      <${Choice} label="Memory" options=${MEMORIES} value=${set.memory}
+        onChange=${(memory) => setSet({ ...set, memory })} />
     </div>
-    <p class="row"><${Action} act=${() => command(axis, "write_parameter", set)} onDone=${(reply) => onWritten(reply.value)} obstacle=${way}
+    <p class="row"><${Action} act=${() => command(axis, "write_parameter", set)}
+      onDone=${(reply) => onWritten(reply.value)} obstacle=${way}
       kind="main">Write ${set.parameter}<//></p>
   <//>`;
 }
@@ -153,7 +172,9 @@ function Restore({ axis, values, file, onWritten }) {
     const failed = [];
     for (const { parameter } of changes) {
       try {
-        onWritten((await command(axis, "write_parameter", { parameter, value: file.values.get(parameter), memory })).value);
+        onWritten(
+          (await command(axis, "write_parameter", { parameter, value: file.values.get(parameter), memory })).value,
+        );
       } catch (error) {
         failed.push(`${parameter}: ${error.message}`);
       }
@@ -163,7 +184,8 @@ function Restore({ axis, values, file, onWritten }) {
   return html`<${Panel} title="Restore from the file" note=${`${UNIT_NUMBER} is left out: it holds the unit number.`}>
     <${Choice} label="Memory" options=${MEMORIES} value=${memory} onChange=${setMemory} />
     <p>${changes.map(({ parameter }) => parameter).join(", ")}</p>
-    <p class="row"><${Action} act=${restore} obstacle=${way} kind="main">Write ${changes.length === 1 ? "1 value" : `${changes.length} values`}<//></p>
+    <p class="row"><${Action} act=${restore} obstacle=${way}
+      kind="main">Write ${changes.length === 1 ? "1 value" : `${changes.length} values`}<//></p>
     <div role="status">${told.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
 }

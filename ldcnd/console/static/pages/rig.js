@@ -11,8 +11,12 @@ import { endpoints, useRigs } from "../session/rigs.js";
 const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Rate", "Control"];
 const FULL = 0.9;
 const COUNTERS = [
-  ["timeouts", "timeouts"], ["corrupt_replies", "corrupt"], ["rejected_packets", "rejected"], ["resent", "retries"],
-  ["resynchronisations", "resyncs"], ["losses", "port losses"],
+  ["timeouts", "timeouts"],
+  ["corrupt_replies", "corrupt"],
+  ["rejected_packets", "rejected"],
+  ["resent", "retries"],
+  ["resynchronisations", "resyncs"],
+  ["losses", "port losses"],
 ];
 
 export function RigPage() {
@@ -36,10 +40,13 @@ function Attention({ rigs }) {
   if (!wrong.length) return null;
   return html`<section class="attention" aria-labelledby="attention">
     <h2 id="attention">Needs attention</h2>
-    <ul>${wrong.map(({ level, text, places }) => html`<li key=${text} data-level=${level}>
+    <ul>${wrong.map(
+      ({ level, text, places }) => html`<li key=${text} data-level=${level}>
       <${Mark} level=${level}>${level === "bad" ? "wrong" : "look"}<//>
-      <span>${text}</span> <span class="places">${places.map(({ where, link }) => html`<a href=${link}>${where}</a> `)}</span>
-    </li>`)}</ul>
+      <span>${text}</span> <span class="places">${places.map(({ where, link }) => html`<a
+        href=${link}>${where}</a> `)}</span>
+    </li>`,
+    )}</ul>
   </section>`;
 }
 
@@ -98,7 +105,8 @@ function AxisRow({ axis }) {
   return html`<tr role="row" data-axis=${axis.name}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
       <small>${info.model} · ${info.address}</small></th>
-    ${cell("State", html`<${StateWord} axis=${axis} />${state?.stop_latched && html` <${Mark} level="warn">stop latched<//>`}`)}
+    ${cell("State", html`<${StateWord} axis=${axis} />${state?.stop_latched && html` <${Mark}
+      level="warn">stop latched<//>`}`)}
     ${cell("Position", html`<b>${number(position?.value, decimals)}</b> <span class="unit">${info.unit}</span>`, "number main")}
     ${cell("Velocity", html`${number(velocity?.value, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
     ${cell("Target", number(state?.command?.target, decimals), "number")}

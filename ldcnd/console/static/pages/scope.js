@@ -31,7 +31,8 @@ export function ScopePage() {
     <div class="bench">
       <${Panel} title="Channels" note=${`Up to ${MOST_CHANNELS} at once; each sample is drawn at the instant at which it was true.`}>
         <div class="fields">
-          <${Choice} label="Time across" options=${WINDOWS.map((each) => [each, `${each} s`])} value=${windowS} onChange=${(value) => setWindowS(Number(value))} />
+          <${Choice} label="Time across" options=${WINDOWS.map((each) => [each, `${each} s`])} value=${windowS}
+            onChange=${(value) => setWindowS(Number(value))} />
         </div>
         <div class="channels" tabindex="0" role="region" aria-label="Channels of all axes">
           ${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} keys=${keys} onToggle=${toggle} />`)}
@@ -50,7 +51,11 @@ function AxisChannels({ axis, keys, onToggle }) {
   return html`<fieldset><legend>${axis.rig.name} · ${axis.name}</legend>
     ${channelsOf(axis).map((channel) => {
       const on = keys.includes(channel.key);
-      return (on || !full) && html`<${Tick} key=${channel.key} label=${channel.title} checked=${on} onChange=${(ticked) => onToggle(channel.key, ticked)} />`;
+      return (
+        (on || !full) &&
+        html`<${Tick} key=${channel.key} label=${channel.title} checked=${on}
+          onChange=${(ticked) => onToggle(channel.key, ticked)} />`
+      );
     })}
   </fieldset>`;
 }

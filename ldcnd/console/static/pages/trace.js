@@ -31,7 +31,9 @@ export function TracePage({ at }) {
 export function AxisChoice({ axes, axis, page }) {
   const names = axes.map((each) => [`${each.rig.name}/${each.name}`, `${each.rig.name} · ${each.name}`]);
   return html`<div class="fields"><${Choice} label="Axis" options=${names} value=${`${axis.rig.name}/${axis.name}`}
-    onChange=${(value) => { location.hash = `#/${page}/${value}`; }} /></div>`;
+    onChange=${(value) => {
+      location.hash = `#/${page}/${value}`;
+    }} /></div>`;
 }
 
 function TraceForm({ axis }) {
@@ -41,32 +43,46 @@ function TraceForm({ axis }) {
   const reason = useId();
   const field = (name) => ({ value: set[name], onChange: (value) => setSet({ ...set, [name]: value }) });
   const under = axis.trace && TRACE_UNDER_WAY.includes(axis.trace.phase);
-  const way = obstacle(axis, "trace") ?? (chosen.length ? null : "Choose a channel.")
-    ?? (under ? "A trace is under way." : null) ?? (set.samples ? null : "How many samples?");
+  const way =
+    obstacle(axis, "trace") ??
+    (chosen.length ? null : "Choose a channel.") ??
+    (under ? "A trace is under way." : null) ??
+    (set.samples ? null : "How many samples?");
   const request = {
-    channels: chosen, samples: set.samples, timeout_s: set.timeout_s ?? FIRST.timeout_s,
+    channels: chosen,
+    samples: set.samples,
+    timeout_s: set.timeout_s ?? FIRST.timeout_s,
     interval_s: set.interval_ms ? set.interval_ms / 1e3 : "fastest",
-    ...(set.trigger && { pre_trigger: set.pre_trigger ?? 0, trigger: { channel: set.trigger, kind: set.kind, level: set.level ?? 0 } }),
+    ...(set.trigger && {
+      pre_trigger: set.pre_trigger ?? 0,
+      trigger: { channel: set.trigger, kind: set.kind, level: set.level ?? 0 },
+    }),
   };
 
   return html`<${Panel} title=${`Record ${axis.name}`} note="Recording moves nothing.">
     <fieldset class="ticks"><legend>Channels, up to ${MOST_CHANNELS}</legend>
-      ${all.map((name) => html`<${Tick} key=${name} label=${words(name)} checked=${chosen.includes(name)}
-        onChange=${(on) => setChosen(on ? [...chosen, name].slice(0, MOST_CHANNELS) : chosen.filter((each) => each !== name))} />`)}
+      ${all.map(
+        (name) => html`<${Tick} key=${name} label=${words(name)} checked=${chosen.includes(name)}
+        onChange=${(on) => setChosen(on ? [...chosen, name].slice(0, MOST_CHANNELS) : chosen.filter((each) => each !== name))} />`,
+      )}
     </fieldset>
     <div class="fields">
       <${Field} label="Samples" ...${field("samples")} min="2" max=${MOST_SAMPLES} step="1" />
       <${Field} label="Interval" unit="ms" ...${field("interval_ms")} hint="empty: as fast as can be" />
       <${Choice} label="Trigger" options=${[["", "none: at once"], ...chosen.map((name) => [name, words(name)])]} ...${field("trigger")} />
-      ${set.trigger && html`<${Choice} label="When it is" options=${TRIGGER_KINDS.map((each) => [each, each])} ...${field("kind")} />
+      ${
+        set.trigger &&
+        html`<${Choice} label="When it is" options=${TRIGGER_KINDS.map((each) => [each, each])} ...${field("kind")} />
         <${Field} label="Level" hint="not used for signals" ...${field("level")} />
         <${Field} label="Samples before" ...${field("pre_trigger")} min="0" step="1" />
-        <${Field} label="Wait at most" unit="s" ...${field("timeout_s")} />`}
+        <${Field} label="Wait at most" unit="s" ...${field("timeout_s")} />`
+      }
     </div>
     <p class="row">
       <${Action} act=${() => capture(axis, request)} obstacle=${way} reason=${reason} kind="main">Record<//>
       <${Action} act=${() => command(axis, "trace_abort")} obstacle=${under ? null : "No trace is under way."}>Abort<//>
-      <${Action} act=${async () => keep(await fetchLast(axis))} obstacle=${under ? "A trace is under way." : null}>Fetch the last one<//>
+      <${Action} act=${async () => keep(await fetchLast(axis))}
+        obstacle=${under ? "A trace is under way." : null}>Fetch the last one<//>
     </p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
     <p role="status">${axis.trace && `${words(axis.trace.phase)}: ${axis.trace.samples} samples of ${axis.trace.channels.map((each) => each.name).join(", ")}${axis.trace.problem ? `; ${axis.trace.problem}` : ""}`}</p>
@@ -78,36 +94,62 @@ function Captured() {
   const [hidden, setHidden] = useState(() => new Set());
   const shown = kept.filter((one) => !hidden.has(one.id));
   const curves = useMemo(() => curvesOf(shown), [shown.map((one) => one.id).join()]);
-  if (!kept.length) return html`<${Panel} title="Captures"><p class="quiet">Nothing was recorded on this page yet.</p><//>`;
-  const toggle = (one, on) => setHidden(new Set([...kept.map((each) => each.id)].filter((id) => (id === one.id ? !on : hidden.has(id)))));
+  if (!kept.length)
+    return html`<${Panel} title="Captures"><p class="quiet">Nothing was recorded on this page yet.</p><//>`;
+  const toggle = (one, on) =>
+    setHidden(new Set([...kept.map((each) => each.id)].filter((id) => (id === one.id ? !on : hidden.has(id)))));
   return html`<${Panel} title="Captures">
     <${ChartView} name="trace" curves=${curves} csv=${() => csvOf(shown)} height=${420} />
-    <ul class="captures">${kept.map((one) => html`<li key=${one.id}>
-      <${Tick} label=${`${one.axis.name}, ${dateAndClock(one.header.t)}`} checked=${!hidden.has(one.id)} onChange=${(on) => toggle(one, on)} />
+    <ul class="captures">${kept.map(
+      (one) => html`<li key=${one.id}>
+      <${Tick} label=${`${one.axis.name}, ${dateAndClock(one.header.t)}`} checked=${!hidden.has(one.id)}
+        onChange=${(on) => toggle(one, on)} />
       <span class="quiet">${one.seconds.length} samples in ${duration(one.seconds.at(-1) - one.seconds[0])}${
-        one.header.trigger ? `, trigger ${one.header.trigger.channel} ${one.header.trigger.kind} at 0 s` : ""}${
-        one.header.missed ? `, ${one.header.missed} missed` : ""}${one.header.problem ? `; ${one.header.problem}` : ""}</span>
+        one.header.trigger ? `, trigger ${one.header.trigger.channel} ${one.header.trigger.kind} at 0 s` : ""
+      }${
+        one.header.missed ? `, ${one.header.missed} missed` : ""
+      }${one.header.problem ? `; ${one.header.problem}` : ""}</span>
       <a href=${`${axisPath(one.axis.rig.name, one.axis.name)}/trace.csv`} download>last trace of ${one.axis.name}, as ldcnd saves it</a>
-      <button type="button" class="plain" onClick=${() => discard(one)}>Forget<span class="unseen"> the capture of ${clock(one.header.t)}</span></button>
-    </li>`)}</ul>
+      <button type="button" class="plain"
+        onClick=${() => discard(one)}>Forget<span class="unseen"> the capture of ${clock(one.header.t)}</span></button>
+    </li>`,
+    )}</ul>
   <//>`;
 }
 
 /** The newest in full, earlier ones dashed: they are told apart without colour. */
 function curvesOf(shown) {
   let count = 0;
-  return shown.flatMap((one, nth) => one.channels.map((channel) => new Curve({
-    label: `${one.axis.name} ${words(channel.name)}${nth ? ` (${clock(one.header.t)})` : ""}`,
-    unit: channel.unit, step: channel.signal, colour: look(count++).colour, dash: nth ? [[8, 4], [2, 3]][(nth - 1) % 2] : [],
-    xs: one.seconds, ys: channel.values,
-  })));
+  return shown.flatMap((one, nth) =>
+    one.channels.map(
+      (channel) =>
+        new Curve({
+          label: `${one.axis.name} ${words(channel.name)}${nth ? ` (${clock(one.header.t)})` : ""}`,
+          unit: channel.unit,
+          step: channel.signal,
+          colour: look(count++).colour,
+          dash: nth
+            ? [
+                [8, 4],
+                [2, 3],
+              ][(nth - 1) % 2]
+            : [],
+          xs: one.seconds,
+          ys: channel.values,
+        }),
+    ),
+  );
 }
 
 function csvOf(shown) {
   const rows = ["time_s,capture,channel,value,unit"];
   for (const one of shown) {
     for (const channel of one.channels) {
-      channel.values.forEach((value, row) => rows.push(`${number(one.seconds[row], 6).replace("−", "-")},${one.id},${channel.name},${value},${channel.unit}`));
+      channel.values.forEach((value, row) =>
+        rows.push(
+          `${number(one.seconds[row], 6).replace("−", "-")},${one.id},${channel.name},${value},${channel.unit}`,
+        ),
+      );
     }
   }
   return `${rows.join("\n")}\n`;

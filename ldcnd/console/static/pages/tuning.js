@@ -42,10 +42,13 @@ function TestMove({ axis }) {
   const [settleS, setSettleS] = useState(0.5);
   const [way, setWay] = useState(1);
   const reason = useId();
-  const hindered = obstacle(axis, kind === "step" ? "track" : "move_relative") ?? (distance > 0 ? null : "A distance above 0 is missing.");
+  const hindered =
+    obstacle(axis, kind === "step" ? "track" : "move_relative") ??
+    (distance > 0 ? null : "A distance above 0 is missing.");
   return html`<${Panel} title="Test move" note=${`It moves ${axis.name}, and the next one moves it back.`}>
     <div class="fields">
-      <${Choice} label="Shape" options=${Object.entries(MOVES).map(([key, { title }]) => [key, title])} value=${kind} onChange=${setKind} hint=${MOVES[kind].hint} />
+      <${Choice} label="Shape" options=${Object.entries(MOVES).map(([key, { title }]) => [key, title])} value=${kind}
+        onChange=${setKind} hint=${MOVES[kind].hint} />
       <${Field} label="Distance" unit=${axis.info.unit} value=${distance} onChange=${setDistance} min="0" />
       <${Field} label="Record after it" unit="s" value=${settleS} onChange=${setSettleS} min="0" max="60" />
     </div>
@@ -60,16 +63,22 @@ function Runs({ axis, onPutBack }) {
   const all = runs(axis);
   const [hidden, setHidden] = useState(() => new Set());
   const shown = all.filter((run) => !hidden.has(run.number));
-  const curves = useMemo(() => shown.flatMap((run, nth) => curvesOf(axis, run, nth)), [shown.map((run) => run.number).join()]);
+  const curves = useMemo(
+    () => shown.flatMap((run, nth) => curvesOf(axis, run, nth)),
+    [shown.map((run) => run.number).join()],
+  );
   if (!all.length) {
     return html`<${Panel} title="Runs"><p class="quiet">No test move yet. Take control, enable the axis, then record one: it is drawn here.</p><//>`;
   }
-  const hide = (run, on) => setHidden(new Set(all.map((each) => each.number).filter((each) => (each === run.number ? !on : hidden.has(each)))));
+  const hide = (run, on) =>
+    setHidden(new Set(all.map((each) => each.number).filter((each) => (each === run.number ? !on : hidden.has(each)))));
   const decimals = decimalsOf(axis.info);
   const { unit } = axis.info;
   const names = Object.keys(gainsOf(axis));
-  const rows = all.map((run) => html`<tr key=${run.number}>
-    <th scope="row"><${Tick} label=${`Run ${run.number}`} checked=${!hidden.has(run.number)} onChange=${(on) => hide(run, on)} /></th>
+  const rows = all.map(
+    (run) => html`<tr key=${run.number}>
+    <th scope="row"><${Tick} label=${`Run ${run.number}`} checked=${!hidden.has(run.number)}
+      onChange=${(on) => hide(run, on)} /></th>
     <td>${MOVES[run.kind].title} ${number(run.distance, decimals)}</td>
     <td class="number">${number(run.result.overshoot, decimals)} <span class="quiet">${percent(run.result.overshootShare)}</span></td>
     <td class="number">${run.result.settlingS === null ? html`<span class="mark" data-level="warn">not settled</span>` : duration(run.result.settlingS)}</td>
@@ -78,9 +87,22 @@ function Runs({ axis, onPutBack }) {
     <td class="number">${number(run.result.rmsError, decimals)}</td>
     <td class="number">${number(run.result.finalError, decimals)}</td>
     ${names.map((name) => html`<td class="number">${number(run.gains[name], 0)}</td>`)}
-    <td><button type="button" class="plain" onClick=${() => onPutBack(run.gains)}>Put back<span class="unseen"> the gains of run ${run.number}</span></button></td>
-  </tr>`);
-  const head = ["Run", "Move", "#Overshoot", "#Settling", "#Rise", "#Peak error", "#RMS error", "#Final error", ...names.map((name) => `#${name}`), "Gains"];
+    <td><button type="button" class="plain"
+      onClick=${() => onPutBack(run.gains)}>Put back<span class="unseen"> the gains of run ${run.number}</span></button></td>
+  </tr>`,
+  );
+  const head = [
+    "Run",
+    "Move",
+    "#Overshoot",
+    "#Settling",
+    "#Rise",
+    "#Peak error",
+    "#RMS error",
+    "#Final error",
+    ...names.map((name) => `#${name}`),
+    "Gains",
+  ];
   return html`<${Panel} title="Runs" note=${`Lengths in ${unit}. Settled is within ${number(all[0].band, decimals)} ${unit}, counted from the end of the profile.`}>
     <${ChartView} name=${`tuning ${axis.name}`} curves=${curves} csv=${() => csvOf(shown)} height=${440} />
     <${Table} label="Runs and their gains" kind="runs" head=${head} rows=${rows} />
@@ -94,13 +116,44 @@ function curvesOf(axis, run, nth) {
   const flipped = (values, from) => values.map((value) => way * (value - from));
   const position = run.capture.channel("position").values;
   const error = run.capture.channel("following_error").values;
-  const shown = { xs: seconds, dash: nth ? [[8, 4], [2, 3]][(nth - 1) % 2] : [] };
+  const shown = {
+    xs: seconds,
+    dash: nth
+      ? [
+          [8, 4],
+          [2, 3],
+        ][(nth - 1) % 2]
+      : [],
+  };
   const { unit } = axis.info;
   const wanted = position.map((value, index) => value + error[index]);
   return [
-    new Curve({ ...shown, label: `${run.number} position`, unit, colour: look(2 * nth).colour, ys: flipped(position, run.start) }),
-    ...(nth ? [] : [new Curve({ ...shown, label: `${run.number} commanded`, unit, colour: "--quiet", dash: [2, 3], ys: flipped(wanted, run.start) })]),
-    new Curve({ ...shown, label: `${run.number} following error`, unit: `${unit} error`, colour: look(2 * nth + 1).colour, ys: flipped(error, 0) }),
+    new Curve({
+      ...shown,
+      label: `${run.number} position`,
+      unit,
+      colour: look(2 * nth).colour,
+      ys: flipped(position, run.start),
+    }),
+    ...(nth
+      ? []
+      : [
+          new Curve({
+            ...shown,
+            label: `${run.number} commanded`,
+            unit,
+            colour: "--quiet",
+            dash: [2, 3],
+            ys: flipped(wanted, run.start),
+          }),
+        ]),
+    new Curve({
+      ...shown,
+      label: `${run.number} following error`,
+      unit: `${unit} error`,
+      colour: look(2 * nth + 1).colour,
+      ys: flipped(error, 0),
+    }),
   ];
 }
 
@@ -108,7 +161,9 @@ function csvOf(shown) {
   const rows = ["run,time_s,position,following_error"];
   for (const run of shown) {
     const [position, error] = ["position", "following_error"].map((name) => run.capture.channel(name).values);
-    run.capture.seconds.forEach((at, row) => rows.push(`${run.number},${(at - run.result.beganAtS).toFixed(6)},${position[row]},${error[row]}`));
+    run.capture.seconds.forEach((at, row) =>
+      rows.push(`${run.number},${(at - run.result.beganAtS).toFixed(6)},${position[row]},${error[row]}`),
+    );
   }
   return `${rows.join("\n")}\n`;
 }

@@ -48,7 +48,9 @@ export class Chart {
     this.curves = curves;
     const units = [...new Set(curves.map((curve) => curve.unit))];
     this.#panes.forEach((pane) => pane.plot.destroy());
-    this.#panes = (units.length ? units : [""]).map((unit, index, all) => this.#pane(unit, index === all.length - 1, all.length));
+    this.#panes = (units.length ? units : [""]).map((unit, index, all) =>
+      this.#pane(unit, index === all.length - 1, all.length),
+    );
     this.draw();
   }
 
@@ -106,26 +108,47 @@ export class Chart {
     const [line, text] = [colour("--grid"), colour("--quiet")];
     const font = `12px ${getComputedStyle(document.body).fontFamily}`;
     const axis = { stroke: text, font, grid: { stroke: line, width: 1 }, ticks: { show: false } };
-    pane.plot = new uPlot({
-      width: this.#root.clientWidth || 600,
-      height: this.#paneHeight(isLast, count),
-      legend: { show: false },
-      padding: [10, 14, isLast ? 0 : 6, 0],
-      cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false },
-      scales: { x: { time: false, auto: false }, y: { auto: false } },
-      axes: [
-        { ...axis, size: isLast ? TIME_AXIS_PX : 0, values: isLast ? undefined : () => [], label: isLast ? "seconds" : undefined,
-          labelSize: LABEL_PX, labelFont: font, labelGap: 0 },
-        { ...axis, size: AXIS_PX, label: unit || "0 or 1", labelSize: LABEL_PX, labelFont: font, labelGap: 0,
-          values: (plot, ticks) => ticks.map((each) => `${Number(each.toPrecision(7))}`.replace("-", "−")) },
-      ],
-      series: [{}, { show: false }],
-      hooks: {
-        draw: [(plot) => this.#drawPane(plot, pane)],
-        setSelect: [(plot) => this.#zoomed(plot)],
-        ready: [(plot) => plot.over.addEventListener("click", (event) => this.#picked(plot, event))],
+    pane.plot = new uPlot(
+      {
+        width: this.#root.clientWidth || 600,
+        height: this.#paneHeight(isLast, count),
+        legend: { show: false },
+        padding: [10, 14, isLast ? 0 : 6, 0],
+        cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false },
+        scales: { x: { time: false, auto: false }, y: { auto: false } },
+        axes: [
+          {
+            ...axis,
+            size: isLast ? TIME_AXIS_PX : 0,
+            values: isLast ? undefined : () => [],
+            label: isLast ? "seconds" : undefined,
+            labelSize: LABEL_PX,
+            labelFont: font,
+            labelGap: 0,
+          },
+          {
+            ...axis,
+            size: AXIS_PX,
+            label: unit || "0 or 1",
+            labelSize: LABEL_PX,
+            labelFont: font,
+            labelGap: 0,
+            values: (plot, ticks) => ticks.map((each) => `${Number(each.toPrecision(7))}`.replace("-", "−")),
+          },
+        ],
+        series: [{}, { show: false }],
+        hooks: {
+          draw: [(plot) => this.#drawPane(plot, pane)],
+          setSelect: [(plot) => this.#zoomed(plot)],
+          ready: [(plot) => plot.over.addEventListener("click", (event) => this.#picked(plot, event))],
+        },
       },
-    }, [[0, 1], [null, null]], this.#root);
+      [
+        [0, 1],
+        [null, null],
+      ],
+      this.#root,
+    );
     return pane;
   }
 
@@ -204,9 +227,11 @@ function fitted(present, curves, span) {
   const low = Math.min(...ranges.map((range) => range.low));
   const high = Math.max(...ranges.map((range) => range.high));
   const needed = high - low;
-  if (present && low >= present.min && high <= present.max && needed > FILLED * (present.max - present.min)) return present;
+  if (present && low >= present.min && high <= present.max && needed > FILLED * (present.max - present.min))
+    return present;
   const margin = needed > 0 ? MARGIN * needed : Math.max(Math.abs(high) * 0.05, 0.01);
-  if (present && needed === 0 && low >= present.min && high <= present.max && present.max - present.min <= 4 * margin) return present;
+  if (present && needed === 0 && low >= present.min && high <= present.max && present.max - present.min <= 4 * margin)
+    return present;
   return { min: low - margin, max: high + margin };
 }
 

@@ -76,10 +76,17 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
   }
 
   return html`<figure class="chart-view">
-    <div class="chart" ref=${root} role="img" aria-label=${`${name}: ${curves.map((curve) => curve.label).join(", ") || "nothing yet"}. The values stand in the table below.`}></div>
+    <div class="chart" ref=${root} role="img"
+      aria-label=${`${name}: ${curves.map((curve) => curve.label).join(", ") || "nothing yet"}. The values stand in the table below.`}></div>
     <p class="row tools">
-      ${live && html`<button type="button" aria-pressed=${live.paused ? "true" : "false"}
-        onClick=${() => { setZoom(null); live.onPause(!live.paused); }}>${live.paused ? "Resume" : "Pause"}</button>`}
+      ${
+        live &&
+        html`<button type="button" aria-pressed=${live.paused ? "true" : "false"}
+        onClick=${() => {
+          setZoom(null);
+          live.onPause(!live.paused);
+        }}>${live.paused ? "Resume" : "Pause"}</button>`
+      }
       <button type="button" onClick=${() => scale(ZOOM)}>Zoom in</button>
       <button type="button" onClick=${() => scale(1 / ZOOM)}>Zoom out</button>
       <button type="button" onClick=${() => setZoom(live && !live.paused ? null : chart.current.extent())}>Show all</button>
@@ -96,7 +103,8 @@ function Cursors({ curves, cursors, onCursors, span, fixed }) {
   const { min, max } = span();
   const { a, b } = cursors;
   const slider = (which, title) => html`<label class="slider"><span>${title}</span>
-    <input type="range" min="0" max=${STEPS} value=${cursors[which] === null ? (which === "a" ? 0 : STEPS) : ((cursors[which] - min) / (max - min)) * STEPS}
+    <input type="range" min="0" max=${STEPS}
+      value=${cursors[which] === null ? (which === "a" ? 0 : STEPS) : ((cursors[which] - min) / (max - min)) * STEPS}
       onInput=${({ target }) => onCursors({ ...cursors, [which]: min + (target.value / STEPS) * (max - min) })} />
     <output class="number">${cursors[which] === null ? "off" : `${number(cursors[which], DIGITS)} s`}</output></label>`;
   const at = (curve, x) => (x === null ? null : curve.valueAt(x));
@@ -110,10 +118,14 @@ function Cursors({ curves, cursors, onCursors, span, fixed }) {
       <td class="unit">${curve.unit || "0 or 1"}</td></tr>`;
   });
   return html`
-    ${fixed ? html`<div class="row">${slider("a", "Cursor A")}${slider("b", "Cursor B")}
+    ${
+      fixed
+        ? html`<div class="row">${slider("a", "Cursor A")}${slider("b", "Cursor B")}
         <p class="number">${a !== null && b !== null ? `B − A: ${number(b - a, DIGITS)} s${a === b ? "" : `, ${number(1 / Math.abs(b - a), 2)} Hz`}` : "Click the chart for A, with Shift for B."}</p></div>`
-      : html`<p class="quiet">Pause to place the cursors. Drag over the chart to look closer.</p>`}
-    <${Table} label="Values of the curves" head=${["Curve", "#Last", "#At A", "#At B", "#B − A", "Unit"]} rows=${rows} />`;
+        : html`<p class="quiet">Pause to place the cursors. Drag over the chart to look closer.</p>`
+    }
+    <${Table} label="Values of the curves" head=${["Curve", "#Last", "#At A", "#At B", "#B − A", "Unit"]}
+      rows=${rows} />`;
 }
 
 /** A piece of the curve's line: its colour and its dashes. */

@@ -31,7 +31,7 @@ export function Action({ act, obstacle = null, reason = null, kind = "", onDone,
   return html`<span class="action">
     <button
       type="button" class=${kind} aria-disabled=${obstacle ? "true" : null} aria-busy=${underWay ? "true" : null}
-      aria-describedby=${obstacle ? reason ?? own : null} title=${title} onClick=${press}
+      aria-describedby=${obstacle ? (reason ?? own) : null} title=${title} onClick=${press}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
     <${RefusalText} refusal=${refusal} />
@@ -46,8 +46,11 @@ export function Reason({ id, text }) {
 /** What was refused, why, and what to do. */
 export function RefusalText({ refusal }) {
   return html`<span class="refusal" role="alert">
-    ${refusal && html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${refusal.remedy}.</span>`}
-      ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`}
+    ${
+      refusal &&
+      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${refusal.remedy}.</span>`}
+      ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`
+    }
   </span>`;
 }
 

@@ -52,14 +52,25 @@ function* ofAxis(rig, axis) {
   const at = { where: `${rig.name} · ${axis.name}`, link: `#/axis/${rig.name}/${axis.name}` };
   const { state, quality, health } = axis;
   if (state?.link === "down") yield { ...at, level: "bad", text: "The drive does not answer." };
-  for (const fault of axis.faults) yield { ...at, level: fault.stops ? "bad" : "warn", text: `${words(fault.code)}: ${fault.text}` };
+  for (const fault of axis.faults)
+    yield { ...at, level: fault.stops ? "bad" : "warn", text: `${words(fault.code)}: ${fault.text}` };
   if (state?.state === "error_stop" && !axis.faults.length && state.link !== "down") {
     yield { ...at, level: "bad", text: `In error stop: ${state.last_error ?? "reset it to go on"}` };
   }
   if (state?.stop_latched) yield { ...at, level: "warn", text: "A stop is latched: nothing moves before reset." };
   if (state?.link === "degraded") yield { ...at, level: "warn", text: "The drive missed its latest polls." };
-  if (quality.level && state?.link !== "down") yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
-  if (health && state?.link === "up" && health.rate_hz < RATE_SHORT * health.rate_wanted_hz && health.rate_wanted_hz > 1) {
-    yield { ...at, level: "warn", text: `${number(health.rate_hz, 1)} samples a second instead of ${number(health.rate_wanted_hz, 1)}.` };
+  if (quality.level && state?.link !== "down")
+    yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
+  if (
+    health &&
+    state?.link === "up" &&
+    health.rate_hz < RATE_SHORT * health.rate_wanted_hz &&
+    health.rate_wanted_hz > 1
+  ) {
+    yield {
+      ...at,
+      level: "warn",
+      text: `${number(health.rate_hz, 1)} samples a second instead of ${number(health.rate_wanted_hz, 1)}.`,
+    };
   }
 }

@@ -4,8 +4,13 @@ import { html } from "../html.js";
 import { age, words } from "./format.js";
 
 const LEVELS = {
-  disabled: "off", standstill: "still", homing: "moving", discrete_motion: "moving", continuous_motion: "moving",
-  stopping: "moving", error_stop: "bad",
+  disabled: "off",
+  standstill: "still",
+  homing: "moving",
+  discrete_motion: "moving",
+  continuous_motion: "moving",
+  stopping: "moving",
+  error_stop: "bad",
 };
 const WORDS = { discrete_motion: "moving", continuous_motion: "running", error_stop: "error stop" };
 
@@ -13,7 +18,7 @@ const WORDS = { discrete_motion: "moving", continuous_motion: "running", error_s
 export function StateWord({ axis }) {
   const state = axis.state?.state;
   const level = axis.rig.worth || !state ? "unknown" : LEVELS[state];
-  return html`<span class="state" data-level=${level}>${state ? WORDS[state] ?? words(state) : "unknown"}</span>`;
+  return html`<span class="state" data-level=${level}>${state ? (WORDS[state] ?? words(state)) : "unknown"}</span>`;
 }
 
 /** How much the values are worth and how old they are. */
@@ -49,7 +54,9 @@ export function Meter({ label, share, text, level = "" }) {
 export function FaultWords({ axis }) {
   if (!axis.faults.length) return html`<span class="quiet">none</span>`;
   return axis.faults.map(
-    (fault) => html`<a class="mark" data-level=${fault.stops ? "bad" : "warn"} href=${faultPage(fault.code)}>${words(fault.code)}</a>${" "}`,
+    (fault) =>
+      html`<a class="mark" data-level=${fault.stops ? "bad" : "warn"}
+        href=${faultPage(fault.code)}>${words(fault.code)}</a>${" "}`,
   );
 }
 

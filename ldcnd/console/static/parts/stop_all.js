@@ -23,7 +23,10 @@ export function StopAll() {
       const { rigs } = await askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
       setReport({ at, lines: Object.entries(rigs).map(([rig, reply]) => outcome(rig, reply)) });
     } catch (error) {
-      setReport({ at, lines: [{ bad: true, text: `The stop did not get through: ${error.message} Use the emergency stop.` }] });
+      setReport({
+        at,
+        lines: [{ bad: true, text: `The stop did not get through: ${error.message} Use the emergency stop.` }],
+      });
     }
   }
 
@@ -42,10 +45,13 @@ export function StopAll() {
       <b>Stop all axes</b> <kbd>Esc</kbd><small>software stop, not an emergency stop</small>
     </button>
     <div class="stop-report" role="alert" data-shown=${report ? "yes" : "no"}>
-      ${report && html`<p class="quiet">Stop at ${clock(report.at)}</p>
+      ${
+        report &&
+        html`<p class="quiet">Stop at ${clock(report.at)}</p>
         ${report.text && html`<p>${report.text}</p>`}
         ${report.lines.map((line) => html`<p class="mark" data-level=${line.bad ? "bad" : ""}>${line.text}</p>`)}
-        <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`}
+        <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`
+      }
     </div>
   </div>`;
 }

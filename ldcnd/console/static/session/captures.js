@@ -62,7 +62,8 @@ export async function arm(axis, request) {
 /** Wait until a trace with a trigger counts triggers: what is to be recorded may begin. */
 export async function watchful(axis, id) {
   const header = await reached(axis, id, (phase) => phase !== "filling", ARMED_S);
-  if (header.phase !== "waiting") throw new Refusal({ message: `The trace is ${header.phase} before anything has happened.` }, 0);
+  if (header.phase !== "waiting")
+    throw new Refusal({ message: `The trace is ${header.phase} before anything has happened.` }, 0);
 }
 
 /** Take a trace and keep it. */
@@ -95,7 +96,10 @@ export async function fetchLast(axis) {
 async function finished(axis, traceId, patienceS) {
   const header = await reached(axis, traceId, (phase) => !TRACE_UNDER_WAY.includes(phase), patienceS);
   if (header.phase !== "complete") {
-    throw new Refusal({ message: `The trace is ${header.phase.replace("_", " ")}: ${header.problem ?? "no samples"}.` }, 0);
+    throw new Refusal(
+      { message: `The trace is ${header.phase.replace("_", " ")}: ${header.problem ?? "no samples"}.` },
+      0,
+    );
   }
   return fetchLast(axis);
 }
@@ -108,7 +112,10 @@ function reached(axis, traceId, wanted, patienceS) {
       if (header?.trace_id === traceId && wanted(header.phase)) end(resolve, header);
     };
     const leave = feed.listen(() => look());
-    const late = new Refusal({ message: "The trace did not get on in time.", remedy: "Abort it, and look at the line" }, 0);
+    const late = new Refusal(
+      { message: "The trace did not get on in time.", remedy: "Abort it, and look at the line" },
+      0,
+    );
     const timer = setTimeout(() => end(reject, late), patienceS * 1e3);
     function end(settle, outcome) {
       leave();

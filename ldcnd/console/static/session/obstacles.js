@@ -7,8 +7,7 @@ const MOVING = new Set(["homing", "discrete_motion", "continuous_motion", "stopp
 const heard = (axis) => axis.rig.worth && "No data from this rig: what the axis does is not known here.";
 const reachable = (axis) => axis.state?.link === "down" && "The drive does not answer: check its power and the line.";
 const unlatched = (axis) => axis.state?.stop_latched && "A stop is latched: reset first.";
-const faultless = (axis) =>
-  axis.state?.state === "error_stop" && "It is in error stop: remove the cause, then reset.";
+const faultless = (axis) => axis.state?.state === "error_stop" && "It is in error stop: remove the cause, then reset.";
 const enabled = (axis) => axis.state && !axis.state.enabled && "It is disabled: enable it first.";
 const disabled = (axis) => axis.state?.enabled && "It is enabled already.";
 const standing = (axis) => moves(axis) && "It moves: halt it and wait.";
@@ -16,7 +15,10 @@ const moving = (axis) => axis.state && !moves(axis) && axis.state.moving === "no
 const referenced = (axis) =>
   axis.state && !axis.state.referenced && "It is not referenced: home it, or tell it where it is.";
 const resettable = (axis) =>
-  axis.state && !axis.state.stop_latched && axis.state.state !== "error_stop" && !axis.faults.length &&
+  axis.state &&
+  !axis.state.stop_latched &&
+  axis.state.state !== "error_stop" &&
+  !axis.faults.length &&
   "There is nothing to reset: no stop is latched, no fault stands.";
 
 function controlled(axis) {

@@ -5,8 +5,10 @@ const LARGEST = 0xffff;
 
 /** Return a dump: what is stored, with a remark where another value is in use. */
 export function asToml(axis, values) {
-  const lines = values.map(({ parameter, stored, active, name }) =>
-    `${parameter} = ${stored}  # ${name}${stored === active ? "" : `, in use ${active}`}`);
+  const lines = values.map(
+    ({ parameter, stored, active, name }) =>
+      `${parameter} = ${stored}  # ${name}${stored === active ? "" : `, in use ${active}`}`,
+  );
   return `axis = "${axis}"\n\n[parameters]\n${lines.join("\n")}\n`;
 }
 

@@ -129,7 +129,8 @@ export class Rig {
     if (!feed.live) return { word: "no data", level: "bad", why: "The console process sends nothing." };
     if (!this.connected) return { word: "no data", level: "bad", why: this.problem ?? "The daemon is not connected." };
     const silentS = (performance.now() - this.heardAtMs) / 1e3;
-    if (silentS > SILENT_AFTER_S) return { word: "old", level: "bad", why: `Nothing was heard for ${silentS.toFixed(0)} s.` };
+    if (silentS > SILENT_AFTER_S)
+      return { word: "old", level: "bad", why: `Nothing was heard for ${silentS.toFixed(0)} s.` };
     return null;
   }
 
@@ -152,10 +153,12 @@ export class Rig {
     for (const info of told.buses) this.bus(info.bus).info = info;
     for (const info of told.axes) this.axis(info.axis).info = info;
     const place = ({ info }) => (info ? [info.bus, info.address] : ["", 0]);
-    this.axes = new Map([...this.axes].sort(([, one], [, other]) => {
-      const [[bus, address], [otherBus, otherAddress]] = [place(one), place(other)];
-      return bus.localeCompare(otherBus) || address - otherAddress;
-    }));
+    this.axes = new Map(
+      [...this.axes].sort(([, one], [, other]) => {
+        const [[bus, address], [otherBus, otherAddress]] = [place(one), place(other)];
+        return bus.localeCompare(otherBus) || address - otherAddress;
+      }),
+    );
   }
 
   take(topic, sample, sentNs) {

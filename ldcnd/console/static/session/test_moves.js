@@ -39,15 +39,17 @@ export function runs(axis) {
 export async function runTest(axis, { kind, distance, settleS }) {
   const start = axis.samples.position?.value;
   if (start === undefined) throw new Refusal({ message: "Where the axis is is not known." }, 0);
-  const limits = kind === "steep" ? { velocity: axis.info.limits.velocity, acceleration: axis.info.limits.acceleration } : {};
+  const limits =
+    kind === "steep" ? { velocity: axis.info.limits.velocity, acceleration: axis.info.limits.acceleration } : {};
   const profileS = kind === "step" ? 0 : await planned(axis, { distance, ...limits });
   const trigger = { channel: "position", kind: distance > 0 ? "rising" : "falling", level: start + BEGUN * distance };
   const { id, finished } = await armFor(axis, trigger, LEAD_S + profileS + settleS, INTERVAL_S);
   finished.catch(() => {}); // awaited below; a refused move leaves before that
   await watchful(axis, id);
-  const reply = kind === "step"
-    ? await command(axis, "track", { position: start + distance })
-    : await command(axis, "move_relative", { distance, ...limits });
+  const reply =
+    kind === "step"
+      ? await command(axis, "track", { position: start + distance })
+      : await command(axis, "move_relative", { distance, ...limits });
   const capture = await finished;
   return keep(axis, run(axis, kind, distance, reply, capture));
 }
@@ -61,11 +63,18 @@ async function planned(axis, body) {
 /** Arm a trace of so many seconds, as dense as the line allows; tracing moves nothing, so it may be asked for twice. */
 async function armFor(axis, trigger, seconds, intervalS) {
   const samples = Math.min(MOST_SAMPLES, Math.ceil(seconds / intervalS));
-  const request = { channels: CHANNELS, samples, interval_s: intervalS, trigger, pre_trigger: Math.ceil(LEAD_S / intervalS) };
+  const request = {
+    channels: CHANNELS,
+    samples,
+    interval_s: intervalS,
+    trigger,
+    pre_trigger: Math.ceil(LEAD_S / intervalS),
+  };
   try {
     return await arm(axis, request);
   } catch (error) {
-    if (error.code === "value_out_of_range" && error.nearest > intervalS) return armFor(axis, trigger, seconds, error.nearest);
+    if (error.code === "value_out_of_range" && error.nearest > intervalS)
+      return armFor(axis, trigger, seconds, error.nearest);
     throw error;
   }
 }
@@ -77,7 +86,15 @@ function run(axis, kind, distance, reply, capture) {
   const position = capture.channel("position").values;
   const start = target - distance;
   const error = capture.channel("following_error").values;
-  const result = judge({ seconds: capture.seconds, position, error, start, target, band, profileS: reply.duration_s ?? 0 });
+  const result = judge({
+    seconds: capture.seconds,
+    position,
+    error,
+    start,
+    target,
+    band,
+    profileS: reply.duration_s ?? 0,
+  });
   const gains = Object.fromEntries(axis.info.registers.map(({ name, value }) => [name, value]));
   return { number: ++counted, kind, distance, start, target, band, capture, result, gains };
 }
