@@ -5,8 +5,8 @@ import asyncio
 import msgpack
 import pytest
 
+from ldcnd.console import reading
 from ldcnd.console.feed import Feed
-from ldcnd.console.reading import SEND_TIME_S
 from ldcnd.model.axes import AxisState
 from tests.support.console_rig import page, running_console
 
@@ -73,10 +73,11 @@ async def test_a_wish_that_cannot_be_met_is_refused_before_the_socket_opens(cons
 async def test_a_page_that_takes_nothing_for_long_is_given_up_and_leaves_nothing_behind(console, monkeypatch):
     opened = []
     open_page = Feed.open_page
+    monkeypatch.setattr(reading, "SEND_TIME_S", 2.0)
     monkeypatch.setattr(Feed, "open_page", lambda feed, wish: opened.append(feed) or open_page(feed, wish))
     async with page(console.app, console.browser) as socket:
         socket.stop_reading()
-        await asyncio.sleep(SEND_TIME_S + 2)
+        await asyncio.sleep(5)
         channels = dict(opened[0]._channels)
 
     assert channels == {}
