@@ -32,7 +32,7 @@ export function FaultPanel({ axis }) {
 function FaultItem({ fault, first }) {
   return html`<li>
     <${Mark} level=${fault.stops ? "bad" : "warn"}>${fault.stops ? "motor off" : "warning"}<//>
-    <b>${words(fault.code)}</b>${first?.code === fault.code && html` <span class="quiet">came first</span>`}
+    ${" "}<b>${words(fault.code)}</b>${first?.code === fault.code && html` <span class="quiet">came first</span>`}
     <p>${fault.text}.</p>
     <p class="quiet">Since ${clock(fault.since)}, says the ${fault.source}.
       ${" "}<a href=${faultPage(fault.code)}>More about ${words(fault.code)}</a></p>

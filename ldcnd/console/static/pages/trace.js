@@ -85,7 +85,7 @@ function TraceForm({ axis }) {
         obstacle=${under ? "A trace is under way." : null}>Fetch the last one<//>
     </p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
-    <p role="status">${axis.trace && `${words(axis.trace.phase)}: ${axis.trace.samples} samples of ${axis.trace.channels.map((each) => each.name).join(", ")}${axis.trace.problem ? `; ${axis.trace.problem}` : ""}`}</p>
+    <p role="status">${axis.trace && `${words(axis.trace.phase)}: ${axis.trace.samples} samples of ${axis.trace.channels.map((each) => words(each.name)).join(", ")}${axis.trace.problem ? `; ${axis.trace.problem}` : ""}`}</p>
   <//>`;
 }
 
