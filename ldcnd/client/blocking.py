@@ -111,7 +111,7 @@ class Rig(Facade[RigClient]):
     axes = _waiting(RigClient.axes)
     buses = _waiting(RigClient.buses)
     last = _waiting(RigClient.last)
-    last_values = _waiting(RigClient.last_values)
+    last_published = _waiting(RigClient.last_values)
     descriptions = _waiting(RigClient.descriptions)
     monitors = _waiting(RigClient.monitors)
     state = _waiting(RigClient.state)

@@ -1,4 +1,4 @@
-"""What the plan predicts and what 31 axes then do, through a host that takes exactly as long as the plan reckons with."""
+"""What the plan predicts and what 31 axes do, through a host that takes exactly as long as the plan reckons with."""
 
 import asyncio
 from dataclasses import dataclass
