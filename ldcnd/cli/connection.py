@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,10 +17,12 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.frozen import Frozen
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-TARGET_OPTIONS = frozenset({"--connect", "--listen", "--config", "--rig", "--json"})
-"""What `with_target` gives to a command."""
 ResultT = TypeVar("ResultT")
 CommandT = TypeVar("CommandT", bound=Callable[..., object])
+
+
+class TargetOption(click.Option):
+    """An option that `with_target` gives to a command; the reference explains them once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +77,13 @@ class Target:
 
 def _target_options(command: CommandT) -> CommandT:
     """Give a command the options that make a `Target`."""
-    for option in (
-        click.option("--json", "as_json", is_flag=True, help="Print JSON lines."),
-        click.option("--rig", help="Which rig, when several can be reached."),
-        click.option("--config", type=click.Path(path_type=Path), help="Zenoh configuration file to start from."),
-        click.option("--listen", "-l", multiple=True, help="Zenoh endpoint to listen on; may be repeated."),
-        click.option(
+    option = partial(click.option, cls=TargetOption)
+    for given in (
+        option("--json", "as_json", is_flag=True, help="Print JSON lines."),
+        option("--rig", help="Which rig, when several can be reached."),
+        option("--config", type=click.Path(path_type=Path), help="Zenoh configuration file to start from."),
+        option("--listen", "-l", multiple=True, help="Zenoh endpoint to listen on; may be repeated."),
+        option(
             "--connect",
             "-e",
             multiple=True,
@@ -88,7 +91,7 @@ def _target_options(command: CommandT) -> CommandT:
             help=f"Zenoh endpoint of the daemon [$LDCND_CONNECT, or {DEFAULT_ENDPOINT}].",
         ),
     ):
-        command = option(command)
+        command = given(command)
     return command
 
 

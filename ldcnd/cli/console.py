@@ -26,7 +26,13 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--key", type=FILE, help="PEM file with its key.")
 @click.option("--token-file", type=FILE, help="File with the token that lets browsers in, instead of one-time links.")
 @click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
-@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="warning")
+@click.option(
+    "--log-level",
+    type=click.Choice(["debug", "info", "warning", "error"]),
+    default="warning",
+    show_default=True,
+    help="Log nothing below this.",
+)
 def command(
     connect: tuple[str, ...],
     config: Path | None,

@@ -6,7 +6,7 @@ from importlib.metadata import version
 
 import click
 
-from ldcnd.cli.connection import TARGET_OPTIONS
+from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import COMMANDS, cli
 
 EXIT_STATUS = (
@@ -115,7 +115,7 @@ def _walk(command: click.Command, path: tuple[str, ...]) -> Iterator[Entry]:
         " ".join(command.collect_usage_pieces(context)),
         tuple(" ".join(part.split()) for part in (command.help or "").split("\n\n")),
         _options(command, of_target=False),
-        _asks_a_daemon(command),
+        any(isinstance(parameter, TargetOption) for parameter in command.params),
         isinstance(command, click.Group),
     )
     if isinstance(command, click.Group):
@@ -127,18 +127,12 @@ def _walk(command: click.Command, path: tuple[str, ...]) -> Iterator[Entry]:
 def _options(command: click.Command, *, of_target: bool) -> tuple[tuple[str, str], ...]:
     """Return the options as `--help` writes them: those for finding the daemon, or all others."""
     context = click.Context(command)
-    shared = TARGET_OPTIONS if _asks_a_daemon(command) else frozenset()
     records = (
         parameter.get_help_record(context)
         for parameter in command.params
-        if isinstance(parameter, click.Option) and (parameter.opts[0] in shared) is of_target
+        if isinstance(parameter, click.Option) and isinstance(parameter, TargetOption) is of_target
     )
     return tuple((written, " ".join(meaning.split())) for written, meaning in filter(None, records))
-
-
-def _asks_a_daemon(command: click.Command) -> bool:
-    """Tell a command that takes all the options for finding a daemon from one that has a few of that name."""
-    return {option for parameter in command.params for option in parameter.opts} >= TARGET_OPTIONS
 
 
 def _table(rows: tuple[tuple[str, str], ...]) -> str:

@@ -31,6 +31,13 @@ NOT_RUN = {
         "test_the_example_follows_a_moving_axis_to_its_target"
     ),
     (FIRST_RIG, "python3 -m venv ldcnd-env"): "fetches packages",
+    ("docs/how-to/console.md", "pip install 'ldcnd[console]'"): (
+        "fetches packages; tests/integration/test_console_server.py runs the console"
+    ),
+    ("docs/how-to/console.md", "ssh -L 8470:127.0.0.1:8470 bench.example ldcnd console"): "needs another machine",
+    ("docs/how-to/console.md", "openssl rand -hex 32 > token; chmod 600 token"): (
+        "test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls"
+    ),
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",
     ("docs/how-to/secure-a-rig.md", "ldcnd axis move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (

@@ -58,7 +58,7 @@ def blocks_of(page: Path) -> list[Block]:
 def command_lines(text: str) -> list[list[str]]:
     """Return the words of every `ldcnd` in some shell text."""
     lines: list[list[str]] = []
-    for line in text.splitlines():
+    for line in text.replace("\\\n", " ").splitlines():
         lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
         lexer.whitespace_split = True
         words: list[str] = []

@@ -49,7 +49,7 @@ def test_a_command_with_options_of_its_own_by_these_names_asks_no_daemon():
     asking = {entry.path for name in COMMANDS for entry in entries(name) if entry.asks_a_daemon}
 
     assert "ldcnd axis move" in asking
-    assert not asking & {"ldcnd run", "ldcnd check-config", "ldcnd doctor smartstep", "ldcnd sim"}
+    assert not asking & {"ldcnd run", "ldcnd check-config", "ldcnd console", "ldcnd doctor smartstep", "ldcnd sim"}
 
 
 @pytest.mark.skipif(not shutil.which("groff"), reason="no groff")
