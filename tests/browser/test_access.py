@@ -82,3 +82,15 @@ async def test_the_keyboard_reaches_the_page_and_an_axis(house):
         await desk.button("Move").focus()
         reason = await desk.button("Move").get_attribute("aria-describedby")
         await expect(desk.page.locator(f"#{reason}")).to_have_text("Take control first.")
+
+
+async def test_whoever_is_in_can_let_another_browser_in(house):
+    async with house.desk() as desk:
+        await desk.open("rig")
+        await desk.button("Let another browser in").click()
+        link = await desk.page.locator("footer code").inner_text()
+        other = await house.browser.new_context(reduced_motion="reduce")
+        page = await other.new_page()
+        await page.goto(link)
+        await expect(page.get_by_role("heading", name="sim", exact=True)).to_be_visible()
+        await other.close()

@@ -1,10 +1,11 @@
 /** The rig page: what is wrong first, then every axis of every line of every rig. */
 
-import { html } from "../html.js";
-import { Facts } from "../parts/controls.js";
+import { html, useState } from "../html.js";
+import { Action, Facts } from "../parts/controls.js";
 import { dateAndClock, decimalsOf, duration, number, percent } from "../parts/format.js";
 import { problems } from "../parts/problems.js";
 import { FaultWords, Mark, Meter, QualityWord, StateWord } from "../parts/state.js";
+import { ask } from "../session/api.js";
 import { controls } from "../session/control.js";
 import { endpoints, useRigs } from "../session/rigs.js";
 
@@ -24,7 +25,17 @@ export function RigPage() {
   return html`
     <h1 class="unseen">Rig</h1>
     <${Attention} rigs=${all} />
-    ${all.length ? all.map((rig) => html`<${RigSection} key=${rig.name} rig=${rig} />`) : html`<${NoRig} />`}`;
+    ${all.length ? all.map((rig) => html`<${RigSection} key=${rig.name} rig=${rig} />`) : html`<${NoRig} />`}
+    <${Invitation} />`;
+}
+
+/** A link that lets one more browser in. */
+function Invitation() {
+  const [link, setLink] = useState(null);
+  return html`<footer class="row">
+    <${Action} act=${() => ask("/api/link")} onDone=${(reply) => setLink(reply.link)}>Let another browser in<//>
+    ${link && html`<p role="status"><code>${link}</code> <small>opens the console once, within ten minutes</small></p>`}
+  </footer>`;
 }
 
 function NoRig() {

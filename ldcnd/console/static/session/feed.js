@@ -5,6 +5,8 @@ import { decode } from "../vendor/msgpack/decode.mjs";
 const RATE_HZ = 10;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 4_000;
+/** A frame comes at least once a second: so much silence means that the console process, or the way to it, is gone. */
+const SILENCE_MS = 3_500;
 /** Clocks drift: the fastest frame counts so much less with every frame after it. */
 const FORGOTTEN_MS = 0.01;
 
@@ -20,6 +22,7 @@ export class Feed {
   #listeners = new Set();
   #streams = [];
   #socket = null;
+  #silence = 0;
   #pauseMs = FIRST_PAUSE_MS;
 
   /** Call `listener(rig, topic, sample, sentNs)` for every entry; returns what ends that. */
@@ -63,6 +66,8 @@ export class Feed {
 
   #take([sentNs, dropped, entries]) {
     this.live = true;
+    clearTimeout(this.#silence);
+    this.#silence = setTimeout(() => this.#giveUp(), SILENCE_MS);
     this.#pauseMs = FIRST_PAUSE_MS;
     this.dropped = dropped;
     this.offsetMs = Math.max(this.offsetMs - FORGOTTEN_MS, sentNs / 1e6 - performance.now());
@@ -71,8 +76,16 @@ export class Feed {
     }
   }
 
+  #giveUp() {
+    const silent = this.#socket;
+    this.#socket = null; // what it still says counts no more
+    silent.close();
+    this.#lost();
+  }
+
   #lost() {
     this.live = false;
+    clearTimeout(this.#silence);
     this.offsetMs = -Infinity;
     for (const listener of this.#listeners) listener(null, "lost", null, 0);
     setTimeout(() => this.open(), this.#pauseMs);
