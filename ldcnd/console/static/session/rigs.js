@@ -114,7 +114,6 @@ export class Rig {
   daemon = null;
   plan = null;
   health = null;
-  leaseRequired = null;
   axes = new Map();
   buses = new Map();
   events = [];
@@ -219,8 +218,22 @@ export function useRigs() {
   return rigs;
 }
 
+/** Return `act` such that it does nothing while it is still under way: questions must not pile up behind a slow answer. */
+function unlessUnderWay(act) {
+  let underWay = false;
+  return async () => {
+    if (underWay) return;
+    underWay = true;
+    try {
+      await act();
+    } finally {
+      underWay = false;
+    }
+  };
+}
+
 /** Read all descriptions anew; values come by the feed. */
-export async function describe() {
+export const describe = unlessUnderWay(async () => {
   try {
     const { rigs: told, endpoints: looked } = await read("/api/rigs");
     endpoints = looked;
@@ -230,7 +243,7 @@ export async function describe() {
     failure = error;
   }
   changed();
-}
+});
 
 /** Read them again as soon as a change can be seen: the console process asks a daemon once a second at most. */
 export function describeSoon() {
@@ -254,19 +267,19 @@ export function watch() {
 }
 
 /** Ask every rig who controls what. */
-export async function askHolders() {
+export const askHolders = unlessUnderWay(async () => {
   if (document.hidden) return;
-  for (const rig of rigs.values()) {
-    if (!rig.connected) continue;
-    try {
-      const { required, holders } = await ask(`${rigPath(rig.name)}/rig/holders`);
-      rig.leaseRequired = required;
-      for (const { axis, client } of holders) rig.axis(axis).holder = client;
-    } catch {
-      for (const axis of rig.axes.values()) axis.holder = null; // the page says already that nothing comes in
-    }
-  }
+  await Promise.all([...rigs.values()].filter((rig) => rig.connected).map(holdersOf));
   changed();
+});
+
+async function holdersOf(rig) {
+  try {
+    const { holders } = await ask(`${rigPath(rig.name)}/rig/holders`);
+    for (const { axis, client } of holders) rig.axis(axis).holder = client;
+  } catch {
+    for (const axis of rig.axes.values()) axis.holder = null; // the page says already that nothing comes in
+  }
 }
 
 function rigNamed(name) {
