@@ -3,7 +3,7 @@
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from ldcnd.messaging.keys import ALL_DAEMONS, Keys, rig_of
+from ldcnd.messaging.keys import ALL_RUNS, Keys, rig_of
 from ldcnd.messaging.session import Session
 
 OnDaemon = Callable[[str, str, bool], None]
@@ -18,7 +18,7 @@ async def daemons(session: Session, told: OnDaemon) -> AsyncIterator[None]:
         rig = rig_of(key)
         told(rig, Keys(rig).parse_alive(key).instance, alive)
 
-    declaration = await session.watch_tokens(ALL_DAEMONS, tell)
+    declaration = await session.watch_tokens(ALL_RUNS, tell)
     try:
         yield
     finally:

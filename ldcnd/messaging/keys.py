@@ -31,9 +31,6 @@ ALL_STOPS = f"{ROOT}/*/@stop/**"
 ALL_COMMANDS = f"{ROOT}/*/@cmd/**"
 ALL_CLIENTS = f"{ROOT}/*/client/**"
 
-ALL_DAEMONS = f"{ROOT}/*/alive/*"
-"""The tokens of all daemons, whichever rig they serve."""
-
 _CHUNK = re.compile(r"[a-z0-9_]+")
 _ANY_CHUNKS = "**"
 _ANY_PART = "$*"
