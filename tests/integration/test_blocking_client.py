@@ -25,7 +25,7 @@ from tests.support.session_pair import free_endpoint
 
 NOT_FOR_ONE_CALL = {"samples", "published", "health", "command_events"}
 """Contexts, which have facades of their own or are for programs with an event loop."""
-PARTS = {"rig_command", "trace_header", "trace_chunk"}
+PARTS = {"rig_command", "axis_question", "trace_header", "trace_chunk"}
 """What other calls are made of."""
 
 
