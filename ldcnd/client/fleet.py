@@ -2,9 +2,9 @@
 
 import asyncio
 
+from ldcnd.client import presence
 from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import LdcndError, OutcomeUnknown
-from ldcnd.messaging.keys import ALL_RUNS, Keys
 from ldcnd.messaging.session import Session
 from ldcnd.model.axes import AxisInfo, LinkState
 from ldcnd.model.frozen import Frozen
@@ -59,16 +59,11 @@ async def survey(session: Session, rig: str | None = None) -> tuple[RigView, ...
     """
     alive: set[tuple[str, str]] = set()
 
-    def on_token(key: str, shown: bool) -> None:  # noqa: FBT001 - the session's signature
-        keys = Keys.of(key)
-        run = (keys.rig, keys.parse_alive(key).instance)
-        (alive.add if shown else alive.discard)(run)
+    def told(name: str, instance: str, there: bool) -> None:  # noqa: FBT001 - as `presence.daemons` calls it
+        (alive.add if there else alive.discard)((name, instance))
 
-    tokens = await session.watch_tokens(ALL_RUNS, on_token)
-    try:
+    async with presence.daemons(session, told):
         daemons = await _daemons(session)
-    finally:
-        await tokens.close()
     runs = [daemon.rig for daemon in daemons]
     silent = alive - {(daemon.rig, daemon.instance) for daemon in daemons}
     slots = asyncio.Semaphore(ASKED_AT_ONCE)

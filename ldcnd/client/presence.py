@@ -3,7 +3,7 @@
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from ldcnd.messaging.keys import ALL_RUNS, Keys, rig_of
+from ldcnd.messaging.keys import ALL_RUNS, Keys
 from ldcnd.messaging.session import Session
 
 OnDaemon = Callable[[str, str, bool], None]
@@ -15,8 +15,8 @@ async def daemons(session: Session, told: OnDaemon) -> AsyncIterator[None]:
     """Tell of every daemon that can be reached, first of those that are there, for the time of the context."""
 
     def tell(key: str, alive: bool) -> None:  # noqa: FBT001 - a callback of the session
-        rig = rig_of(key)
-        told(rig, Keys(rig).parse_alive(key).instance, alive)
+        keys = Keys.of(key)
+        told(keys.rig, keys.parse_alive(key).instance, alive)
 
     declaration = await session.watch_tokens(ALL_RUNS, tell)
     try:

@@ -287,18 +287,6 @@ class Keys:
         return f"{ROOT}/{self.rig}"
 
 
-def rig_of(key: str) -> str:
-    """Return the rig that a key belongs to.
-
-    Raises:
-        MalformedRequest: the key belongs to none.
-    """
-    chunks = key.split("/")
-    if len(chunks) < 2 or chunks[0] != ROOT or not _CHUNK.fullmatch(chunks[1]):  # noqa: PLR2004 - root and rig
-        raise MalformedRequest(f"{key} is not below {ROOT}/<rig>", value=key)
-    return chunks[1]
-
-
 def matches(left: str, right: str) -> bool:
     """Tell whether two key expressions have a key in common, as Zenoh does."""
     if "*" not in left and "*" not in right:
