@@ -10,12 +10,15 @@ from pathlib import Path
 
 import structlog
 
-from tests.bench import bus_efficiency, console, round_trip, system_calls, virtual_time
+from tests.bench import bus_efficiency, console, round_trip, round_trips, scaling, system_calls, virtual_time
 from tests.bench.bus_efficiency import FLOOR, Result
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
 from tests.bench.sources import NoCompiler
 
+RATES = (115_200, 19_200)
+CORE = {115_200: 0.15}
+"""Share of one processor that a saturated line may take."""
 EFFICIENCY = {
     (115_200, "uvloop"): 0.985,
     (115_200, "asyncio"): 0.97,
@@ -55,10 +58,12 @@ def _processes(rounds: int) -> list[Row]:
             print(f"skipped: {error}")
             return []
         rows = console.rows(folder, CONSOLE_S, CONSOLE_ROUNDS)
-        for baud in (115_200, 19_200):
+        for baud in RATES:
             for result in bus_efficiency.measure(programs, folder, baud, rounds):
                 rows += _efficiency_rows(result)
-        return rows + system_calls.rows(programs[0], folder)
+        rows += system_calls.rows(programs[0], folder)
+        rows += round_trips.rows(programs[0], folder)
+        return rows + scaling.rows(programs[0], folder, rounds)
 
 
 def _efficiency_rows(result: Result) -> list[Row]:
@@ -76,6 +81,13 @@ def _efficiency_rows(result: Result) -> list[Row]:
         Row(f"{what}: bus efficiency / floor", result.efficiency_ratio, "", EFFICIENCY[result.baud, loop]),
         Row(f"{what}: the same by the wall clock", result.wall_ratio),
         Row(f"{what}: processor time / floor", result.cpu_ratio, "", 5.0, at_most=True),
+        Row(
+            f"{what}: share of one processor",
+            result.core,
+            "",
+            CORE.get(result.baud),
+            at_most=True,
+        ),
         Row(f"{what}: processor time for each sample", result.cpu_us_per_sample, "us"),
     ]
 

@@ -1,7 +1,6 @@
 """How much of the line the whole daemon uses, and what it costs, against the floor in interleaved rounds."""
 
 import random
-import signal
 import statistics
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -17,6 +16,7 @@ from tests.bench.processes import (
     process,
     settle,
     subscriber,
+    told,
 )
 
 MODULES = 8
@@ -57,6 +57,7 @@ class Result:
     cpu_us: float
     cpu_ratio: float
     cpu_us_per_sample: float
+    core: float
     line_late_p99_us: float
 
 
@@ -122,8 +123,7 @@ def _round(subject: Subject, listener) -> Round:
 def _received(listener) -> int:
     if listener is None:
         return 0
-    listener.send_signal(signal.SIGUSR1)
-    return int(listener.stdout.readline())
+    return int(told(listener))
 
 
 def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
@@ -145,6 +145,7 @@ def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
                 cpu_us=_median(each.cpu_us for each in own),
                 cpu_ratio=_median(each.cpu_us / base.cpu_us for each, base in pairs),
                 cpu_us_per_sample=_median(each.cpu_us / (each.samples or 1) for each in own),
+                core=_median(each.cpu_us * each.exchanges_per_s for each in own) / 1e6,
                 line_late_p99_us=_median(each.line_late_p99_us for each in own),
             )
         )

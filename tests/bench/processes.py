@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -18,7 +19,7 @@ from tests.bench.sources import build
 ROOT = Path(__file__).parents[2]
 LINE_CPU, SUBJECT_CPU = 0, -1
 """The line spins on one processor, everything that is measured shares another one."""
-START_TIME_S = 30.0
+ANSWER_TIME_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,19 +77,30 @@ def process(command: Sequence[str | Path], *, cpu: int, nice: int, pipe: bool = 
             running.wait()
 
 
+def told(running: subprocess.Popen) -> str:
+    """Ask a program for its figures and return its line of them.
+
+    Raises:
+        RuntimeError: the machine is so busy that the program does not get to answer.
+    """
+    assert running.stdout
+    running.send_signal(signal.SIGUSR1)
+    if not select.select([running.stdout], [], [], ANSWER_TIME_S)[0]:
+        raise RuntimeError(f"no figures within {ANSWER_TIME_S:g} s: this machine is too busy to measure anything")
+    return running.stdout.readline()
+
+
 class PacedLine:
     """A running paced line."""
 
     def __init__(self, running: subprocess.Popen) -> None:
         assert running.stdout
         self._running = running
-        self._output = running.stdout
-        self.terminal = json.loads(self._output.readline())["terminal"]
+        self.terminal = json.loads(running.stdout.readline())["terminal"]
 
     def figures(self) -> LineFigures:
         """Return what was counted since the call before."""
-        self._running.send_signal(signal.SIGUSR1)
-        return LineFigures(**json.loads(self._output.readline()))
+        return LineFigures(**json.loads(told(self._running)))
 
 
 @contextmanager
@@ -100,13 +112,18 @@ def paced_line(program: Path, *, modules: int, ready_baud: int, burst: bool = Fa
 
 
 class Subject:
-    """A host under measurement; stopped between its rounds."""
+    """A host under measurement, with its lines; stopped between its rounds."""
 
-    def __init__(self, name: str, running: subprocess.Popen, line: PacedLine) -> None:
+    def __init__(self, name: str, running: subprocess.Popen, *lines: PacedLine) -> None:
         self.name = name
         self.pid = running.pid
-        self.line = line
+        self.lines = lines
         self._running = running
+
+    @property
+    def line(self) -> PacedLine:
+        """Its first line."""
+        return self.lines[0]
 
     def stop(self) -> None:
         """Freeze it."""
@@ -122,18 +139,18 @@ class Subject:
         return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks.iterdir()) / 1e9
 
 
-def config_text(terminal: str, *, modules: int, baud: int, uvloop: bool, hz: float, items: Sequence[str]) -> str:
-    """Return the configuration of a daemon that polls as often as the line allows."""
+def config_text(*terminals: str, modules: int, baud: int, uvloop: bool, hz: float, items: Sequence[str]) -> str:
+    """Return the configuration of a daemon that polls its lines at a rate, or as often as they allow."""
     rates = ", ".join(f"{item} = {hz if item in items else 0}" for item in ("position", "velocity", "adc"))
-    axes = "\n".join(
-        f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\nvelocity = 1\nacceleration = 1\n'
-        f"rates = {{ {rates}, state = 1 }}"
-        for number in range(1, modules + 1)
-    )
-    return (
-        f'rig = "bench"\n[daemon]\nuvloop = {str(uvloop).lower()}\n'
-        f'[[bus]]\nname = "line0"\nport = "{terminal}"\nbaud = {baud}\nmargin_ms = 20\noverload = "skip"\n{axes}\n'
-    )
+    text = f'rig = "bench"\n[daemon]\nuvloop = {str(uvloop).lower()}\n'
+    for line, terminal in enumerate(terminals):
+        text += f'[[bus]]\nname = "line{line}"\nport = "{terminal}"\nbaud = {baud}\nmargin_ms = 20\noverload = "skip"\n'
+        for number in range(1, modules + 1):
+            text += (
+                f'[[bus.axis]]\nname = "a{number + line * modules}"\naddress = {number}\nmodel = "ls-182ap"\n'
+                f"velocity = 1\nacceleration = 1\nrates = {{ {rates}, state = 1 }}\n"
+            )
+    return text
 
 
 @contextmanager

@@ -1,0 +1,25 @@
+"""A process that answers queries at once, over the kind of session that the daemon has: the price of a round trip."""
+
+import asyncio
+import sys
+
+from ldcnd.messaging.session import Query
+from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+
+KEY = "bare/answer"
+
+
+async def main(endpoint: str) -> None:
+    """Answer until terminated."""
+
+    def answer(query: Query) -> None:
+        query.reply(b"{}", "application/json")
+
+    async with open_zenoh_session(ZenohSettings(mode="peer", listen=(endpoint,), connect=())) as session:
+        await session.serve(KEY, answer, complete=True)
+        print("serving", flush=True)
+        await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1]))
