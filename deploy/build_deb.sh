@@ -43,7 +43,7 @@ fi
 install -Dm644 "$here/udev/71-ldcnd.rules" "$root/usr/lib/udev/rules.d/71-ldcnd.rules"
 install -Dm644 "$here/sysusers.d/ldcnd.conf" "$root/usr/lib/sysusers.d/ldcnd.conf"
 install -Dm644 "$here/modules-load.d/ldcnd.conf" "$root/usr/lib/modules-load.d/ldcnd.conf"
-install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,lan,single-line}.conf "$source"/config/*.toml
+install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-line}.conf "$source"/config/*.toml
 install -Dm644 "$here/INSTALL.md" "$doc/INSTALL.md"
 install -Dm644 "$source/LICENSE" "$doc/copyright"
 "$opt/bin/python" "$here/sbom.py" ${extras//,/ } > "$doc/sbom.cdx.json"

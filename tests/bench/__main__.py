@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from tests.bench import bus_efficiency, console, round_trip, round_trips, scaling, system_calls, virtual_time
+from tests.bench import bus_efficiency, console, round_trip, saturated_command, scaling, system_calls, virtual_time
 from tests.bench.bus_efficiency import FLOOR, Result
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
@@ -62,7 +62,7 @@ def _processes(rounds: int) -> list[Row]:
             for result in bus_efficiency.measure(programs, folder, baud, rounds):
                 rows += _efficiency_rows(result)
         rows += system_calls.rows(programs[0], folder)
-        rows += round_trips.rows(programs[0], folder)
+        rows += saturated_command.rows(programs[0], folder)
         return rows + scaling.rows(programs[0], folder, rounds)
 
 

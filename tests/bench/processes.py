@@ -19,7 +19,7 @@ from tests.bench.sources import build
 ROOT = Path(__file__).parents[2]
 LINE_CPU, SUBJECT_CPU = 0, -1
 """The line spins on one processor, everything that is measured shares another one."""
-ANSWER_TIME_S = 20.0
+PATIENCE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,15 +78,20 @@ def process(command: Sequence[str | Path], *, cpu: int, nice: int, pipe: bool = 
 
 
 def told(running: subprocess.Popen) -> str:
-    """Ask a program for its figures and return its line of them.
+    """Ask a program for its figures and return its line of them; see `heard`."""
+    running.send_signal(signal.SIGUSR1)
+    return heard(running)
+
+
+def heard(running: subprocess.Popen) -> str:
+    """Return the next line that a program prints.
 
     Raises:
-        RuntimeError: the machine is so busy that the program does not get to answer.
+        RuntimeError: none comes; the machine is so busy that the program does not get to run.
     """
     assert running.stdout
-    running.send_signal(signal.SIGUSR1)
-    if not select.select([running.stdout], [], [], ANSWER_TIME_S)[0]:
-        raise RuntimeError(f"no figures within {ANSWER_TIME_S:g} s: this machine is too busy to measure anything")
+    if not select.select([running.stdout], [], [], PATIENCE_S)[0]:
+        raise RuntimeError(f"{running.args}: not a word within {PATIENCE_S:g} s; this machine is too busy to measure")
     return running.stdout.readline()
 
 
@@ -94,9 +99,8 @@ class PacedLine:
     """A running paced line."""
 
     def __init__(self, running: subprocess.Popen) -> None:
-        assert running.stdout
         self._running = running
-        self.terminal = json.loads(running.stdout.readline())["terminal"]
+        self.terminal = json.loads(heard(running))["terminal"]
 
     def figures(self) -> LineFigures:
         """Return what was counted since the call before."""
@@ -166,10 +170,9 @@ def subscriber(endpoint: str) -> Iterator[subprocess.Popen]:
     """Run a remote subscriber of everything; returns once it receives."""
     command = (sys.executable, "-m", "tests.bench.subscriber", endpoint)
     with process(command, cpu=SUBJECT_CPU, nice=19, pipe=True) as running:
+        assert heard(running).strip() == "receiving"
         # it stands for another machine: what it does must not hold up the daemon
         os.sched_setscheduler(running.pid, os.SCHED_IDLE, os.sched_param(0))
-        assert running.stdout
-        assert running.stdout.readline().strip() == "receiving"
         yield running
 
 
