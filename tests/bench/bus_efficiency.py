@@ -41,6 +41,11 @@ class Round:
     line_late_p99_us: float
     samples: float = 0.0
 
+    @property
+    def core(self) -> float:
+        """Share of a processor at the rate that the median turn-around allows, however often others came between."""
+        return self.cpu_us / 1e6 * self.exchanges_per_s * self.efficiency / self.wall_efficiency
+
 
 @dataclass(frozen=True, slots=True)
 class Result:
@@ -145,7 +150,7 @@ def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
                 cpu_us=_median(each.cpu_us for each in own),
                 cpu_ratio=_median(each.cpu_us / base.cpu_us for each, base in pairs),
                 cpu_us_per_sample=_median(each.cpu_us / (each.samples or 1) for each in own),
-                core=_median(each.cpu_us * each.exchanges_per_s for each in own) / 1e6,
+                core=_median(each.core for each in own),
                 line_late_p99_us=_median(each.line_late_p99_us for each in own),
             )
         )
