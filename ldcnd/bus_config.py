@@ -55,6 +55,15 @@ class GroupConfig(Frozen):
     """The axis whose drive answers for the group."""
 
 
+class RecorderConfig(Frozen):
+    """The flight recorder of a line: how much of what was on it is kept in memory."""
+
+    seconds: float = Field(default=300.0, ge=1, le=86_400)
+    """How far back it reaches."""
+    memory_mb: int = Field(default=16, ge=1, le=4096)
+    """The oldest packets go sooner when all take more; 16 MB are about 35000 exchanges."""
+
+
 class BusConfig(Frozen):
     """One line."""
 
@@ -94,6 +103,8 @@ None where polls would miss their turns for it."""
     """What is on the line besides the axes."""
     group: tuple[GroupConfig, ...] = Field(default=(), max_length=15)
     """Axes that start and stop together."""
+    recorder: RecorderConfig = RecorderConfig()
+    """The flight recorder of the line."""
 
     @property
     def skips(self) -> bool:

@@ -58,6 +58,17 @@ class DaemonConfig(Frozen):
     """Keep the processor out of deep idle states: quicker turn-around for more power; needs /dev/cpu_dma_latency."""
 
 
+class CapturesConfig(Frozen):
+    """What is kept of lines on which something has gone wrong: a drive's fault, a loss, a line that does not turn."""
+
+    directory: Path | None = None
+    """Where captures are written; `captures` in `state_dir` if that is set, else nothing is written."""
+    files: int = Field(default=20, ge=1, le=10_000)
+    """So many at most; the oldest are deleted."""
+    total_mb: int = Field(default=200, ge=1, le=100_000)
+    """So much disk space at most."""
+
+
 class TelemetryConfig(Frozen):
     """How telemetry leaves."""
 
@@ -82,10 +93,17 @@ class RigConfig(Frozen):
     """Whether a lease is needed to move anything; readers and stops never need one."""
     state_dir: Path | None = None
     """Where the daemon keeps what must outlive it, such as the wear of EEPROMs; without it EEPROM is not written."""
+    captures: CapturesConfig = CapturesConfig()
+    """Captures that the daemon writes by itself."""
     bus: tuple[BusConfig, ...] = Field(min_length=1)
     """The lines."""
     sim: tuple[SimulatedLineConfig, ...] = ()
     """Simulated lines, used by ports of the form sim:NAME."""
+
+    @property
+    def captures_dir(self) -> Path | None:
+        """Where captures are written, if anywhere."""
+        return self.captures.directory or (self.state_dir / "captures" if self.state_dir else None)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -57,6 +57,7 @@ class ErrorCode(StrEnum):
     # the daemon
     CONFIG_INVALID = "config_invalid"
     SESSION_FAILED = "session_failed"
+    REPLAY_DEVIATION = "replay_deviation"
     INTERNAL = "internal"
 
 
@@ -365,6 +366,12 @@ class SessionError(LdcndError):
 
     code = ErrorCode.SESSION_FAILED
     retryable = True
+
+
+class ReplayDeviation(LdcndError):
+    """The daemon that a capture is played to does not send what was sent when the capture was made."""
+
+    code = ErrorCode.REPLAY_DEVIATION
 
 
 class InternalError(LdcndError):

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 import pytest
 from hypothesis import settings
 
-from tests.support.jumping_clock import JumpingLoop
+from ldcnd.sim.jumping_loop import JumpingLoop
 
 # one run is like the other; `make soak` looks at what was never tried, and prints how to repeat what it finds
 settings.register_profile("same", derandomize=True, deadline=None, print_blob=True)

@@ -34,7 +34,7 @@ class Bus:
     def __init__(self, settings: BusSettings, opener: Opener) -> None:
         self.settings = settings
         self.statistics = BusStatistics()
-        self.wire_log = WireLog()
+        self.wire_log = WireLog(settings.recorded_s, settings.recorded_bytes)
         self.resync = Resync()
         self._opener = opener
         self._loop = asyncio.get_running_loop()

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from ldcnd.bus.wire_log import KEPT_BYTES, KEPT_S
+
 LINGER_S = 0.001
 """The line stays with a packet that must not be repeated for as long as its true reply can come, and so much longer:
 adapters pass bytes on a little late."""
@@ -34,6 +36,8 @@ class BusSettings:
         paced: bytes take real time on this line, so that what comes too early is foreign; false only for
             far ends that answer faster than the baud rate allows.
         cycle: of the drives, to order polls by; None when they have none, or when polls are not to be ordered by it.
+        recorded_s: how far back the flight recorder reaches.
+        recorded_bytes: how much memory it may take.
     """
 
     name: str
@@ -44,3 +48,5 @@ class BusSettings:
     echo: bool = False
     paced: bool = True
     cycle: ServoCycle | None = None
+    recorded_s: float = KEPT_S
+    recorded_bytes: int = KEPT_BYTES

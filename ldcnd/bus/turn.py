@@ -7,8 +7,14 @@ from typing import Any
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poller import Poller
+from ldcnd.bus.wire_log import AT_ONCE_REMARK
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Exchange, Timing
+
+LANES = tuple(lane.name.lower() for lane in Lane)
+"""Remarks of the wire log about packets, by lane."""
+AT_ONCE = tuple(f"{lane}{AT_ONCE_REMARK}" for lane in LANES)
+"""The same for packets that waited for the reply before them."""
 
 
 class Turn(ABC):

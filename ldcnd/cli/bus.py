@@ -1,24 +1,35 @@
 """`ldcnd bus`: look at the lines of a running daemon."""
 
+import json
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 import click
 
+from ldcnd.bus.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.bus.pcapng import encode_pcapng
-from ldcnd.bus.wire_log import WireRecord, parse_records
+from ldcnd.bus.wire_log import WireEvent, WireRecord, parse_records
+from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.transcript import Describe, LdcnTranscript, describe_smartstep
-from ldcnd.model.axes import AxisInfo
+from ldcnd.daemon.replaying import config_of
+from ldcnd.drivers.transcript import Describe, describer
+
+TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
+
+FORMAT = click.option(
+    "--format", "form", type=click.Choice(FORMATS), help="[default: by the suffix of --out, else text]"
+)
+OUT = click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write a file instead of printing.")
 
 
 @click.group()
 def command() -> None:
-    """Look at the lines of a running daemon."""
+    """Look at the lines of a running daemon, and play back what was on them."""
+
+
+command.add_command(replay.command)
 
 
 @command.command("list")
@@ -39,49 +50,92 @@ def list_buses(target: Target) -> None:
 @click.argument("bus")
 @click.option(
     "--seconds",
-    type=click.FloatRange(0, 3600, min_open=True),
+    type=click.FloatRange(0, 86_400, min_open=True),
     default=10.0,
     show_default=True,
     help="How far back.",
 )
-@click.option("--decode", is_flag=True, help="Say in words what each packet means.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Text file, or pcapng by that suffix.")
+@FORMAT
+@OUT
 @with_target
-def wire_log(target: Target, bus: str, seconds: float, *, decode: bool, out: Path | None) -> None:
-    """Show what was on the line BUS in the last seconds, or write it to a file."""
+def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Path | None) -> None:
+    """Show what was on the line BUS in the last seconds, or write it to a file.
 
-    async def fetch(client: RigClient) -> tuple[FetchedWireLog, list[AxisInfo]]:
-        return await fetch_wire_log(client, bus, seconds), list(await client.axes())
-
-    log, axes = target.run(fetch)
-    records = parse_records(log.lines)
-    if out and out.suffix == ".pcapng":
-        out.write_bytes(encode_pcapng(records, log.bus, log.zero_ns))
-    else:
-        text = "\n".join((*_heading(log), *(_described(records, _describer(log, axes)) if decode else log.lines)))
-        if out:
-            out.write_text(f"{text}\n", encoding="utf-8")
-        else:
-            click.echo(text)
+    text is a capture: bytes, with their meaning as comments; `ldcnd bus replay` plays it back. words has the meaning
+    alone. pcapng is for Wireshark, in link type USER0. --json prints or writes one object a record instead.
+    """
+    log, header, describe = target.run(lambda client: _fetch(client, bus, seconds))
+    _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)
     if log.lost:
         click.echo(f"{log.lost} records were overwritten while they were fetched", err=True)
 
 
-def _heading(log: FetchedWireLog) -> tuple[str, ...]:
-    zero = datetime.fromtimestamp(log.zero_ns / 1e9, UTC).isoformat(timespec="microseconds")
-    return (f"# ldcnd wire log: bus {log.bus}, family {log.family}", f"# seconds since {zero}")
+@command.command("convert")
+@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@FORMAT
+@OUT
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a record.")
+def convert(file: Path, form: str | None, out: Path | None, *, as_json: bool) -> None:
+    """Put the capture in FILE into another form, as `wire-log` has them."""
+    capture = parse_capture(file.read_text(encoding="utf-8"))
+    models: dict[int, str] = {}
+    if capture.header.config:
+        (line,) = config_of(capture.header).bus
+        models = {axis.address: axis.model for axis in line.axis}
+    _render(capture, describer(capture.header.family, models), form, out, as_json=as_json)
 
 
-def _describer(log: FetchedWireLog, axes: list[AxisInfo]) -> Describe:
-    if log.family == "smartstep":
-        return describe_smartstep
-    here = [axis for axis in axes if axis.bus == log.bus and axis.model in PROFILES]
-    return LdcnTranscript({axis.address: PROFILES[axis.model] for axis in here}).describe
+def _render(capture: Capture, describe: Describe, form: str | None, out: Path | None, *, as_json: bool) -> None:
+    header, records = capture.header, capture.records
+    form = form or (PCAPNG if out and out.suffix == ".pcapng" else TEXT)
+    if form == PCAPNG and not as_json:
+        if out is None:
+            raise click.UsageError("pcapng is not for a terminal: name a file with --out")
+        out.write_bytes(encode_pcapng(records, header.bus, header.zero_ns))
+        return
+    make = _json_lines if as_json else capture_lines if form == TEXT else _word_lines
+    text = "\n".join(make(header, records, describe))
+    if out:
+        out.write_text(f"{text}\n", encoding="utf-8")
+    else:
+        click.echo(text)
 
 
-def _described(records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
-    """Yield each record and, in a comment behind it, what it means: the text still loads back."""
+async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[FetchedWireLog, CaptureHeader, Describe]:
+    log = await fetch_wire_log(client, bus, seconds)
+    daemon = await client.daemon()
+    line = next(line for line in await client.buses() if line.bus == bus)
+    header = CaptureHeader(
+        version=daemon.version,
+        bus=bus,
+        family=log.family,
+        port=line.port,
+        baud=line.baud,
+        instance=daemon.instance,
+        zero_ns=log.zero_ns,
+        started_s=log.started_s,
+        until_s=log.now_s,
+        first_record=log.first_record,
+    )
+    models = {axis.address: axis.model for axis in await client.axes() if axis.bus == bus}
+    return log, header, describer(log.family, models)
+
+
+def _word_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
     for record in records:
-        yield str(record)
-        if words := describe(record):
-            yield f"#   {words}"
+        words = record.data.decode() if record.event is WireEvent.COMMAND else describe(record)
+        yield f"{record.at_s:.6f} {record.event:<8} {words or record.note}".rstrip()
+
+
+def _json_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
+    for record in records:
+        is_text = record.event is WireEvent.COMMAND
+        yield json.dumps(
+            {
+                "at_s": record.at_s,
+                "event": record.event,
+                "data": record.data.decode() if is_text else record.data.hex(),
+                "note": record.note,
+                "words": describe(record),
+            }
+        )

@@ -3,14 +3,16 @@
 import asyncio
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import click
 
 from ldcnd.config import RigConfig, load_config, single_line
 from ldcnd.daemon.assembly import open_daemon
+from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.planning import require_plan
-from ldcnd.daemon.process import held_awake, loop_factory, settle_heap
+from ldcnd.daemon.process import held_awake, last_words, loop_factory, settle_heap
 from ldcnd.daemon.service import Service
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import configure_logging, get_logger
@@ -68,7 +70,14 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
             loop.add_signal_handler(number, handler)
         settle_heap()
         try:
-            await service.run()
+            with last_words(partial(write_captures, daemon)):
+                await service.run()
         finally:
             for number in handlers:
                 loop.remove_signal_handler(number)
+
+
+def write_captures(daemon: Daemon) -> None:
+    """Leave behind what was on the lines, where there is a place for it."""
+    if daemon.captures:
+        daemon.captures.write_all("aborted, as by a watchdog")

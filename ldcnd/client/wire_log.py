@@ -15,6 +15,9 @@ class FetchedWireLog:
         bus: the line.
         family: the drive family on it.
         zero_ns: the wall time at which the records' clock was 0, UTC in ns since 1970.
+        started_s: what that clock showed when the daemon was started.
+        now_s: what that clock showed when it was asked for.
+        first_record: number of the first record, counted since the daemon started.
         lines: one record each.
         lost: how many records were overwritten while the pages were fetched.
     """
@@ -22,6 +25,9 @@ class FetchedWireLog:
     bus: str
     family: str
     zero_ns: int
+    started_s: float
+    now_s: float
+    first_record: int
     lines: tuple[str, ...]
     lost: int
 
@@ -42,4 +48,6 @@ async def fetch_wire_log(client: RigClient, bus: str, seconds: float) -> Fetched
         page = await client.rig_command(WIRE_LOG, request, WireLogReply)
         lost += min(page.first_record, end) - wanted
         lines += page.lines[: max(0, end - page.first_record)]
-    return FetchedWireLog(first.bus, first.family, first.zero, tuple(lines), lost)
+    return FetchedWireLog(
+        first.bus, first.family, first.zero, first.started, first.now, first.first_record, tuple(lines), lost
+    )

@@ -13,6 +13,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings, ServoCycle
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, SimulatedLineConfig
+from ldcnd.daemon.authority import random_token
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.bus_service import NO_DEMANDS, BusService
 from ldcnd.daemon.clock import Clock
@@ -70,6 +71,8 @@ def build_daemon(
     now_ns: Callable[[], int],
     instance: str,
     chains: Mapping[str, Chain] = MappingProxyType({}),
+    openers: Mapping[str, Opener] = MappingProxyType({}),
+    next_token: Callable[[], str] = random_token,
 ) -> Daemon:
     """Build a daemon on an open session.
 
@@ -79,6 +82,8 @@ def build_daemon(
         now_ns: the wall clock, UTC in ns since 1970.
         instance: names this run of the daemon.
         chains: simulated lines that exist already, by name; the others are built from the configuration.
+        openers: what opens a line instead of its port, by the name of the bus.
+        next_token: makes what a lease is known by.
     """
     clock = Clock(now_ns)
     publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
@@ -95,10 +100,12 @@ def build_daemon(
 
     eeprom = open_ledger(config.state_dir)
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
-    buses = tuple(_build_bus(config, bus, make_axis, chains, eeprom) for bus in config.bus)
+    buses = tuple(_build_bus(config, bus, make_axis, chains, openers, eeprom) for bus in config.bus)
     rig = Rig(config.rig, buses, groups)
     leased = config.authority == "leased"
-    control = build_control(rig, ledger, events, clock, next_command_id, instance=instance, leased=leased)
+    control = build_control(
+        rig, ledger, events, clock, next_command_id, instance=instance, leased=leased, next_token=next_token
+    )
 
     def eeprom_writes(axis: AxisService) -> int | None:
         return eeprom.total(axis.config.name) if eeprom and axis.driver.parameters else None
@@ -111,10 +118,11 @@ def _build_bus(
     settings: BusConfig,
     make_axis: Callable[[AxisConfig, Bus, AxisDriver], AxisService],
     chains: Mapping[str, Chain],
+    openers: Mapping[str, Opener],
     eeprom: EepromLedger | None,
 ) -> BusService:
     if settings.family == "smartstep":
-        line, units = build_line(config, settings, eeprom, chains)
+        line, units = build_line(config, settings, eeprom, chains, openers.get(settings.name))
         services = tuple(make_axis(axis, line, units.axes[axis.name]) for axis in settings.axis)
         return BusService(line, units, services, port=settings.port, family=settings.family)
     opening_baud = settings.baud if settings.port.startswith(SOCKET) else RESET_BAUD
@@ -124,8 +132,10 @@ def _build_bus(
             opening_baud,
             margin_s=settings.margin_ms / 1000,
             cycle=_cycle(settings) if settings.order == "phase" else None,
+            recorded_s=settings.recorder.seconds,
+            recorded_bytes=settings.recorder.memory_mb * 1_000_000,
         ),
-        _opener(config, settings, opening_baud, chains),
+        openers.get(settings.name) or _opener(config, settings, opening_baud, chains),
     )
     specs = tuple(_spec(axis) for axis in settings.axis)
     network = FAMILIES[settings.family](bus, specs, settings.baud, _line(settings))

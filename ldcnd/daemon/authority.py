@@ -6,7 +6,7 @@ was delivered late - because the daemon, the link or the client was frozen - fin
 
 import secrets
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, StaleSequence, UnknownAxis
@@ -36,16 +36,23 @@ class Lease:
     sequence: int = -1
 
 
+def random_token() -> str:
+    """Return what a new lease is known by."""
+    return secrets.token_hex(8)
+
+
 class Authority:
     """All leases of one rig."""
 
-    def __init__(self, axes: Iterable[str], *, required: bool) -> None:
+    def __init__(self, axes: Iterable[str], *, required: bool, next_token: Callable[[], str] = random_token) -> None:
         """Begin without leases.
 
         Args:
             axes: the axes of the rig.
             required: whether a motion needs a lease; without, an axis that nobody holds is open to all.
+            next_token: makes what a lease is known by.
         """
+        self._next_token = next_token
         self.required = required
         self._axes = frozenset(axes)
         self._leases: dict[str, Lease] = {}
@@ -80,7 +87,7 @@ class Authority:
             )
         for lease in displaced:
             self._end(lease)
-        lease = Lease(secrets.token_hex(8), client, wanted, duration_s, now_s + duration_s)
+        lease = Lease(self._next_token(), client, wanted, duration_s, now_s + duration_s)
         self._leases[lease.token] = lease
         return lease, displaced
 

@@ -8,6 +8,7 @@ from typing import Any
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
+from ldcnd.bus.wire_log import WireEvent
 from ldcnd.daemon.axis_poller import AxisPoller, Deliver, wanted_rates_hz
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.demand import Demand
@@ -208,6 +209,7 @@ class BusService:
         own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed))
         poller = own or AxisPoller(axis.driver, self._rates_hz(axis, now_s), now_s, self._listener(axis), axis.missed)
         self._pollers[axis.config.name] = poller
+        self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)
         self.bus.add_poller(poller)
 
     def _listener(self, axis: AxisService) -> Deliver:

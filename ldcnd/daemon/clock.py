@@ -7,11 +7,16 @@ from ldcnd.exchange import Timing
 
 
 class Clock:
-    """Turns instants of the event loop's clock into UTC nanoseconds."""
+    """Turns instants of the event loop's clock into UTC nanoseconds.
+
+    Attributes:
+        started_s: what the loop's clock showed when the daemon was built, in seconds.
+    """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
         self._loop = asyncio.get_running_loop()
+        self.started_s = self._loop.time()
 
     def now_s(self) -> float:
         """Return the loop's time, in seconds."""

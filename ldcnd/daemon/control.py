@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ldcnd.daemon.authority import Authority
+from ldcnd.daemon.authority import Authority, random_token
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command_desk import CommandDesk
 from ldcnd.daemon.event_log import EventLog
@@ -30,9 +30,10 @@ def build_control(
     *,
     instance: str,
     leased: bool,
+    next_token: Callable[[], str] = random_token,
 ) -> Control:
     """Set up the desks of a rig whose axes report to this ledger already."""
-    authority = Authority(rig.axes, required=leased)
+    authority = Authority(rig.axes, required=leased, next_token=next_token)
     return Control(
         authority,
         CommandDesk(rig, authority, ledger, clock, next_command_id, instance),

@@ -5,9 +5,13 @@ import contextlib
 from functools import partial
 from importlib.metadata import version
 
+from ldcnd.bus.capture import Capture
 from ldcnd.config import RigConfig
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.bus_service import BusService
+from ldcnd.daemon.capture_store import CaptureStore
+from ldcnd.daemon.capture_watch import CaptureWatch
+from ldcnd.daemon.captures import Run, capture_of, snapshot_of
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.control import Control
 from ldcnd.daemon.demand import DEMANDED_ITEMS
@@ -36,7 +40,12 @@ STOP_TIME_S = 2.0
 
 
 class Daemon:
-    """Serves one rig over one session until it is told to end."""
+    """Serves one rig over one session until it is told to end.
+
+    Attributes:
+        rig: what it serves.
+        captures: writes captures when something goes wrong; None where there is no place for them.
+    """
 
     def __init__(
         self,
@@ -55,11 +64,10 @@ class Daemon:
         self._session = session
         self._keys = Keys(config.rig)
         self._publisher = publisher
-        self._clock = clock
-        self._instance = instance
-        self._started_ns = clock.now_ns()
+        self._run = Run(instance, clock.now_ns(), clock)
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
+        self.captures = _capture_watch(self, self._run)
         self._declarations: list[Declaration] = []
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
         plan = plan_rig(config)
@@ -74,6 +82,14 @@ class Daemon:
     def end(self) -> None:
         """Ask the daemon to stop its axes and to leave; `run` returns when that is done."""
         self._ending.set()
+
+    def capture(self, bus: str, cause: str) -> Capture:
+        """Return what the flight recorder of a line holds.
+
+        Raises:
+            ValueOutOfRange: there is no such line.
+        """
+        return capture_of(snapshot_of(self.rig.line(bus), self._run.clock), self._config, self._run, cause)
 
     def reconfigure(self, config: RigConfig) -> None:
         """Take other limits, speeds and rates of axes; everything else is as before, see `plan_reload`."""
@@ -100,7 +116,7 @@ class Daemon:
         refused, what moves comes to rest, tokens go, lines close.
         """
         async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
-            leases = LeaseWatch(self.rig, self._control.authority, self._clock, group)
+            leases = LeaseWatch(self.rig, self._control.authority, self._run.clock, group)
             requests = Requests(self.rig, self._keys, group, self._control, leases)
             serving = [group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses]
             try:
@@ -108,8 +124,10 @@ class Daemon:
                 serving.append(group.create_task(self._watch_axes(group), name="liveliness"))
                 serving.append(group.create_task(leases.run(), name="leases"))
                 serving.append(group.create_task(self._health.run(), name="health"))
+                if self.captures:
+                    serving.append(group.create_task(self.captures.run(), name="captures"))
                 self._serving.set()
-                log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._instance)
+                log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
                 await self._ending.wait()
                 requests.close()
                 await self._come_to_rest()
@@ -139,7 +157,7 @@ class Daemon:
                 for item in DEMANDED_ITEMS:
                     key, told = keys.telemetry(axis.config.name, item), partial(_told, bus, axis, item)
                     await until_end(await session.watch_subscribers(key, told))
-        await until_end(await session.declare_token(keys.alive(self._instance)))
+        await until_end(await session.declare_token(keys.alive(self._run.instance)))
 
     def _load(self) -> Load:
         """Return how the daemon keeps up with what is asked of it."""
@@ -149,7 +167,7 @@ class Daemon:
     def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
         """Notice another daemon on the same rig: two of them would move every axis twice."""
         address = self._keys.parse_alive(key)
-        if address.axis is not None or address.instance == self._instance:
+        if address.axis is not None or address.instance == self._run.instance:
             return
         log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
         self._control.commands.rival = address.instance if alive else None
@@ -178,7 +196,9 @@ class Daemon:
                             policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
                             group.create_task(policy, name=f"bus loss {name}")
                         known.add(name)
-                        tokens[name] = await self._session.declare_token(self._keys.alive_axis(self._instance, name))
+                        tokens[name] = await self._session.declare_token(
+                            self._keys.alive_axis(self._run.instance, name)
+                        )
                     elif not alive and name in tokens:
                         await tokens.pop(name).close()
                 await asyncio.sleep(TOKEN_PERIOD_S)
@@ -191,12 +211,20 @@ class Daemon:
             rig=self.rig.name,
             version=version("ldcnd"),
             api=API,
-            instance=self._instance,
-            started=self._started_ns,
+            instance=self._run.instance,
+            started=self._run.started_ns,
             encoding=self._config.telemetry.encoding,
             axes=tuple(self.rig.axes),
             buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
         )
+
+
+def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:
+    directory, bounds = daemon.config.captures_dir, daemon.config.captures
+    if directory is None:
+        return None
+    store = CaptureStore(directory, bounds.files, bounds.total_mb * 1_000_000)
+    return CaptureWatch(daemon.rig, lambda: daemon.config, run, store)
 
 
 def _told(bus: BusService, axis: AxisService, item: TelemetryItem, present: bool) -> None:  # noqa: FBT001 - as above

@@ -3,10 +3,12 @@
 import asyncio
 import gc
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 from ldcnd.log import get_logger
 
@@ -41,6 +43,28 @@ def held_awake(*, wanted: bool, device: Path = CPU_LATENCY) -> Iterator[None]:
     finally:
         if descriptor is not None:
             os.close(descriptor)
+
+
+@contextmanager
+def last_words(speak: Callable[[], object]) -> Iterator[None]:
+    """Have something done when the process is aborted, as a service manager does whose watchdog was not fed.
+
+    It is done wherever the interpreter is just then, also in an event loop that hangs; then the process dies as it
+    would have without.
+    """
+
+    def aborted(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        try:
+            speak()
+        finally:
+            os.kill(os.getpid(), number)
+
+    before = signal.signal(signal.SIGABRT, aborted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGABRT, before)
 
 
 def settle_heap() -> None:

@@ -7,6 +7,7 @@ from functools import partial
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.control import Control
 from ldcnd.daemon.group_moves import move_together
+from ldcnd.daemon.journal import Journal
 from ldcnd.daemon.loss_policies import LeaseWatch
 from ldcnd.daemon.rehearsals import rehearse
 from ldcnd.daemon.rig import Rig
@@ -41,6 +42,7 @@ class Requests:
         self._leases = leases
         self._keys = keys
         self._group = group
+        self._journal = Journal(rig)
         self._pending = 0
         self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
         self._closing = False
@@ -92,9 +94,12 @@ class Requests:
         if self._closing:
             raise ShuttingDown("the daemon is stopping", axis=address.axis)
         if address.axis == RIG_ITSELF and address.verb == REHEARSE:
-            return await rehearse(self._rig, decode(RehearsalRequest, query.payload, query.encoding))
+            rehearsal = decode(RehearsalRequest, query.payload, query.encoding)
+            self._journal.asked(RIG_ITSELF, REHEARSE, rehearsal)
+            return await rehearse(self._rig, rehearsal)
         if address.axis == RIG_ITSELF and address.verb == MOVE_TOGETHER:
             request = decode(MoveTogetherRequest, query.payload, query.encoding)
+            self._journal.asked(RIG_ITSELF, MOVE_TOGETHER, request)
             return await self._move_together(request, query.login)
         if address.axis == RIG_ITSELF:
             return self._control.rig.answer(address.verb, query.payload, query.encoding)
@@ -112,6 +117,7 @@ class Requests:
                 value=address.verb,
             ) from None
         command = decode(REQUEST_MODELS[verb], query.payload, query.encoding)
+        self._journal.asked(address.axis, verb, command)
         return await self._control.commands.carry_out(address.axis, verb, command, query.login)
 
     async def _move_together(self, request: MoveTogetherRequest, login: str | None) -> MoveTogetherReply:
@@ -129,6 +135,7 @@ class Requests:
         """Stop even if the payload is nonsense: a stop is always accepted."""
         name = self._keys.parse_stop(query.key)
         names = tuple(self._rig.axes) if name is None else (self._rig.axis(name).config.name,)
+        self._journal.stopped(name)
         return StopReply(axes=names, confirmed=await self._stop_once(names))
 
     async def _stop_once(self, names: tuple[str, ...]) -> tuple[str, ...]:

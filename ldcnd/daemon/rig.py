@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.bus_service import BusService
 from ldcnd.drivers.driver import StopMode
-from ldcnd.errors import UnknownAxis
+from ldcnd.errors import UnknownAxis, ValueOutOfRange
 
 
 class Rig:
@@ -37,6 +37,18 @@ class Rig:
             raise UnknownAxis(
                 f"rig {self.name} has no axis {name!r}; it has {', '.join(self.axes)}", axis=name, value=name
             ) from None
+
+    def line(self, name: str) -> BusService:
+        """Return the line of that name.
+
+        Raises:
+            ValueOutOfRange: there is none; names those that exist.
+        """
+        for line in self.buses:
+            if line.bus.settings.name == name:
+                return line
+        names = ", ".join(line.bus.settings.name for line in self.buses)
+        raise ValueOutOfRange(f"rig {self.name} has no bus {name!r}; it has {names}", value=name)
 
     def members(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the axes that are meant by names of axes and of groups."""

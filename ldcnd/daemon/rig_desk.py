@@ -5,12 +5,14 @@ from collections.abc import Callable, Mapping
 from ldcnd.daemon.authority import Authority, Lease
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.event_log import EventLog
+from ldcnd.daemon.journal import Journal
 from ldcnd.daemon.ledger import Ledger
 from ldcnd.daemon.rig import Rig
 from ldcnd.daemon.wire_dumps import wire_page
 from ldcnd.errors import UnknownVerb
 from ldcnd.log import get_logger
 from ldcnd.messaging.codec import decode
+from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model import verbs
 from ldcnd.model.authority import AcquireRequest, Holder, HolderList, HoldersRequest, LeaseReply, LeaseRequest
 from ldcnd.model.events import CommandOutcome, EventList, EventsRequest, OutcomeRequest
@@ -29,6 +31,7 @@ class RigDesk:
         self._ledger = ledger
         self._events = events
         self._clock = clock
+        self._journal = Journal(rig)
         self._handlers: Mapping[str, Callable[[bytes, str], Frozen]] = {
             verbs.ACQUIRE: self._acquire,
             verbs.RENEW: self._renew,
@@ -59,14 +62,19 @@ class RigDesk:
         for other in displaced:
             if other.client != lease.client:
                 log.warning("control taken over", axes=sorted(other.axes), from_client=other.client, by=lease.client)
+        self._journal.asked(RIG_ITSELF, verbs.ACQUIRE, request, lease.token)
         log.info("control acquired", client=lease.client, axes=sorted(lease.axes))
         return _reply(lease)
 
     def _renew(self, payload: bytes, encoding: str) -> LeaseReply:
-        return _reply(self._authority.renew(decode(LeaseRequest, payload, encoding).lease, self._clock.now_s()))
+        request = decode(LeaseRequest, payload, encoding)
+        self._journal.asked(RIG_ITSELF, verbs.RENEW, request)
+        return _reply(self._authority.renew(request.lease, self._clock.now_s()))
 
     def _release(self, payload: bytes, encoding: str) -> LeaseReply:
-        lease = self._authority.release(decode(LeaseRequest, payload, encoding).lease, self._clock.now_s())
+        request = decode(LeaseRequest, payload, encoding)
+        self._journal.asked(RIG_ITSELF, verbs.RELEASE, request)
+        lease = self._authority.release(request.lease, self._clock.now_s())
         log.info("control released", client=lease.client, axes=sorted(lease.axes))
         return _reply(lease)
 

@@ -39,9 +39,21 @@ def open_ledger(state_dir: Path | None) -> EepromLedger | None:
 
 
 def build_line(
-    config: RigConfig, settings: BusConfig, ledger: EepromLedger | None, chains: Mapping[str, Chain]
+    config: RigConfig,
+    settings: BusConfig,
+    ledger: EepromLedger | None,
+    chains: Mapping[str, Chain],
+    opener: Opener | None = None,
 ) -> tuple[Bus, SmartStepNetwork]:
-    """Return the bus of a line and the units on it; nothing is opened yet."""
+    """Return the bus of a line and the units on it; nothing is opened yet.
+
+    Args:
+        config: the rig.
+        settings: the line.
+        ledger: counts EEPROM writes.
+        chains: simulated lines that exist already, by name.
+        opener: opens the line, manners included, instead of its port.
+    """
     profiles = {axis.name: _profile(settings, axis) for axis in settings.axis}
     profile = profiles[settings.axis[0].name]  # what concerns the line is the same for all
     bus = Bus(
@@ -51,8 +63,10 @@ def build_line(
             margin_s=settings.margin_ms / 1000 + profile.quiet_s,
             attempts=profile.attempts,
             echo=profile.echo is Echo.EXPECT,
+            recorded_s=settings.recorder.seconds,
+            recorded_bytes=settings.recorder.memory_mb * 1_000_000,
         ),
-        smartstep_opener(_opener(config, settings, profile, chains), profile),
+        opener or smartstep_opener(_opener(config, settings, profile, chains), profile),
     )
     specs = tuple(
         UnitSpec(

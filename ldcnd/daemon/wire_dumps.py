@@ -6,7 +6,6 @@ from dataclasses import replace
 from ldcnd.bus.wire_log import WireRecord
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.rig import Rig
-from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.wire_log import WireLogReply, WireLogRequest
 
 PAGE_BYTES = 12_000
@@ -23,10 +22,7 @@ def wire_page(rig: Rig, request: WireLogRequest, clock: Clock) -> WireLogReply:
     Raises:
         ValueOutOfRange: the rig has no such line.
     """
-    service = next((bus for bus in rig.buses if bus.bus.settings.name == request.bus), None)
-    if service is None:
-        names = ", ".join(bus.bus.settings.name for bus in rig.buses)
-        raise ValueOutOfRange(f"rig {rig.name} has no bus {request.bus!r}; it has {names}", value=request.bus)
+    service = rig.line(request.bus)
     log = service.bus.wire_log
     records = log.records()
     oldest = log.added - len(records)
@@ -40,6 +36,8 @@ def wire_page(rig: Rig, request: WireLogRequest, clock: Clock) -> WireLogReply:
         bus=request.bus,
         family=service.family,
         zero=clock.wall_ns(0.0),
+        started=clock.started_s,
+        now=clock.now_s(),
         first_record=oldest + skipped,
         next_record=oldest + skipped + len(page),
         end_record=log.added,

@@ -8,13 +8,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 
 from ldcnd.bus.wire_log import WireEvent, WireRecord
-from ldcnd.drivers.ldcn.profiles import LS_182AP, Profile
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PROFILES, Profile
 from ldcnd.drivers.ldcn.received import DefineStatus, HardReset, PlainCommand, ReadStatus, interpret_bytes
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusFlag, StatusItem, decode_status
 from ldcnd.drivers.smartstep.packet import decode_command, decode_reply
 from ldcnd.errors import BadReply
 
 Describe = Callable[[WireRecord], str]
+
+
+class Parts:
+    """Puts replies together that were delivered in pieces."""
+
+    def __init__(self) -> None:
+        self._before = b""
+
+    def whole(self, record: WireRecord) -> bytes:
+        """Return the record's bytes behind those of the parts before it; of a part alone, nothing."""
+        before, self._before = self._before, b""
+        if record.event is WireEvent.PART:
+            self._before = before + record.data
+            return b""
+        return before + record.data if record.event is WireEvent.RECEIVED else record.data
 
 
 class LdcnTranscript:
@@ -28,16 +43,18 @@ class LdcnTranscript:
         self._profiles = profiles
         self._defined: dict[int, StatusItem] = {}
         self._asked: tuple[Profile, StatusItem] = (LS_182AP, STATUS_BYTE_ONLY)
+        self._parts = Parts()
 
     def describe(self, record: WireRecord) -> str:
         """Return the record's packet in words; empty when there is none."""
-        if not record.data:
+        data = self._parts.whole(record)
+        if not data:
             return ""
         try:
             if record.event is WireEvent.SENT:
-                return self._request(record.data)
+                return self._request(data)
             if record.event is WireEvent.RECEIVED:
-                return self._reply(record.data)
+                return self._reply(data)
         except BadReply as error:
             return error.message
         return ""
@@ -64,20 +81,39 @@ class LdcnTranscript:
         return _status_words(decode_status(profile, items, data))
 
 
-def describe_smartstep(record: WireRecord) -> str:
-    """Return the packet of a record of a SmartStep line in words; empty when there is none."""
-    if record.event is WireEvent.SENT:
-        command = decode_command(record.data)
-        if command is None:
+class SmartStepTranscript:
+    """Reads the records of one SmartStep line, oldest first."""
+
+    def __init__(self) -> None:
+        self._parts = Parts()
+
+    def describe(self, record: WireRecord) -> str:
+        """Return the record's packet in words; empty when there is none."""
+        data = self._parts.whole(record)
+        if record.event is WireEvent.SENT:
+            command = decode_command(data)
+            if command is None:
+                return ""
+            return f"unit {command.unit}: {command.function.name} {command.address:04X}H, {command.data:04X}H"
+        if record.event is not WireEvent.RECEIVED:
             return ""
-        return f"unit {command.unit}: {command.function.name} {command.address:04X}H, {command.data:04X}H"
-    if record.event is not WireEvent.RECEIVED:
-        return ""
-    try:
-        reply = decode_reply(record.data)
-    except BadReply as error:
-        return error.message
-    return f"unit {reply.unit}: {reply.status.name} {reply.address:04X}H, {reply.data:04X}H"
+        try:
+            reply = decode_reply(data)
+        except BadReply as error:
+            return error.message
+        return f"unit {reply.unit}: {reply.status.name} {reply.address:04X}H, {reply.data:04X}H"
+
+
+def describer(family: str, models: Mapping[int, str]) -> Describe:
+    """Return what puts the records of a line into words.
+
+    Args:
+        family: the drive family on it.
+        models: the drives' models by node address, as far as they are known.
+    """
+    if family == "smartstep":
+        return SmartStepTranscript().describe
+    return LdcnTranscript({node: PROFILES[model] for node, model in models.items() if model in PROFILES}).describe
 
 
 def _status_words(status: Status) -> str:

@@ -90,6 +90,7 @@ _ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
             errors.NotPermitted,
             errors.ConfigError,
             errors.SessionError,
+            errors.ReplayDeviation,
             errors.InternalError,
         )
     }
@@ -116,7 +117,7 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
         MalformedRequest: anything else; names the first field that is wrong and what is allowed there.
     """
     try:
-        return model.model_validate_json(_text(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
+        return model.model_validate_json(as_json(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
     except pydantic.ValidationError as error:
         raise _explained(model, error) from None
 
@@ -136,7 +137,7 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
         MalformedRequest: a known field is missing or wrong.
     """
     try:
-        return model.model_validate_json(_text(payload, encoding, MAX_RECEIVED_BYTES), strict=True, extra="ignore")
+        return model.model_validate_json(as_json(payload, encoding, MAX_RECEIVED_BYTES), strict=True, extra="ignore")
     except pydantic.ValidationError as error:
         raise _explained(model, error) from None
 
@@ -193,8 +194,13 @@ def _packable(value: object) -> object:
     return vars(value) if isinstance(value, Frozen) else pydantic_core.to_jsonable_python(value)
 
 
-def _text(payload: bytes, encoding: str, longest: int) -> bytes:
-    """Return a payload as JSON."""
+def as_json(payload: bytes, encoding: str, longest: int = MAX_RECEIVED_BYTES) -> bytes:
+    """Return a payload as JSON.
+
+    Raises:
+        PayloadTooLarge: it is longer than `longest` bytes.
+        MalformedRequest: it cannot be read.
+    """
     if len(payload) > longest:
         raise PayloadTooLarge(
             f"the payload has {len(payload)} bytes, more than the {longest} that it may have",
@@ -203,7 +209,7 @@ def _text(payload: bytes, encoding: str, longest: int) -> bytes:
         )
     if not payload:
         return b"{}"
-    return _as_json(payload) if _told(payload, encoding) is Encoding.MSGPACK else payload
+    return _from_msgpack(payload) if _told(payload, encoding) is Encoding.MSGPACK else payload
 
 
 def _named(encoding: str) -> Encoding | None:
@@ -220,7 +226,7 @@ def _told(payload: bytes, encoding: str) -> Encoding:
     return Encoding.JSON if payload[:1] == b"{" or payload[:1] in _WHITE_SPACE else Encoding.MSGPACK
 
 
-def _as_json(payload: bytes) -> bytes:
+def _from_msgpack(payload: bytes) -> bytes:
     try:
         return pydantic_core.to_json(msgpack.unpackb(payload))
     # what msgpack cannot read, and what JSON cannot say: both libraries raise kinds of ValueError

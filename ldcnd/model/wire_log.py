@@ -10,7 +10,7 @@ class WireLogRequest(Frozen):
 
     bus: str
     """Which line."""
-    seconds: float = Field(default=10.0, gt=0, le=3600)
+    seconds: float = Field(default=10.0, gt=0, le=86_400)
     """How far back, in seconds; what is older than the recorder keeps is gone."""
     from_record: int | None = Field(default=None, ge=0)
     """Go on from this record; null for the first one within `seconds`."""
@@ -25,6 +25,10 @@ class WireLogReply(Frozen):
     """The drive family on it: how the bytes are to be read."""
     zero: int
     """The wall time at which the records' clock was 0, UTC in ns since 1970."""
+    started: float
+    """What that clock showed when the daemon was started, in seconds."""
+    now: float
+    """What that clock showed when this was answered, in seconds."""
     first_record: int = Field(ge=0)
     """Number of the first record in `lines`; records are counted since the daemon started."""
     next_record: int = Field(ge=0)

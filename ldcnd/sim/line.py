@@ -19,6 +19,7 @@ class SimulatedLine(Transport):
         self._loop = asyncio.get_running_loop()
         self._receiver: Receiver | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at_s: float | None = None
         self._farewell: asyncio.Handle | None = None
         self._gone: str | None = None
         now_s = self._loop.time()
@@ -84,9 +85,10 @@ class SimulatedLine(Transport):
     def _arm(self) -> None:
         """Keep exactly one timer, at the chain's next event."""
         at_s = None if self._gone else self._chain.next_event_s()
-        if self._timer and at_s == self._timer.when():
+        if self._timer and at_s == self._timer_at_s:
             return
         self._disarm()
+        self._timer_at_s = at_s
         if at_s is not None:
             self._timer = self._loop.call_at(at_s, self._due, at_s)
 

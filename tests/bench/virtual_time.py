@@ -16,8 +16,8 @@ from ldcnd.daemon.process import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.bench.report import Row
-from tests.support.jumping_clock import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 
 DRIVES = 31

@@ -46,7 +46,7 @@ async def test_a_long_log_comes_in_pages_without_gap_or_repetition():
 
 async def test_a_page_that_was_overwritten_starts_at_the_oldest_record_left():
     async with running_rig() as rig:
-        await asyncio.sleep(60.0)
+        await asyncio.sleep(90.0)
         name = rig.daemon.rig.buses[0].bus.settings.name
 
         page = await rig.client.rig_command("wire_log", WireLogRequest(bus=name, from_record=0), WireLogReply)

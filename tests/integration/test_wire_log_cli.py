@@ -1,37 +1,39 @@
 """`ldcnd bus wire-log` against a daemon in its own process over loopback TCP."""
 
-import asyncio
-from asyncio.subprocess import PIPE
+import json
+import re
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent, parse_records
-from tests.support.process import LDCND, ROOT, daemon
+from ldcnd.bus.capture import parse_capture
+from ldcnd.bus.wire_log import WireEvent
+from tests.support.command_line import run_all
+from tests.support.process import ROOT, daemon
 
 pytestmark = pytest.mark.real_time
 
 
-async def ldcnd(*arguments):
-    """Run `ldcnd ARGUMENTS` and return its exit code and what it printed, errors last."""
-    running = await asyncio.create_subprocess_exec(*LDCND, *arguments, stdout=PIPE, stderr=PIPE)
-    async with asyncio.timeout(45):
-        printed, errors = await running.communicate()
-    return running.returncode, printed.decode(), errors.decode()
+PAGE = (ROOT / "docs" / "how-to" / "replay-a-capture.md").read_text(encoding="utf-8")
+ON_PAGE = re.findall(r"^ldcnd bus wire-log .+$", PAGE, re.MULTILINE)
 
 
-async def test_a_line_is_dumped_as_text_in_words_and_for_wireshark(tmp_path):
-    text, capture = tmp_path / "line0.txt", tmp_path / "line0.pcapng"
+async def test_a_line_is_dumped_as_a_capture_in_words_as_json_and_for_wireshark(tmp_path):
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
-        written = await ldcnd("bus", "wire-log", "line0", "-e", endpoint, "--decode", "--out", str(text))
-        captured = await ldcnd("bus", "wire-log", "line0", "-e", endpoint, "--out", str(capture))
-        refused = await ldcnd("bus", "wire-log", "nowhere", "-e", endpoint)
+        asked = [f"{command} -e {endpoint}" for command in ON_PAGE]
+        as_json = f"ldcnd bus wire-log line0 --seconds 3 --json -e {endpoint}"
+        refused = f"ldcnd bus wire-log nowhere -e {endpoint}"
+        *ran, jsons, refusal = await run_all(tmp_path, *asked, as_json, refused)
 
-    lines = text.read_text(encoding="utf-8").splitlines()
-    assert (written[0], captured[0]) == (0, 0), written[2] + captured[2]
-    assert lines[0] == "# ldcnd wire log: bus line0, family ldcn"
-    assert {WireEvent.SENT, WireEvent.RECEIVED} <= {record.event for record in parse_records(lines)}
-    assert any(line.startswith("#   node ") for line in lines)
-    assert any(line.startswith("#   status ") and "position" in line for line in lines)
-    assert capture.read_bytes()[:4] == b"\x0a\x0d\x0d\x0a"
-    assert refused[0] == 1
-    assert "line0" in refused[2]
+    assert [each.code for each in (*ran, jsons)] == [0, 0, 0, 0], ran
+    text = (tmp_path / "now.capture").read_text(encoding="utf-8")
+    file = parse_capture(text)
+    assert (file.header.bus, file.header.family, file.header.baud) == ("line0", "ldcn", 115_200)
+    assert file.header.first_record == 0
+    assert {WireEvent.SENT, WireEvent.RECEIVED} <= {record.event for record in file.records}
+    assert "#   node " in text
+    assert any("received" in line and "position" in line for line in ran[1].printed.splitlines())
+    assert (tmp_path / "now.pcapng").read_bytes()[:4] == b"\x0a\x0d\x0d\x0a"
+    records = [json.loads(line) for line in jsons.printed.splitlines()]
+    assert any(record["event"] == "received" and "position" in record["words"] for record in records)
+    assert refusal.code == 1
+    assert "line0" in refusal.errors

@@ -19,8 +19,8 @@ from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.requests import MoveRelativeRequest, PowerRequest, Verb
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.line import open_simulated_line
-from tests.support.jumping_clock import JumpingLoop
 
 SCHEDULES_PER_TEST = 250
 BATCHES = 8

@@ -16,8 +16,8 @@ from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.settings import BusSettings
 from ldcnd.errors import BadReply, BusBusy, BusDown, BusError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Exchange
+from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support import toy_family as toy
-from tests.support.jumping_clock import JumpingLoop
 from tests.support.scripted_line import Say, ScriptedOpener
 
 FIRST_NUMBER = 0x8000

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from ldcnd.recording.mcap_file import McapFile
-from tests.support.jumping_clock import JumpingLoop
+from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.recordings import recorded_rig, thirty_one_axes
 
 MOST_AXES = 31

@@ -8,8 +8,8 @@ from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import TransportLost
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.line import open_simulated_line
-from tests.support.jumping_clock import JumpingLoop
 
 SET_ADDRESS_1 = bytes.fromhex("aa 00 21 01 ff 21")
 SET_ADDRESS_2 = bytes.fromhex("aa 00 21 02 ff 22")

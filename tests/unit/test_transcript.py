@@ -4,7 +4,7 @@ from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.smartstep.packet import Command as SmartStepCommand
 from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus
-from ldcnd.drivers.transcript import LdcnTranscript, describe_smartstep
+from ldcnd.drivers.transcript import LdcnTranscript, SmartStepTranscript
 
 
 def sent(data: bytes) -> WireRecord:
@@ -58,10 +58,23 @@ def test_what_is_no_packet_is_said_to_be_none():
     assert not transcript.describe(WireRecord(0.0, WireEvent.TIMEOUT))
 
 
+def test_a_reply_that_came_in_pieces_is_told_with_its_last_piece():
+    transcript = LdcnTranscript({})
+    items = StatusItem.POSITION
+    reply = encode_status(LS_182AP, items, Status(StatusFlag(0), position=77))
+    transcript.describe(sent(encode_packet(Packet(3, Command.READ_STATUS, bytes([items])))))
+
+    first = transcript.describe(WireRecord(0.0, WireEvent.PART, reply[:2]))
+    last = transcript.describe(received(reply[2:]))
+
+    assert (first, last) == ("", "status 00, position 77")
+
+
 def test_smartstep_packets_are_told_in_words():
     request = SmartStepCommand(2, Function.REFERENCE, 0xE000).encode()
     reply = Reply(2, ResponseStatus(Function.REFERENCE), 0xE000, 0x1234).encode()
+    transcript = SmartStepTranscript()
 
-    assert describe_smartstep(sent(request)) == "unit 2: REFERENCE E000H, 0000H"
-    assert describe_smartstep(received(reply)).endswith("E000H, 1234H")
-    assert "checksum" in describe_smartstep(received(b"nonsense"))
+    assert transcript.describe(sent(request)) == "unit 2: REFERENCE E000H, 0000H"
+    assert transcript.describe(received(reply)).endswith("E000H, 1234H")
+    assert "checksum" in transcript.describe(received(b"nonsense"))

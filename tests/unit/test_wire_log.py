@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.bus.wire_log import WireEvent, WireLog, WireRecord, parse_record, parse_records
+from ldcnd.bus.wire_log import RECORD_BYTES, WireEvent, WireLog, WireRecord, parse_record, parse_records
 from ldcnd.errors import MalformedRequest
 
 
@@ -18,42 +18,64 @@ def test_records_come_oldest_first():
     ]
 
 
-def test_a_full_log_drops_the_oldest():
-    log = WireLog(records=3)
+def test_the_last_seconds_are_kept_however_many_packets_they_have():
+    log = WireLog(kept_s=10.0)
 
-    for number in range(5):
-        log.add(float(number), WireEvent.SENT, bytes([number]))
+    for number in range(5000):
+        log.add(number / 100, WireEvent.SENT, bytes([number % 256]))
 
-    assert [record.data for record in log.records()] == [b"\x02", b"\x03", b"\x04"]
+    assert [record.at_s for record in log.records()] == [number / 100 for number in range(3999, 5000)]
+
+
+def test_memory_is_bounded_also_when_little_time_has_passed():
+    log = WireLog(kept_s=1e6, kept_bytes=10 * RECORD_BYTES)
+
+    for number in range(50):
+        log.add(0.0, WireEvent.SENT, bytes([number]))
+    few = [record.data[0] for record in log.records()]
+    log.add(0.0, WireEvent.STRAY, bytes(100 * RECORD_BYTES))
+
+    assert few == list(range(41, 50))
+    assert [record.event for record in log.records()] == [WireEvent.STRAY]
 
 
 def test_a_record_reads_as_one_line():
-    assert str(WireRecord(1.5, WireEvent.SENT, b"\xaa\x01")) == "1.500000 sent     aa 01"
-    assert str(WireRecord(2.0, WireEvent.TIMEOUT, b"", "node 3")) == "2.000000 timeout   # node 3"
-    assert str(WireRecord(0.0, WireEvent.OPENED)) == "0.000000 opened"
+    assert str(WireRecord(1.5, WireEvent.SENT, b"\xaa\x01")) == "1.500000000 sent     aa 01"
+    assert str(WireRecord(2.0, WireEvent.TIMEOUT, b"", "node 3")) == "2.000000000 timeout   # node 3"
+    assert str(WireRecord(0.0, WireEvent.OPENED)) == "0.000000000 opened"
 
 
 def test_what_was_dropped_is_still_counted():
-    log = WireLog(records=3)
+    log = WireLog(kept_s=0.5)
 
     for number in range(5):
         log.add(float(number), WireEvent.SENT)
 
-    assert log.added == 5
+    assert (log.added, len(log.records())) == (5, 1)
 
 
 @given(
-    at_us=st.integers(0, 10**12),
-    event=st.sampled_from(WireEvent),
+    at_ns=st.integers(0, 10**16),
+    event=st.sampled_from(sorted(set(WireEvent) - {WireEvent.COMMAND})),
     data=st.binary(max_size=40),
     note=st.text(max_size=40),
 )
-def test_a_line_of_text_loads_back(at_us, event, data, note):
-    record = WireRecord(at_us / 1e6, event, data, " ".join(note.split()))
+def test_a_line_of_text_loads_back(at_ns, event, data, note):
+    """To the nanosecond for any uptime: 10 ** 16 ns are 115 days, where a float has steps of 2 ns."""
+    record = WireRecord(at_ns / 1e9, event, data, " ".join(note.split()))
 
-    line = str(WireRecord(at_us / 1e6, event, data, note))
+    line = str(WireRecord(at_ns / 1e9, event, data, note))
 
     assert line.splitlines() == [line]
+    assert parse_record(line) == record
+
+
+def test_a_command_loads_back_whatever_is_in_its_text():
+    record = WireRecord(1.0, WireEvent.COMMAND, b'x/move_absolute {"position": 1.5, "client": "a # b  c"}')
+
+    line = str(record)
+
+    assert line == '1.000000000 command  x/move_absolute {"position": 1.5, "client": "a # b  c"}'
     assert parse_record(line) == record
 
 
@@ -63,7 +85,7 @@ def test_comments_and_empty_lines_are_skipped():
     assert records == (WireRecord(1.0, WireEvent.OPENED), WireRecord(2.5, WireEvent.SENT, b"\xaa\x00"))
 
 
-@pytest.mark.parametrize("line", ["x sent aa", "1.0 whispered aa", "1.0 sent a", "1.0", "1.0 sent zz"])
+@pytest.mark.parametrize("line", ["x sent aa", "1.0 whispered aa", "1.0 sent a", "1.0", "1.0 sent zz", "x command y"])
 def test_what_is_no_record_is_refused_with_the_line(line):
     with pytest.raises(MalformedRequest) as refused:
         parse_record(line)

@@ -1,0 +1,46 @@
+"""What clients ask for, written into the flight recorders of the lines concerned, between the packets.
+
+A line of the journal is `axis/verb {payload}`, or `@stop/axis {}`, with the payload as JSON. A lease is named by a
+fingerprint: whoever reads a wire log must not be able to command with what it finds there.
+"""
+
+import asyncio
+import hashlib
+import json
+
+from ldcnd.bus.wire_log import WireEvent
+from ldcnd.daemon.rig import Rig
+from ldcnd.messaging.keys import RIG_ITSELF
+from ldcnd.model.frozen import Frozen
+
+STOP = "@stop"
+
+
+class Journal:
+    """Knows which line an axis is on; what concerns the rig as a whole is written to all lines."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+
+    def asked(self, axis: str, verb: str, request: Frozen, lease: str | None = None) -> None:
+        """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
+        fields = request.model_dump(mode="json", exclude_defaults=True)
+        token = lease or fields.get("lease")
+        if token is not None:
+            fields["lease"] = fingerprint(token)
+        self._note(axis, f"{axis}/{verb} {json.dumps(fields)}")
+
+    def stopped(self, axis: str | None) -> None:
+        """Note a stop of an axis, or of the rig."""
+        self._note(axis or RIG_ITSELF, f"{STOP}/{axis} {{}}" if axis else f"{STOP} {{}}")
+
+    def _note(self, axis: str, text: str) -> None:
+        now_s = asyncio.get_running_loop().time()
+        for line in self._rig.buses:
+            if axis == RIG_ITSELF or any(axis == one.config.name for one in line.axes):
+                line.bus.wire_log.add(now_s, WireEvent.COMMAND, text.encode())
+
+
+def fingerprint(token: str) -> str:
+    """Return a name for a lease that does not give it away."""
+    return hashlib.sha256(token.encode()).hexdigest()[:16]
