@@ -1,4 +1,4 @@
-"""What the plan predicts and what 31 axes do, through a host that takes exactly as long as the plan reckons with."""
+"""What the plan predicts and what 31 axes then do, through a host that takes as long as the plan reckons with."""
 
 import asyncio
 from dataclasses import dataclass
@@ -108,7 +108,9 @@ async def test_ordered_by_phase_they_use_less_of_it():
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(1200)
+@pytest.mark.timeout(3000)
 @pytest.mark.parametrize("order", ["deadline", "phase"])
 async def test_ten_minutes_of_31_axes_are_as_planned(order):
-    check(await kept(order, 600.0))
+    seen = await kept(order, 600.0)
+    print(seen.load / seen.planned.mean_load, seen.longest_s / max(poll.response_s for poll in seen.planned.polls))
+    check(seen)
