@@ -64,14 +64,14 @@ def export(recording: Path, folder: Path) -> None:
 async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
     from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder  # noqa: PLC0415 - needs an optional package
 
-    descriptions = await client.descriptions()
-    with Recorder(out, descriptions, time.time_ns, rotate_bytes) as recorder:
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, recorder.end)
-        async with client.published(recorder.take, KEPT_SAMPLES) as gave_way:
-            click.echo(f"recording rig {client.rig} to {out}", err=True)
-            try:
+    recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, recorder.end)
+    try:
+        with recorder:
+            async with client.published(recorder.take, KEPT_SAMPLES) as gave_way:
+                click.echo(f"recording rig {client.rig} to {out}", err=True)
                 await recorder.run(gave_way)
-            finally:
-                click.echo(recorder.summary, err=True)
+    finally:
+        click.echo(recorder.summary, err=True)  # only now: until the subscriptions are gone, more is recorded

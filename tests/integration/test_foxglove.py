@@ -86,6 +86,7 @@ async def test_an_address_that_is_taken_is_told():
             LiveView("rig", "127.0.0.1", view.port)
 
 
+@pytest.mark.timeout(120)
 async def test_a_daemon_is_shown_by_a_process_of_its_own():
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
         address = ("--address", "127.0.0.1:0")

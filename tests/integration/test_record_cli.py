@@ -7,11 +7,13 @@ from asyncio.subprocess import PIPE
 
 import pytest
 from click.testing import CliRunner
+from mcap.records import Channel
 
 from ldcnd.cli.main import cli
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.samples import PositionSample
+from ldcnd.recording.reading import Recording
 from ldcnd.recording.recorder import Recorder
 from tests.support.process import LDCND, ROOT, daemon
 
@@ -21,7 +23,14 @@ VALUE = PositionSample(
 POSITION = Sample("ldcn/sim/tele/x/position", *encode(VALUE, Encoding.JSON), SampleKind.PUT, VALUE.t)
 
 
+def is_on_the_disk(part, topic):
+    """Tell whether a file that is being written has a message of a topic."""
+    written = part.stat().st_size and Recording(part).records()
+    return bool(written) and any(isinstance(record, Channel) and record.topic == topic for record in written)
+
+
 @pytest.mark.real_time
+@pytest.mark.timeout(120)
 async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
     path, whole, tables = tmp_path / "run.mcap", tmp_path / "whole.mcap", tmp_path / "tables"
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
@@ -29,9 +38,8 @@ async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
         assert recording.stderr
         async with asyncio.timeout(45):
             await recording.stderr.readline()
-            while not path.with_name("run.mcap.part").exists():
-                await asyncio.sleep(0.05)
-            await asyncio.sleep(1.0)  # of real samples
+            while not is_on_the_disk(path.with_name("run.mcap.part"), "/ldcn/sim/tele/x/position"):
+                await asyncio.sleep(0.2)  # nothing tells when a file has grown
             recording.send_signal(signal.SIGTERM)
             _, told = await recording.communicate()
 
