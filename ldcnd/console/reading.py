@@ -1,9 +1,9 @@
 """What pages may read: the rigs, traces, what faults mean, and telemetry."""
 
 import asyncio
-import re
 from collections.abc import Callable
 from functools import partial
+from html import escape
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -22,14 +22,13 @@ from ldcnd.console.replies import RigsReply
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitors
 from ldcnd.errors import DriveFault, LdcndError, WrongState
+from ldcnd.fault_pages import page_text
 
 STATIC = Path(str(files("ldcnd.console") / "static"))
-FAULT_PAGES = Path(str(files("ldcnd") / "fault_pages"))
 SEND_TIME_S = 30.0
 """A page that takes nothing for so long is given up."""
 NOTHING_TO_SAY = 1008
 
-_FAULT_CODE = re.compile(r"[a-z0-9_]{1,64}")
 _FAULT_PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>{code} - ldcnd</title><link rel="stylesheet" href="/static/style/base.css"></head>
@@ -89,14 +88,18 @@ def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors) -> list[BaseRoute
 
 
 async def fault_page(request: Request) -> Response:
-    """Answer with what a fault means and what to do about it."""
+    """Answer with what a fault or an error means and what to do about it."""
     code = request.path_params["code"]
-    path = FAULT_PAGES / f"{code}.md"
-    if not _FAULT_CODE.fullmatch(code) or not path.is_file():
-        return PlainTextResponse(f"There is no page about {code[:64]!r} yet.", 404)
-    # html=False: what is in the text stays text
-    text = MarkdownIt("commonmark", {"html": False}).enable("table").render(path.read_text(encoding="utf-8"))
-    return HTMLResponse(_FAULT_PAGE.format(code=code, text=text))
+    text = page_text(code)
+    if text is None:
+        return PlainTextResponse(f"There is no page about {code[:64]!r}.", 404)
+    return HTMLResponse(_FAULT_PAGE.format(code=escape(code), text=as_html(text)))
+
+
+def as_html(text: str) -> str:
+    """Return CommonMark as HTML; what looks like HTML in it stays text."""
+    html: str = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
+    return html
 
 
 def _or_no_trace(answer: Answer) -> Answer:

@@ -27,8 +27,8 @@ from ldcnd.model.schemas import schema_name
 MAX_PAYLOAD_BYTES = 16 * 1024
 """No request is longer: the largest has a quarter of this."""
 
-MAX_RECEIVED_BYTES = 4 * 1024 * 1024
-"""No answer of a daemon is longer: 1000 events have a tenth of this."""
+MAX_RECEIVED_BYTES = 512 * 1024
+"""No answer of a daemon is longer: the plan of a hundred axes has a tenth of it."""
 
 ECHO_CHARACTERS = 80
 """An error repeats so much of what it complains about."""

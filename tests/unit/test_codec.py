@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from ldcnd.errors import ErrorCode, LdcndError, MalformedRequest, PayloadTooLarge, PositionLimit
 from ldcnd.messaging.codec import (
     MAX_PAYLOAD_BYTES,
+    MAX_RECEIVED_BYTES,
     Encoding,
     decode,
     decode_error,
@@ -22,6 +23,7 @@ from ldcnd.messaging.codec import (
 )
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.errors import ErrorReply
+from ldcnd.model.plan import RigPlan
 from ldcnd.model.requests import REQUEST_MODELS, HomeRequest, MoveAbsoluteRequest, PowerRequest, ResetRequest
 from ldcnd.model.samples import CurrentCommand, FaultEntry, FaultSample, StateSample
 
@@ -146,6 +148,15 @@ def test_the_longest_payload_is_taken_and_one_byte_more_is_not() -> None:
     with pytest.raises(PayloadTooLarge) as caught:
         decode(PowerRequest, longest + b" ", "application/json")
     assert caught.value.limit == MAX_PAYLOAD_BYTES
+
+
+def test_an_answer_may_be_longer_than_any_request() -> None:
+    """The plan of two full lines is."""
+    answer = b'{"rig":"sim","holds":true,"buses":[]}'
+
+    assert decode_received(RigPlan, answer.ljust(MAX_RECEIVED_BYTES), "application/json").holds
+    with pytest.raises(PayloadTooLarge):
+        decode_received(RigPlan, answer.ljust(MAX_RECEIVED_BYTES + 1), "application/json")
 
 
 @given(
