@@ -5,11 +5,13 @@ import asyncio
 import pytest
 
 from ldcnd.bus.wire_log import WireEvent, parse_records
+from ldcnd.bus_config import RecorderConfig
 from ldcnd.client.wire_log import fetch_wire_log
+from ldcnd.config import load_config
 from ldcnd.daemon.wire_dumps import LONGEST_DATA_BYTES
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.wire_log import WireLogReply, WireLogRequest
-from tests.support.rig import running_rig
+from tests.support.rig import SIMULATED, running_rig
 
 
 async def test_the_last_second_of_a_line_is_fetched_as_it_was_recorded():
@@ -45,8 +47,11 @@ async def test_a_long_log_comes_in_pages_without_gap_or_repetition():
 
 
 async def test_a_page_that_was_overwritten_starts_at_the_oldest_record_left():
-    async with running_rig() as rig:
-        await asyncio.sleep(90.0)
+    rigs = load_config(SIMULATED)
+    (bus,) = rigs.bus
+    short = rigs.model_copy(update={"bus": (bus.model_copy(update={"recorder": RecorderConfig(seconds=10.0)}),)})
+    async with running_rig(short) as rig:
+        await asyncio.sleep(15.0)
         name = rig.daemon.rig.buses[0].bus.settings.name
 
         page = await rig.client.rig_command("wire_log", WireLogRequest(bus=name, from_record=0), WireLogReply)
