@@ -23,7 +23,13 @@ FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option("--config", type=FILE, help="The rig's configuration, instead of the one in the capture.")
 @click.option("--real-time", is_flag=True, help="Take as long as it took then, instead of no time.")
 @click.option("--json", "as_json", is_flag=True, help="Print all that is published, as JSON lines, and nothing else.")
-@click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="error")
+@click.option(
+    "--log-level",
+    type=click.Choice(["debug", "info", "warning", "error"]),
+    default="error",
+    show_default=True,
+    help="Log nothing below this.",
+)
 def command(capture: Path, config: Path | None, *, real_time: bool, as_json: bool, log_level: str) -> None:
     """Play CAPTURE, the text of a wire log, to drivers and daemon, and show the events and faults that come of it.
 

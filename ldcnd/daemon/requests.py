@@ -135,7 +135,10 @@ class Requests:
         """Stop even if the payload is nonsense: a stop is always accepted."""
         name = self._keys.parse_stop(query.key)
         names = tuple(self._rig.axes) if name is None else (self._rig.axis(name).config.name,)
-        self._journal.stopped(name)
+        try:
+            self._journal.stopped(name)
+        except Exception:
+            log.exception("stop not recorded", key=query.key)  # it is carried out all the same
         return StopReply(axes=names, confirmed=await self._stop_once(names))
 
     async def _stop_once(self, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from ldcnd.model.authority import AcquireRequest, HolderList, LeaseReply
-from ldcnd.model.requests import HaltRequest, MoveVelocityRequest, PowerRequest, ReadParameterRequest, Verb
+from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply
+from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, ReadParameterRequest, Verb
 from ldcnd.model.samples import TelemetryItem
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), 
 
 
 async def holder(daemon, axis):
-    told = await daemon.rig.rig_command("holders", HaltRequest(), HolderList)
+    told = await daemon.rig.rig_command("holders", HoldersRequest(), HolderList)
     return next(each.client for each in told.holders if each.axis == axis)
 
 

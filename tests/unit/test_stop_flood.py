@@ -33,6 +33,7 @@ class SlowRig:
     confirmed: asyncio.Event = field(default_factory=asyncio.Event)
     stops: int = 0
     fails: bool = False
+    buses: tuple[object, ...] = ()
 
     def __post_init__(self) -> None:
         self.axes = {"x": SimpleNamespace(tracker=Tracker(), stoppable=True, config=SimpleNamespace(name="x"))}
@@ -146,3 +147,15 @@ async def test_stops_that_come_after_a_flood_are_sent_again(times: int):
         flood.stop()
 
     assert rig.stops == sent + 1
+
+
+async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
+    rig = SlowRig(buses=(object(),))  # no line that could be written to
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop()
+        await settled()
+        rig.confirmed.set()
+
+    assert rig.stops == 1
+    assert not flood.answers[0].is_error
