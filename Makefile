@@ -2,6 +2,8 @@
 PY := .venv/bin/python
 CONFIG ?= config/simulated.toml
 PYTHON ?= python3
+# where byte code must not be written, each of the hundreds of programs that tests start would compile every module anew
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: run test check fix docs dist soak bench screenshots clean
 
@@ -9,7 +11,7 @@ run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
 
 test: .venv/ready check
-	$(PY) -m pytest -n 4 --dist worksteal
+	$(PY) -m pytest -n 3 --dist worksteal
 
 check: .venv/ready
 	.venv/bin/ruff check .

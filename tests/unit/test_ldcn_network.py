@@ -34,6 +34,21 @@ class StuckRate(SimulatedDrive):
     baud = property(lambda _self: actual_baud(0x3F), lambda _self, _value: None)
 
 
+class DeafOnce(SimulatedDrive):
+    """A drive to which the first Set Baud Rate to the working rate was noise."""
+
+    _missed = False
+    _rate = 0.0
+
+    def _follow(self, rate):
+        if rate == actual_baud(0x0A) and not self._missed:
+            self._missed = True
+        else:
+            self._rate = rate
+
+    baud = property(lambda self: self._rate, _follow)
+
+
 @pytest.mark.parametrize(
     ("baud", "alternate", "code"),
     [
@@ -83,6 +98,14 @@ async def test_a_module_that_does_not_follow_takes_everybody_back_by_reset():
     assert report.remarks == ("address 2 does not answer at 115200 baud; the line stays at 19200",)
     assert [module.address for module in chain.modules] == [1, 2]
     assert follower.baud == actual_baud(0x3F)
+
+
+async def test_a_lost_change_of_the_rate_is_tried_once_more():
+    chain = Chain([DeafOnce(PIC_SERVO_V4, ModuleSettings(4), MotorPlant()) for _ in PAIR])
+    async with bare_network(chain, specs("pic-servo-v4", "pic-servo-v4")) as line:
+        report = await line.network.bring_up()
+
+    assert (report.baud, report.remarks) == (115_200, ())
 
 
 @pytest.mark.parametrize("left_at", [9600, 57_600, 115_200])

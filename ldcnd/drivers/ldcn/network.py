@@ -32,6 +32,8 @@ log = get_logger("ldcn")
 __all__ = ["RESET_BAUD", "LdcnNetwork"]
 
 MISSES_UNTIL_MUTE = 3
+RATE_ATTEMPTS = 2
+"""Set Baud to everybody is not answered: one packet that was lost must not decide on the rate for good."""
 
 
 class LdcnNetwork(Network):
@@ -142,19 +144,25 @@ class LdcnNetwork(Network):
                 f" would restart at {RESET_BAUD}",
                 remedy=f'set the far end to {RESET_BAUD} baud, or use start = "adopt"',
             )
-        await self._addressing.reset_all()
-        modules = await self._addressing.address_all(len(self._expected))
-        remarks = self._compare(modules)
-        deaf = await self._change_rate(modules)
-        if deaf is None:
-            return modules, remarks
-        await self._addressing.reset_all()
-        modules = await self._addressing.address_all(len(self._expected))
+        for _ in range(RATE_ATTEMPTS):
+            modules, remarks = await self._address_afresh()
+            deaf = await self._change_rate(modules)
+            if deaf is None:
+                return modules, remarks
+        modules, remarks = await self._address_afresh()
         self._rate.working = RESET_BAUD
-        return modules, (
-            *self._compare(modules),
-            f"address {deaf} does not answer at {self._baud} baud; the line stays at {RESET_BAUD}",
-        )
+        told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {RESET_BAUD}"
+        return modules, (*remarks, told)
+
+    async def _address_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
+        """Bring everybody to the rate of power-up and give out addresses; return who is where, and remarks.
+
+        Raises:
+            NetworkMismatch: they are not those of the configuration.
+        """
+        await self._addressing.reset_all()
+        modules = await self._addressing.address_all(len(self._expected))
+        return modules, self._compare(modules)
 
     async def _change_rate(self, modules: Mapping[int, Identity]) -> int | None:
         """Move everybody to the working rate; return the first module that did not follow, None if all did."""
