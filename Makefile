@@ -27,10 +27,9 @@ fix: .venv/ready
 	.venv/bin/ldcnd schema configuration
 	.venv/bin/ldcnd schema cli
 
-# the site in build/docs, warnings as errors, and its tutorials followed; apart from `make test`, whose time it would eat up
-docs: .venv/docs-ready
+# the site in build/docs, warnings as errors
+docs: .venv/ready
 	.venv/bin/sphinx-build -W --keep-going -q -b html -d build/doctrees docs build/docs
-	$(PY) -m pytest tests/integration/test_pages.py -m pages
 
 # wheel, sdist and the bill of materials, the same bytes from the same commit
 dist: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct)
@@ -54,10 +53,6 @@ screenshots: .venv/ready
 	$(PYTHON) -m venv .venv
 	.venv/bin/pip install --quiet --disable-pip-version-check uv
 	.venv/bin/uv pip install --quiet --python $(PY) -c constraints.txt -e '.[test]'
-	@touch $@
-
-.venv/docs-ready: .venv/ready
-	.venv/bin/uv pip install --quiet --python $(PY) -c constraints.txt -e '.[test,docs]'
 	@touch $@
 
 clean:

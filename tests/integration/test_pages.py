@@ -95,7 +95,6 @@ def test_every_link_leads_somewhere(page) -> None:
             assert (page.parent / place).exists(), target
 
 
-@pytest.mark.pages
 @pytest.mark.real_time
 @pytest.mark.timeout(600)
 async def test_the_tutorials_can_be_followed(tmp_path) -> None:
