@@ -12,7 +12,8 @@ from ldcnd.bus.wire_log import WireEvent
 from ldcnd.daemon.axis_poller import AxisPoller, Deliver, wanted_rates_hz
 from ldcnd.daemon.axis_service import AxisService
 from ldcnd.daemon.demand import Demand
-from ldcnd.drivers.driver import AxisReading, BringUpReport, Network, ReadingListeners, StopMode
+from ldcnd.drivers.driver import AxisReading, ReadingListeners, StopMode
+from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import BusError, LdcndError
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger

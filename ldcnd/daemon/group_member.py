@@ -11,7 +11,8 @@ from ldcnd.daemon.axis_motion import AxisMotion
 from ldcnd.daemon.axis_tracker import Completion
 from ldcnd.daemon.motion_plan import MotionPlan
 from ldcnd.daemon.procedure import Procedure, Turn
-from ldcnd.drivers.driver import AxisReading, Network
+from ldcnd.drivers.driver import AxisReading
+from ldcnd.drivers.network import Network
 from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, WrongState
 from ldcnd.model.axes import AxisState
 from ldcnd.model.replies import CommandReply

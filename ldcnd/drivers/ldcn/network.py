@@ -10,7 +10,7 @@ from typing import Any
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
-from ldcnd.drivers.driver import AxisDriver, AxisSpec, BringUpReport, Motion, Network, StopMode
+from ldcnd.drivers.driver import AxisDriver, AxisSpec, Motion, StopMode
 from ldcnd.drivers.ldcn.addressing import Addressing
 from ldcnd.drivers.ldcn.adoption import Adopted, Adoption
 from ldcnd.drivers.ldcn.group_plan import GroupPlan
@@ -23,6 +23,7 @@ from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.rejoin import Rejoin
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
+from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import NetworkMismatch
 from ldcnd.exchange import Exchange
 from ldcnd.log import get_logger

@@ -13,7 +13,8 @@ from typing import Any
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.wire_log import WireEvent
-from ldcnd.drivers.driver import AxisDriver, BringUpReport, Network
+from ldcnd.drivers.driver import AxisDriver
+from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.drivers.smartstep import commands
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.axis import SmartStepAxis, UnitSpec

@@ -1,0 +1,114 @@
+"""The contract between the daemon and all drives of one line: how it comes up, and what concerns them together."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ldcnd.bus.poller import Poller
+from ldcnd.bus.resync import Resync
+from ldcnd.drivers.driver import AxisDriver, Motion, StopMode
+from ldcnd.drivers.line import FoundModule
+from ldcnd.errors import NotSupported
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpReport:
+    """How a line came up.
+
+    Attributes:
+        baud: the rate in use.
+        identities: what was found, by axis name.
+        reset: the drives were reset, so their positions count from 0.
+        remarks: what differs from the configuration or deserves a look.
+    """
+
+    baud: int
+    identities: Mapping[str, str]
+    reset: bool
+    remarks: tuple[str, ...] = ()
+
+
+class Network(ABC):
+    """All drives of one line.
+
+    Attributes:
+        axes: by axis name.
+        resync: how the bus gets this line back in step.
+    """
+
+    axes: Mapping[str, AxisDriver]
+    resync: Resync
+
+    @property
+    def modules(self) -> tuple[FoundModule, ...]:
+        """What was found on the line, by address; empty while that is not known."""
+        return ()
+
+    @property
+    def watches(self) -> tuple[Poller[Any], ...]:
+        """Who asks modules that are no axes how they are; to be added to the bus once the line is up."""
+        return ()
+
+    def incomplete(self) -> bool:
+        """Tell whether something on the line has stopped answering that `rejoin` may bring back."""
+        return False
+
+    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:  # noqa: ARG002 - nobody is lost here
+        """Bring back drives that lost power without disturbing the others; moves and resets nothing.
+
+        Args:
+            restarted: told the axis whose drive had lost power, before that drive can answer again.
+
+        Returns:
+            The axes whose drives answer again, restarted or only cut off for a while.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        return frozenset()
+
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:  # noqa: B027 - optional
+        """Stop axes with as few packets as the family can, before anything else that waits; nobody confirms it.
+
+        Args:
+            mode: see `StopMode`.
+            names: axes whose loops are closed: a smooth or abrupt stop would close an open one.
+
+        Raises:
+            BusError: the line failed; each axis must be stopped by itself in any case.
+        """
+
+    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
+        """Load motions, and start them all in the same servo cycle; if one cannot be loaded nothing starts.
+
+        Args:
+            motions: by axis name; exactly the members of one group.
+            still_wanted: raises when a stop has overtaken the motion; asked before anything starts.
+
+        Raises:
+            NotSupported: these axes are no group.
+            DriveFault: a drive is not ready; nothing started.
+            OutcomeUnknown: a drive did not prove that it started; the group was stopped.
+            BusError: the line failed before the start.
+        """
+        raise NotSupported("this family cannot start several drives together")
+
+    async def snapshot(self) -> Mapping[str, int]:
+        """Return the positions of all axes at one instant, in counts by axis name.
+
+        Raises:
+            NotSupported: the family cannot, or the configuration forbids it.
+            WrongState: a homing needs the registers.
+            BusError: the line failed, or a drive missed the instant.
+        """
+        raise NotSupported("this family cannot freeze positions")
+
+    @abstractmethod
+    async def bring_up(self) -> BringUpReport:
+        """Make the drives ready to be polled, moving nothing.
+
+        Raises:
+            NetworkMismatch: what answers is not what the configuration expects; says precisely what differs.
+            BusError: the line failed meanwhile.
+        """
