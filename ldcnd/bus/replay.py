@@ -277,7 +277,7 @@ class ReplayLine(Transport):
         self._replay = replay
 
     @property
-    def lag_s(self) -> float:  # type: ignore[override] # an attribute elsewhere
+    def lag_s(self) -> float:
         """See `Transport`: a host that was held up still took what it found then."""
         return self._replay.lag_s()
 

@@ -23,11 +23,14 @@ class Transport(ABC):
 
     Attributes:
         fixed_baud: the rate cannot be changed from here (a TCP serial server).
-        lag_s: how much later than the line has it the next reply may come out of this pipe, known delays only.
     """
 
     fixed_baud = False
-    lag_s: float = 0.0
+
+    @property
+    def lag_s(self) -> float:
+        """How much later than the line has it the next reply may come out of this pipe; known delays only."""
+        return 0.0
 
     @abstractmethod
     def attach(self, receiver: Receiver) -> None:
