@@ -5,7 +5,7 @@ import asyncio
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.client.fleet import AxisView, RigView, survey
+from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.errors import SessionError
 from ldcnd.messaging.session import Session
 
@@ -37,7 +37,7 @@ def command(target: Target, watch: float | None) -> None:
     target.run_session(work)
 
 
-def table(rig: RigView) -> str:
+def table(rig: RigReport) -> str:
     """Return a rig as lines of text: itself, what is wrong, its axes."""
     version = f"ldcnd {rig.daemon.version}" if rig.daemon else "version unknown"
     lines = [f"{rig.rig}  {version}  run {rig.instance}  {'look at it' if rig.problems else 'well'}"]
@@ -46,7 +46,7 @@ def table(rig: RigView) -> str:
     return "\n".join(lines)
 
 
-def _axis(axis: AxisView) -> str:
+def _axis(axis: AxisReport) -> str:
     info, state, health = axis.info, axis.state, axis.health
     where = f"{info.bus}/{info.address}"
     what = f"{state.state}{' (stop latched)' if state.stop_latched else ''}" if state else "unknown"

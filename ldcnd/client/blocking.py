@@ -13,7 +13,7 @@ from functools import wraps
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from ldcnd.client import connecting, events, lease, progress
-from ldcnd.client.fleet import RigView, survey
+from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
 from ldcnd.messaging.zenoh_session import open_zenoh_session
@@ -163,7 +163,7 @@ def open_rig(settings: ZenohSettings, rig: str | None = None) -> Iterator[Rig]:
         yield Rig(loop, client)
 
 
-def fleet(settings: ZenohSettings, rig: str | None = None) -> tuple[RigView, ...]:
+def fleet(settings: ZenohSettings, rig: str | None = None) -> tuple[RigReport, ...]:
     """See `ldcnd.client.fleet.survey`."""
     with _running_loop() as loop, loop.inside(open_zenoh_session(settings)) as session:
         return loop.run(survey(session, rig))

@@ -18,7 +18,7 @@ LATE_S = 0.25
 """A daemon whose timers come later than this has too much to do."""
 
 
-class AxisView(Frozen):
+class AxisReport(Frozen):
     """One axis of a fleet."""
 
     info: AxisInfo
@@ -29,7 +29,7 @@ class AxisView(Frozen):
     """How fresh its samples are; null before the first report."""
 
 
-class RigView(Frozen):
+class RigReport(Frozen):
     """One run of a daemon, and its rig."""
 
     rig: str
@@ -42,13 +42,13 @@ class RigView(Frozen):
     """How its process is doing; null before the first report."""
     buses: tuple[BusHealth, ...] = ()
     """How its lines are doing."""
-    axes: tuple[AxisView, ...] = ()
+    axes: tuple[AxisReport, ...] = ()
     """Its axes, in the order of lines and addresses."""
     problems: tuple[str, ...] = ()
     """What somebody should look at; empty when all is well."""
 
 
-async def survey(session: Session, rig: str | None = None) -> tuple[RigView, ...]:
+async def survey(session: Session, rig: str | None = None) -> tuple[RigReport, ...]:
     """Ask every rig how it is, and return them by name; what one of them does not answer keeps nobody waiting.
 
     A daemon that shows its liveliness token and answers nothing is in the list, with that as its problem.
@@ -85,9 +85,9 @@ async def _daemons(session: Session) -> list[DaemonInfo]:
         return []
 
 
-async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, *, rival: bool) -> RigView:
+async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, *, rival: bool) -> RigReport:
     """Ask one rig; what it does not answer is a problem of its own."""
-    view = RigView(rig=daemon.rig, instance=daemon.instance, daemon=daemon, health=None)
+    view = RigReport(rig=daemon.rig, instance=daemon.instance, daemon=daemon, health=None)
     client = RigClient(session, daemon.rig)
     try:
         async with slots:
@@ -100,19 +100,19 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
     freshness = {axis.axis: axis for bus in buses for axis in bus.axes}
     known = {axis.axis: axis for axis in axes}  # two daemons on one rig tell of each axis twice
     views = tuple(
-        AxisView(info=axis, state=states.get(name), health=freshness.get(name)) for name, axis in known.items()
+        AxisReport(info=axis, state=states.get(name), health=freshness.get(name)) for name, axis in known.items()
     )
     problems = ["another daemon serves this rig: nothing is moved"] if rival else []
     problems += _problems(health, buses, views)
     return view.model_copy(update={"health": health, "buses": buses, "axes": views, "problems": tuple(problems)})
 
 
-def _silent(rig: str, instance: str) -> RigView:
+def _silent(rig: str, instance: str) -> RigReport:
     problem = "is alive and does not answer: frozen, or this login may not ask it"
-    return RigView(rig=rig, instance=instance, daemon=None, health=None, problems=(problem,))
+    return RigReport(rig=rig, instance=instance, daemon=None, health=None, problems=(problem,))
 
 
-def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: tuple[AxisView, ...]) -> list[str]:
+def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: tuple[AxisReport, ...]) -> list[str]:
     problems = []
     if health and health.loop_lag_s > LATE_S:
         problems.append(f"the daemon is late by {health.loop_lag_s:.2f} s")

@@ -21,7 +21,7 @@ from typing import TypeVar
 import pytest
 
 from ldcnd.client.events import Events, follow_events
-from ldcnd.client.fleet import RigView, survey
+from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import LeaseExpired, OutcomeUnknown, SessionError
@@ -154,9 +154,9 @@ async def until(ready: Callable[[], Awaitable[bool]], site: SiteNetwork) -> None
         pytest.fail(f"not within {WITHIN_S} s\n{said}")
 
 
-async def well(session: Session, site: SiteNetwork, *rigs: str) -> dict[str, RigView]:
+async def well(session: Session, site: SiteNetwork, *rigs: str) -> dict[str, RigReport]:
     """Wait until exactly these rigs are seen, with nothing wrong."""
-    found: dict[str, RigView] = {}
+    found: dict[str, RigReport] = {}
 
     async def ready() -> bool:
         views = await survey(session)
