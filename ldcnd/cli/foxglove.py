@@ -1,12 +1,12 @@
 """`ldcnd foxglove`: a running rig, live in the Foxglove app."""
 
 import asyncio
-import signal
 
 import click
 
 from ldcnd.cli.address import Address, parse_address
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.ending import on_end
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
 
@@ -29,9 +29,7 @@ async def _serve(client: RigClient, address: Address) -> None:
     except ImportError as error:
         raise ConfigError("foxglove-sdk is not installed", remedy="install ldcnd[foxglove]") from error
     ending = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, ending.set)
+    on_end(ending.set)
     with LiveView(f"ldcnd {client.rig}", address.host, address.port) as view:
         async with client.published(view.take):
             click.echo(f"rig {client.rig} on ws://{address.host}:{view.port}")

@@ -1,12 +1,12 @@
 """`ldcnd metrics`: the health of a running daemon for Prometheus, from a process of its own."""
 
 import asyncio
-import signal
 
 import click
 
 from ldcnd.cli.address import Address, parse_address
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.ending import on_end
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
 
@@ -35,8 +35,7 @@ async def _serve(client: RigClient, address: Address) -> None:
     registry = CollectorRegistry()
     registry.register(collector)
     ending = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, ending.set)
+    on_end(ending.set)
     async with client.health(collector.take):
         try:
             server, thread = start_http_server(address.port, address.host, registry)

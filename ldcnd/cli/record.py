@@ -1,7 +1,5 @@
 """`ldcnd record`: what a rig publishes, in MCAP files for Foxglove and PlotJuggler."""
 
-import asyncio
-import signal
 import sys
 import time
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.ending import on_end
 from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
 from ldcnd.client.rig_client import RigClient
 
@@ -65,9 +64,7 @@ async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
     from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder  # noqa: PLC0415 - needs an optional package
 
     recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes)
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, recorder.end)
+    on_end(recorder.end)
     try:
         with recorder:
             async with client.published(recorder.take, KEPT_SAMPLES) as gave_way:
