@@ -85,6 +85,8 @@ def main() -> NoReturn:
         sys.exit(130)
     except ConfigError as error:
         print(error.message, file=sys.stderr)
+        if error.remedy:
+            print(f"  {error.remedy}", file=sys.stderr)
         sys.exit(EXIT_CONFIG)
     except LdcndError as error:
         print(f"{error.message} [{error.code}]", file=sys.stderr)
