@@ -1,23 +1,30 @@
-"""Where a command serves: HOST:PORT."""
+"""The option that says where a command serves."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import TypeVar
 
 import click
 
-LARGEST_PORT = 65_535
+from ldcnd.errors import ConfigError
+from ldcnd.listen_address import ListenAddress, parse_listen_address
+
+CommandT = TypeVar("CommandT", bound=Callable[..., object])
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
-    """A host, without the brackets of IPv6, and a port; 0 stands for one that is free."""
+def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
+    """Return an option of that name, whose value is a `ListenAddress`; anything but HOST:PORT is wrong usage."""
+    return click.option(
+        name,
+        callback=_parsed,
+        default=default,
+        show_default=True,
+        metavar="HOST:PORT",
+        help="Where to serve; port 0 is any.",
+    )
 
-    host: str
-    port: int
 
-
-def parse_address(_context: click.Context, _parameter: click.Parameter, value: str) -> Address:
-    """Return the address that an option names."""
-    host, _, port = value.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > LARGEST_PORT:
-        raise click.BadParameter(f"{value!r} is not HOST:PORT")
-    return Address(host.strip("[]"), int(port))
+def _parsed(_context: click.Context, _parameter: click.Parameter, value: str) -> ListenAddress:
+    try:
+        return parse_listen_address(value)
+    except ConfigError as error:
+        raise click.BadParameter(error.message) from error

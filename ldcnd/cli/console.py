@@ -5,8 +5,10 @@ from pathlib import Path
 
 import click
 
+from ldcnd.cli.address import address_option
 from ldcnd.cli.connection import DEFAULT_ENDPOINT
 from ldcnd.errors import ConfigError
+from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 
@@ -20,7 +22,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option("--config", type=FILE, help="Zenoh configuration file to start from, for each endpoint.")
 @click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
-@click.option("--listen", default=DEFAULT_ADDRESS, show_default=True, help="HOST:PORT to serve on; port 0 is any.")
+@address_option("--listen", DEFAULT_ADDRESS)
 @click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
 @click.option("--certificate", type=FILE, help="PEM file: serve HTTPS with this certificate.")
 @click.option("--key", type=FILE, help="PEM file with its key.")
@@ -37,7 +39,7 @@ def command(
     connect: tuple[str, ...],
     config: Path | None,
     rig: tuple[str, ...],
-    listen: str,
+    listen: ListenAddress,
     host: tuple[str, ...],
     certificate: Path | None,
     key: Path | None,
@@ -53,7 +55,7 @@ def command(
     try:
         from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
         from ldcnd.console.server import serve  # noqa: PLC0415
-        from ldcnd.console.settings import ConsoleSettings, parse_address, read_token  # noqa: PLC0415
+        from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError(f"{error.name} is not installed", remedy="install ldcnd[console]") from error
     configure_logging(level=log_level)
@@ -65,7 +67,7 @@ def command(
         )
         or (Endpoint(str(config), ZenohSettings(mode=None, config_file=config, instance="ldcnd console")),),
         rigs=rig,
-        address=parse_address(listen),
+        address=listen,
         hosts=host,
         certificate=certificate,
         key=key,

@@ -4,26 +4,25 @@ import asyncio
 
 import click
 
-from ldcnd.cli.address import Address, parse_address
+from ldcnd.cli.address import address_option
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
+from ldcnd.listen_address import ListenAddress
 
 DEFAULT_ADDRESS = "127.0.0.1:8765"
 
 
 @click.command()
-@click.option(
-    "--address", callback=parse_address, default=DEFAULT_ADDRESS, show_default=True, help="Where to serve, HOST:PORT."
-)
+@address_option("--address", DEFAULT_ADDRESS)
 @with_target
-def command(target: Target, address: Address) -> None:
+def command(target: Target, address: ListenAddress) -> None:
     """Show a rig in Foxglove until SIGTERM or SIGINT; read-only, and open to whoever reaches the address."""
     target.run(lambda client: _serve(client, address))
 
 
-async def _serve(client: RigClient, address: Address) -> None:
+async def _serve(client: RigClient, address: ListenAddress) -> None:
     try:
         from ldcnd.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
     except ImportError as error:
@@ -32,5 +31,5 @@ async def _serve(client: RigClient, address: Address) -> None:
     on_end(ending.set)
     with LiveView(f"ldcnd {client.rig}", address.host, address.port) as view:
         async with client.published(view.take):
-            click.echo(f"rig {client.rig} on ws://{address.host}:{view.port}")
+            click.echo(f"rig {client.rig} on ws://{address.in_url}:{view.port}")
             await ending.wait()

@@ -4,26 +4,25 @@ import asyncio
 
 import click
 
-from ldcnd.cli.address import Address, parse_address
+from ldcnd.cli.address import address_option
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
+from ldcnd.listen_address import ListenAddress
 
 DEFAULT_ADDRESS = "127.0.0.1:9464"
 
 
 @click.command()
-@click.option(
-    "--address", callback=parse_address, default=DEFAULT_ADDRESS, show_default=True, help="Where to serve, HOST:PORT."
-)
+@address_option("--address", DEFAULT_ADDRESS)
 @with_target
-def command(target: Target, address: Address) -> None:
+def command(target: Target, address: ListenAddress) -> None:
     """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for whoever reads them."""
     target.run(lambda client: _serve(client, address))
 
 
-async def _serve(client: RigClient, address: Address) -> None:
+async def _serve(client: RigClient, address: ListenAddress) -> None:
     try:
         from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415 - an optional package
 
@@ -40,9 +39,9 @@ async def _serve(client: RigClient, address: Address) -> None:
         try:
             server, thread = start_http_server(address.port, address.host, registry)
         except OSError as error:
-            where = f"{address.host}:{address.port}"
+            where = f"{address.in_url}:{address.port}"
             raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
-        click.echo(f"metrics on http://{address.host}:{server.server_port}/metrics")
+        click.echo(f"metrics on http://{address.in_url}:{server.server_port}/metrics")
         try:
             await ending.wait()
         finally:

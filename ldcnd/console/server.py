@@ -24,9 +24,10 @@ from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.reading import STATIC, reading_routes
 from ldcnd.console.replies import LinkReply
 from ldcnd.console.rigs import Rigs
-from ldcnd.console.settings import Address, ConsoleSettings
+from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.errors import ConfigError
+from ldcnd.listen_address import ListenAddress
 from ldcnd.messaging.zenoh_config import zenoh_config
 
 END_TIME_S = 1
@@ -124,7 +125,7 @@ def _config(app: ASGIApp, settings: ConsoleSettings) -> uvicorn.Config:
     return config
 
 
-def _listen(address: Address) -> socket.socket:
+def _listen(address: ListenAddress) -> socket.socket:
     family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
     listening = socket.socket(family)
     try:

@@ -1,46 +1,17 @@
 """How the console is served, and what it refuses: nobody off this machine gets in without TLS and a token."""
 
-import ipaddress
 import stat
 from dataclasses import dataclass
 from pathlib import Path
 
 from ldcnd.console.rigs import Endpoint
 from ldcnd.errors import ConfigError
+from ldcnd.listen_address import ListenAddress
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 SHORTEST_TOKEN = 32
 """Characters; as many random ones cannot be guessed."""
-HIGHEST_PORT = 0xFFFF
 EVERY_ADDRESS = frozenset({"0.0.0.0", "::"})  # noqa: S104 - what is listened on is the operator's choice
-
-
-@dataclass(frozen=True, slots=True)
-class Address:
-    """Where to listen.
-
-    Attributes:
-        host: a name or an IP address, without brackets.
-        port: 0 is any free one.
-    """
-
-    host: str
-    port: int
-
-    @property
-    def is_loopback(self) -> bool:
-        """Nobody off this machine can connect to it."""
-        if self.host == "localhost":
-            return True
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return False
-
-    @property
-    def in_url(self) -> str:
-        """The host as it stands in a URL and in the Host header."""
-        return f"[{self.host}]" if ":" in self.host else self.host
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +31,7 @@ class ConsoleSettings:
 
     endpoints: tuple[Endpoint, ...]
     rigs: tuple[str, ...]
-    address: Address
+    address: ListenAddress
     hosts: tuple[str, ...] = ()
     certificate: Path | None = None
     key: Path | None = None
@@ -108,19 +79,6 @@ class ConsoleSettings:
     def shown_host(self) -> str:
         """The host of the printed link."""
         return self.hosts[0] if self.hosts else self.address.in_url
-
-
-def parse_address(text: str) -> Address:
-    """Return the address that is written as HOST:PORT.
-
-    Raises:
-        ConfigError: it is not.
-    """
-    host, _, port = text.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not host or not port.isdecimal() or int(port) > HIGHEST_PORT:
-        raise ConfigError(f"{text!r} is not HOST:PORT", value=text)
-    return Address(host, int(port))
 
 
 def read_token(path: Path) -> str:

@@ -13,8 +13,9 @@ from ldcnd.console.feed import Feed
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.rigs import Endpoint, Rigs
 from ldcnd.console.server import build_app
-from ldcnd.console.settings import Address, ConsoleSettings
+from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import Visitors
+from ldcnd.listen_address import ListenAddress
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from tests.support.browser import Browser, WebAnswer, WebQuestion, web_answer
@@ -138,7 +139,7 @@ async def console_of(rig: RunningRig, session: Session) -> AsyncIterator[Running
     values = LatestValues()
     rigs = Rigs(values)
     visitors = Visitors(loop.time)
-    settings = ConsoleSettings((ENDPOINT,), (), Address("127.0.0.1", 8470))
+    settings = ConsoleSettings((ENDPOINT,), (), ListenAddress("127.0.0.1", 8470))
     async with Feed(values, lambda: EPOCH_NS + round(loop.time() * 1e9)) as feed, asyncio.TaskGroup() as group:
         app = build_app(settings, rigs, feed, visitors, lambda: f"{ORIGIN}/?link={visitors.new_link()}")
 
