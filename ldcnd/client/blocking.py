@@ -118,6 +118,7 @@ class Rig(Facade[RigClient]):
     monitors = _waiting(RigClient.monitors)
     state = _waiting(RigClient.state)
     states = _waiting(RigClient.states)
+    faults = _waiting(RigClient.faults)
     last_health = _waiting(RigClient.last_health)
     last_bus_health = _waiting(RigClient.last_bus_health)
     command = _waiting(RigClient.command)

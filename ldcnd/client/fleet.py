@@ -4,13 +4,14 @@ import asyncio
 
 from ldcnd.client import presence
 from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.client.trouble import axis_troubles
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.messaging.session import Session
-from ldcnd.model.axes import AxisInfo, LinkState
+from ldcnd.model.axes import AxisInfo
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.model.meta import DaemonInfo
-from ldcnd.model.samples import StateSample
+from ldcnd.model.samples import FaultSample, StateSample
 
 ASKED_AT_ONCE = 8
 """So many rigs are asked one beside the other."""
@@ -25,6 +26,8 @@ class AxisReport(Frozen):
     """What it is."""
     state: StateSample | None
     """Its last state; null before the first."""
+    fault: FaultSample | None
+    """Its last faults; null before the first."""
     health: AxisHealth | None
     """How fresh its samples are; null before the first report."""
 
@@ -93,6 +96,7 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
         async with slots:
             axes = await client.axes()
             states = await client.states()
+            faults = await client.faults()
             health = await client.last_health()
             buses = tuple(sorted(await client.last_bus_health(), key=lambda bus: bus.bus))
     except LdcndError as error:
@@ -100,7 +104,8 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
     freshness = {axis.axis: axis for bus in buses for axis in bus.axes}
     known = {axis.axis: axis for axis in axes}  # two daemons on one rig tell of each axis twice
     views = tuple(
-        AxisReport(info=axis, state=states.get(name), health=freshness.get(name)) for name, axis in known.items()
+        AxisReport(info=axis, state=states.get(name), fault=faults.get(name), health=freshness.get(name))
+        for name, axis in known.items()
     )
     problems = ["another daemon serves this rig: nothing is moved"] if rival else []
     problems += _problems(health, buses, views)
@@ -118,12 +123,10 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
         problems.append(f"the daemon is late by {health.loop_lag_s:.2f} s")
     problems += [f"line {bus.bus} is not up" for bus in buses if not bus.up]
     down = {bus.bus for bus in buses if not bus.up}
-    for axis in axes:
-        name, state = axis.info.axis, axis.state
-        if state and state.link is not LinkState.UP and axis.info.bus not in down:
-            problems.append(
-                f"{name}: its drive {'does not answer' if state.link is LinkState.DOWN else 'misses polls'}"
-            )
-        if axis.health and axis.health.faults:
-            problems.append(f"{name}: {axis.health.faults} active fault{'s' if axis.health.faults > 1 else ''}")
+    problems += [
+        f"{axis.info.axis}: {trouble.text}"
+        for axis in axes
+        if axis.info.bus not in down
+        for trouble in axis_troubles(axis.state, axis.fault, axis.health)
+    ]
     return problems

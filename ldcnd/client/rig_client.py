@@ -20,7 +20,7 @@ from ldcnd.model.plan import RigPlan
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.replies import CommandReply, StopReply
 from ldcnd.model.requests import REPLY_MODELS, Request, Verb
-from ldcnd.model.samples import SAMPLE_MODELS, StateSample, TelemetryItem
+from ldcnd.model.samples import SAMPLE_MODELS, FaultSample, StateSample, TelemetryItem
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
 from ldcnd.model.verbs import PLAN, WHY
@@ -160,6 +160,11 @@ class RigClient:
         """Return the last state of every axis that has one."""
         answers = await self._session.query(self._keys.telemetry_pattern("*", TelemetryItem.STATE))
         return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, StateSample) for answer in answers}
+
+    async def faults(self) -> dict[str, FaultSample]:
+        """Return what is wrong with every axis that has said so much."""
+        answers = await self._session.query(self._keys.telemetry_pattern("*", TelemetryItem.FAULT))
+        return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, FaultSample) for answer in answers}
 
     async def state(self, axis: str) -> StateSample | None:
         """Return the axis's last state, or None when there is none yet."""

@@ -1,19 +1,8 @@
 """A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
 
-from enum import IntEnum
-
+from ldcnd.client.trouble import Severity
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.frozen import Frozen
-
-
-class Severity(IntEnum):
-    """How much something asks for attention; the highest is shown first."""
-
-    FINE = 0
-    NOTICE = 1
-    """It works, with a doubt: missed polls, uncertain values, a latched stop."""
-    WRONG = 2
-    """It does not work: a fault, a drive or a line that does not answer."""
 
 
 class Glance(Frozen):

@@ -7,16 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
+from ldcnd.client.trouble import Severity, Trouble, axis_troubles
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.authority import HolderList
-from ldcnd.model.axes import AxisInfo, LinkState, Moving, Quality
+from ldcnd.model.axes import AxisInfo, Moving
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.health import AxisHealth, BusHealth, LaneHealth
+from ldcnd.model.health import BusHealth, LaneHealth
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.samples import AdcSample, FaultSample, PositionSample, StateSample, TelemetryItem, VelocitySample
-from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance, Severity
+from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 SILENT_S = 3.0
 """A daemon that has not reported for so long, three reports, is said to be silent."""
@@ -115,7 +116,7 @@ class RigView:
         fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
-        severity, trouble = _axis_trouble(state, fault, position)
+        worst = next(iter(axis_troubles(state, fault, health)), _news(state))
         return AxisGlance(
             axis=info.axis,
             bus=info.bus,
@@ -132,8 +133,8 @@ class RigView:
             rate_wanted_hz=health.rate_wanted_hz if health else None,
             link=state.link if state else None,
             holder=self._description.holders.get(info.axis) if self._description else None,
-            severity=severity,
-            trouble=trouble,
+            severity=worst.severity,
+            trouble=worst.text,
         )
 
     def _bus(self, report: BusHealth) -> BusGlance:
@@ -146,8 +147,6 @@ class RigView:
             severity, trouble = Severity.WRONG, "down: its drives are not polled"
         elif grown > 0:
             severity, trouble = Severity.NOTICE, f"{grown} exchanges brought nothing to be trusted in the last second"
-        elif slow := _slow(report.axes):
-            severity, trouble = Severity.NOTICE, f"polled less often than configured: {', '.join(slow)}"
         poll, stop = _lane(report, "poll"), _lane(report, "stop")
         return BusGlance(
             bus=report.bus,
@@ -171,36 +170,9 @@ class RigView:
         return decode_received(model, kept.sample.payload, kept.sample.encoding)
 
 
-def _axis_trouble(
-    state: StateSample | None, fault: FaultSample | None, position: PositionSample | None
-) -> tuple[Severity, str]:
-    """Return the one thing to be said of an axis."""
-    if state is None:
-        return Severity.NOTICE, "nothing was heard of it yet"
-    if state.link is LinkState.DOWN:
-        return Severity.WRONG, "the drive does not answer"
-    if fault and (stopping := [entry for entry in fault.active if entry.stops]):
-        first = fault.first if fault.first and fault.first.stops else stopping[0]
-        return Severity.WRONG, f"{first.code}: {first.text}"
-    if state.stop_latched:
-        return Severity.NOTICE, "a stop is latched; reset clears it"
-    if fault and fault.active:
-        return Severity.NOTICE, f"{fault.active[0].code}: {fault.active[0].text}"
-    if state.link is LinkState.DEGRADED:
-        return Severity.NOTICE, "the drive missed its latest polls"
-    if position and position.quality is not Quality.GOOD:
-        return Severity.NOTICE, f"its position is {position.quality}"
-    return (Severity.NOTICE, state.last_error) if state.last_error else (Severity.FINE, "")
-
-
-ENOUGH = 0.9
-"""A rate counts as kept from this share of the configured one on: a report sees a period more or less."""
-
-
-def _slow(axes: tuple[AxisHealth, ...]) -> list[str]:
-    return [
-        axis.axis for axis in axes if axis.link is not LinkState.DOWN and axis.rate_hz < ENOUGH * axis.rate_wanted_hz
-    ]
+def _news(state: StateSample | None) -> Trouble:
+    """Return what is shown of an axis without trouble: how its last command ended, if that was not as it was asked."""
+    return Trouble(Severity.NOTICE, state.last_error) if state and state.last_error else Trouble(Severity.FINE, "")
 
 
 def _errors(report: BusHealth) -> int:

@@ -238,6 +238,7 @@ async def test_roles_hold_across_routers(site: SiteNetwork) -> None:
         opened = await client.state("x")
         stopped, told = await at_the_desk(site, "vic", "axis", "stop", "x", "--rig", "mill")
         latched = await client.state("x")
+        await client.command("x", Verb.RESET, ResetRequest())  # the tests that follow find the fleet well
 
     assert untouched
     assert opened

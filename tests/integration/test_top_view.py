@@ -3,12 +3,12 @@
 import asyncio
 from contextlib import asynccontextmanager
 
+from ldcnd.client.trouble import Severity
 from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.model.axes import AxisState, LinkState, Moving
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.requests import HaltRequest, MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.top.columns import as_text, headline
 from ldcnd.top.follow import follow
-from ldcnd.top.glance import Severity
 from ldcnd.top.rig_view import RigView
 from tests.support.rig import running_rig
 
@@ -59,6 +59,18 @@ async def test_a_move_shows_where_it_goes_and_who_has_control():
 
     assert (x.state, x.moving, x.target) == (AxisState.DISCRETE_MOTION, Moving.YES, 20.0)
     assert "20.000" in as_text(moving)
+
+
+async def test_an_axis_without_trouble_shows_how_its_last_command_ended():
+    async with running_rig() as rig, followed(rig) as glance:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=20.0))
+        await rig.client.command("x", Verb.HALT, HaltRequest())
+        shown = await until(glance, lambda now: now.axes and now.axes[0].trouble)
+
+    assert (shown.axes[0].axis, shown.axes[0].severity) == ("x", Severity.NOTICE)
+    assert shown.axes[0].trouble == "move_absolute: aborted by halt"
 
 
 async def test_a_drive_that_lost_power_comes_first_and_says_so():

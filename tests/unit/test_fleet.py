@@ -10,6 +10,7 @@ import pytest
 
 from ldcnd.cli.fleet import table
 from ldcnd.client.fleet import survey
+from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.errors import MalformedRequest
@@ -114,6 +115,15 @@ async def test_a_line_that_is_lost_is_told_once_and_not_for_each_of_its_axes():
         (view,) = await survey(session)
 
     assert view.problems == ("line line0 is not up",)
+
+
+async def test_what_is_wrong_with_an_axis_is_told_in_words():
+    async with fleet(("mill", "m1")) as (broker, _), broker.session() as session:
+        await RigClient(session, "mill").stop("x")
+
+        (view,) = await survey(session)
+
+    assert view.problems == ("x: a stop is latched: nothing moves before reset",)
 
 
 async def test_nobody_there_is_an_empty_list():

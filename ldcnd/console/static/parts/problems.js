@@ -3,7 +3,9 @@
 import { number, words } from "./format.js";
 
 const BUSY = 0.9;
-const RATE_SHORT = 0.8;
+/** As `ldcnd/client/trouble.py` has it, in whose words this speaks: a report sees a sample more or less at its edges. */
+const ENOUGH = 0.9;
+const EDGE_HZ = 1;
 /** A few repeated exchanges a minute are a line's daily life; more deserve a look. */
 const ERRORS_A_MINUTE = 5;
 const COUNTERS = ["timeouts", "corrupt_replies", "rejected_packets"];
@@ -61,16 +63,8 @@ function* ofAxis(rig, axis) {
   if (state?.link === "degraded") yield { ...at, level: "warn", text: "The drive missed its latest polls." };
   if (quality.level && state?.link !== "down")
     yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
-  if (
-    health &&
-    state?.link === "up" &&
-    health.rate_hz < RATE_SHORT * health.rate_wanted_hz &&
-    health.rate_wanted_hz > 1
-  ) {
-    yield {
-      ...at,
-      level: "warn",
-      text: `${number(health.rate_hz, 1)} samples a second instead of ${number(health.rate_wanted_hz, 1)}.`,
-    };
+  const asked = health?.items.find(({ item }) => item === "position")?.asked_hz ?? health?.rate_wanted_hz;
+  if (state?.link === "up" && health && health.rate_hz + EDGE_HZ < ENOUGH * asked) {
+    yield { ...at, level: "warn", text: `${number(health.rate_hz, 1)} samples a second instead of ${number(asked, 1)}.` };
   }
 }

@@ -1,0 +1,132 @@
+"""What is wrong with an axis, in words, the worst first."""
+
+from importlib import resources
+
+import pytest
+
+from ldcnd.client.trouble import Severity, Trouble, axis_troubles
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.health import AxisHealth, ItemHealth
+from ldcnd.model.samples import FaultEntry, FaultSample, StateSample
+
+
+def state(**changes) -> StateSample:
+    standing = StateSample(
+        t=0,
+        t_error_ns=0,
+        seq=0,
+        quality=Quality.GOOD,
+        state=AxisState.STANDSTILL,
+        enabled=True,
+        referenced=True,
+        moving=Moving.NO,
+        link=LinkState.UP,
+        stop_latched=False,
+        command=None,
+    )
+    return standing.model_copy(update=changes)
+
+
+def entry(code: str, *, stops: bool = True) -> FaultEntry:
+    return FaultEntry(code=code, text=f"remedy of {code}", since=0, source="drive", stops=stops)
+
+
+def faults(*active: FaultEntry, first: FaultEntry | None = None) -> FaultSample:
+    return FaultSample(t=0, t_error_ns=0, seq=0, quality=Quality.GOOD, active=active, first=first)
+
+
+def health(rate_hz: float, *, wanted_hz: float = 20.0, asked_hz: float | None = None) -> AxisHealth:
+    items = () if asked_hz is None else (ItemHealth(item="position", asked_hz=asked_hz, granted_hz=rate_hz),)
+    return AxisHealth(
+        axis="x",
+        link=LinkState.UP,
+        sample_age_s=0.0,
+        rate_wanted_hz=wanted_hz,
+        rate_hz=rate_hz,
+        faults=0,
+        items=items,
+    )
+
+
+def notice(text: str) -> tuple[Trouble, ...]:
+    return (Trouble(Severity.NOTICE, text),)
+
+
+def wrong(text: str) -> tuple[Trouble, ...]:
+    return (Trouble(Severity.WRONG, text),)
+
+
+def test_an_axis_that_is_well_has_none():
+    assert axis_troubles(state(), faults(), health(20.0)) == ()
+
+
+def test_what_was_never_heard_of_is_a_doubt():
+    assert axis_troubles(None, None, None) == notice("nothing was heard of it yet")
+
+
+def test_of_a_drive_that_does_not_answer_nothing_else_is_said():
+    gone = state(link=LinkState.DOWN, state=AxisState.ERROR_STOP, stop_latched=True)
+
+    assert axis_troubles(gone, faults(entry("link_lost")), health(0.0)) == wrong("the drive does not answer")
+
+
+def test_faults_that_stop_come_before_warnings_and_the_first_cause_before_its_consequences():
+    active = faults(entry("position_wrap", stops=False), entry("position_error"), entry("overheat"))
+    caused = active.model_copy(update={"first": entry("overheat")})
+
+    found = axis_troubles(state(state=AxisState.ERROR_STOP, stop_latched=True), caused, None)
+
+    assert [(trouble.severity, trouble.text.partition(":")[0]) for trouble in found] == [
+        (Severity.WRONG, "overheat"),
+        (Severity.WRONG, "position_error"),
+        (Severity.NOTICE, "a stop is latched"),
+        (Severity.NOTICE, "position_wrap"),
+    ]
+    assert found[0].text == "overheat: remedy of overheat"
+
+
+@pytest.mark.parametrize(
+    ("last_error", "text"),
+    [("home: no switch", "in error stop: home: no switch"), (None, "in error stop: reset it to go on")],
+)
+def test_an_error_stop_whose_fault_is_over_is_wrong_all_the_same(last_error, text):
+    assert axis_troubles(state(state=AxisState.ERROR_STOP, last_error=last_error), faults(), None) == wrong(text)
+
+
+def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on():
+    assert axis_troubles(state(last_error="home: no switch"), faults(), None) == ()
+
+
+@pytest.mark.parametrize(
+    ("report", "told"),
+    [
+        (health(16.0), "16.0 samples a second instead of 20.0"),
+        (health(17.0), None),  # a report may miss the sample at its edge
+        (health(0.0, wanted_hz=1.0), None),
+        (health(0.0, wanted_hz=2.0), "0.0 samples a second instead of 2.0"),
+        (health(1.0, asked_hz=1.0), None),  # nobody takes them: the drive is asked at its idle rate
+        (health(1.0, asked_hz=20.0), "1.0 samples a second instead of 20.0"),
+    ],
+)
+def test_samples_that_come_too_seldom_are_told(report, told):
+    assert axis_troubles(state(), faults(), report) == (notice(told) if told else ())
+
+
+def test_polls_that_are_missed_explain_a_low_rate():
+    found = axis_troubles(state(link=LinkState.DEGRADED), faults(), health(1.0))
+
+    assert found == notice("the drive missed its latest polls")
+
+
+def test_the_console_says_it_in_the_same_words():
+    script = resources.files("ldcnd.console").joinpath("static/parts/problems.js").read_text(encoding="utf-8")
+    said = [
+        axis_troubles(state(link=LinkState.DOWN), None, None),
+        axis_troubles(state(link=LinkState.DEGRADED), None, None),
+        axis_troubles(state(stop_latched=True), None, None),
+    ]
+
+    for (trouble,) in said:
+        assert f'"{trouble.text[0].upper()}{trouble.text[1:]}."' in script
+    for part in ("In error stop: ", "reset it to go on", " samples a second instead of "):
+        assert part in script
