@@ -119,8 +119,8 @@ class HomeSequence(Procedure):
             reach = abs(speed) * search.timeout_s * BEYOND
         else:
             reach = search.distance * self._motion.scale.counts_per_unit
-        most = LARGEST_COUNT - abs(here)
-        return here + round(math.copysign(min(reach, most), speed))
+        room = LARGEST_COUNT - (here if speed > 0 else -here)  # to the end of the counter on this side
+        return here + round(math.copysign(min(reach, max(room, 0), LARGEST_COUNT), speed))
 
     def _failure(self) -> str:
         search = self._search
