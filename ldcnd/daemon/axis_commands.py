@@ -283,6 +283,7 @@ class AxisCommands:
         view = self._tracker.view()
         guards.check_reachable(view)
         guards.check_stands(view)
+        guards.check_position_kept(view)
         motion.telemetry.origin_counts = motion.latest().position_counts - motion.scale.to_counts(position)
         self._tracker.referenced = True
         motion.publish_state()

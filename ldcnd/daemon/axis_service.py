@@ -134,7 +134,10 @@ class AxisService:
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Take a reading from the poller."""
+        was_referenced = self.tracker.referenced
         self.tracker.observed(reading, timing, self._clock.now_ns())
+        if was_referenced and not self.tracker.referenced:
+            log.warning("reference lost", axis=self.config.name, faults=[fault.code for fault in reading.faults])
         self._changed.set()
         self._commands.observed(reading, timing)
         if self._commands.step_due:

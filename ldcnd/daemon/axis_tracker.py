@@ -81,6 +81,7 @@ class AxisTracker:
         self.state = AxisState.DISABLED
         self.enabled = False
         self.referenced = False
+        self.position_lost = False
         self.stop_latched = False
         self.link = LinkState.DOWN
         self.command: ActiveCommand | None = None
@@ -102,6 +103,7 @@ class AxisTracker:
             self.state,
             self.enabled,
             self.referenced,
+            self.position_lost,
             self.stop_latched,
             self.link,
             tuple(fault.text for fault in self.active_faults),
@@ -148,12 +150,15 @@ class AxisTracker:
         self._misses = 0
         self.link = LinkState.UP
         self._faults(list(reading.faults), now_ns)
+        self.position_lost = any(fault.loses_position for fault in reading.faults)
+        if self.position_lost:
+            self.referenced = False
         self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
         if not self.concerns(timing):
             return  # asked before the latest command took effect: says nothing about it
         self.enabled = reading.enabled
         if any(fault.stops for fault in reading.faults):
-            self._fail("the drive reports a fault")
+            self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")
         elif self.enabled:
             self._enabled_reading(reading)
         elif self.command and self.command.opens_loop:
@@ -276,6 +281,7 @@ class AxisTracker:
         """Reset: latch and first cause are forgotten; the next readings tell what stands."""
         self._effective_from_s = now_s
         self.stop_latched = False
+        self.position_lost = False
         self.active_faults = ()
         self.first_fault = None
         self.last_error = None

@@ -20,13 +20,14 @@ MOTION_STATES = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class AxisView:
-    """What the guards look at; faults are texts."""
+    """What the guards look at; faults are texts, and `position_lost` while one of them has lost the position."""
 
     name: str
     unit: str
     state: AxisState
     enabled: bool
     referenced: bool
+    position_lost: bool
     stop_latched: bool
     link: LinkState
     faults: tuple[str, ...]
@@ -89,6 +90,16 @@ def check_referenced(axis: AxisView) -> None:
             f"axis {axis.name} is not referenced: its position means nothing",
             axis=axis.name,
             remedy="send home or set_position",
+        )
+
+
+def check_position_kept(axis: AxisView) -> None:
+    """Refuse to give the position a meaning while the drive says that it has lost it."""
+    if axis.position_lost:
+        raise WrongState(
+            f"axis {axis.name}: its position is lost: {'; '.join(axis.faults)}",
+            axis=axis.name,
+            remedy="send reset first",
         )
 
 

@@ -42,11 +42,13 @@ class Fault:
         code: stable code.
         text: what it means and what to do.
         stops: the drive has switched the motor off; false for a warning.
+        loses_position: what the drive counts from then on is not where the axis is: it needs a new reference.
     """
 
     code: str
     text: str
     stops: bool = True
+    loses_position: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -115,7 +115,8 @@ class StateSample(Sample):
     enabled: bool
     """The position loop is closed."""
     referenced: bool
-    """The position means something: the axis was homed or told where it is since its drive was last reset."""
+    """The position means something: the axis was homed or told where it is since its drive was last reset, and neither
+    the link nor the encoder was lost since then, nor has the counter wrapped."""
     moving: Moving
     """Whether it moves; unknown when the drive does not answer."""
     link: LinkState

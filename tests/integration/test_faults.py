@@ -7,14 +7,18 @@ import pytest
 
 from ldcnd.drivers.ldcn.faults import FaultCode
 from ldcnd.drivers.ldcn.simulated_power import Condition
-from ldcnd.errors import DriveFault, WrongState
+from ldcnd.errors import DriveFault, NotReferenced, WrongState
 from ldcnd.model.axes import AxisState
 from ldcnd.model.requests import (
+    HomeMethod,
+    HomeRequest,
+    HomeStop,
     MoveAbsoluteRequest,
     MoveAnalogRequest,
     PowerRequest,
     ResetRequest,
     SetGainsRequest,
+    SetPositionRequest,
     SetPwmRequest,
     Verb,
 )
@@ -60,6 +64,7 @@ def codes(sample):
     ],
 )
 async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(dialect, condition, code):
+    lost = code is FaultCode.ENCODER_OR_HALL
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
         await rig.send(Verb.MOVE_ABSOLUTE, FAR)
@@ -74,7 +79,7 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
         assert (state.enabled, state.command, state.last_error) == (
             False,
             None,
-            "move_absolute: the drive reports a fault",
+            f"move_absolute: the drive reports a fault{'; its position is lost' * lost}",
         )
         with pytest.raises(WrongState) as refusal:
             await rig.send(Verb.MOVE_ABSOLUTE, FAR)
@@ -86,6 +91,8 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
         assert (await rig.until_fault(lambda faults: not faults.active)).first is None
         assert not recovered.enabled
         await rig.send(Verb.POWER, PowerRequest(on=True))
+        if lost:
+            return
         assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
 
 
@@ -167,6 +174,74 @@ async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
 
 
+# -- the position is lost ----------------------------------------------------------------------------------------------
+
+
+@named(LOGOSOL)
+async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_axis_is_homed(dialect):
+    async with dialect_rig(dialect, replace(PLANT, index_width_counts=40)) as rig:
+        await rig.power_on()
+        assert (await rig.rig.client.state(AXIS)).referenced
+        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await asyncio.sleep(0.5)
+
+        rig.condition(Condition.ENCODER_LOSS)
+        state = await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
+        with pytest.raises(WrongState, match="its position is lost") as refusal:
+            await rig.send(Verb.SET_POSITION, SetPositionRequest(position=3.0))
+        rig.condition(Condition.ENCODER_LOSS, present=False)
+        await rig.send(Verb.RESET, ResetRequest())
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        with pytest.raises(NotReferenced):
+            await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        homed = await rig.done(Verb.HOME, HomeRequest(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
+
+        assert not state.referenced
+        assert refusal.value.remedy == "send reset first"
+        assert (homed.referenced, homed.last_error) == (True, None)
+        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+
+
+@named((V1, LS_182AP))
+async def test_a_counter_that_wrapped_means_nothing_before_a_new_reference(dialect):
+    async with dialect_rig(dialect, pwm={"duty": 0.1}, acceleration=2000) as rig:
+        await rig.power_on()
+        rig.drive.loop.renumber((1 << 31) - 500)
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.1, duration_s=0.3))  # no profile would go there
+        await rig.until_fault(lambda faults: faults.active)
+        await rig.until(lambda state: state.command is None)
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+
+        with pytest.raises(NotReferenced):
+            await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=0.0))
+        with pytest.raises(WrongState, match="its position is lost"):
+            await rig.send(Verb.SET_POSITION, SetPositionRequest(position=3.0))
+        await rig.send(Verb.RESET, ResetRequest())
+        await rig.send(Verb.SET_POSITION, SetPositionRequest(position=3.0))
+        where = rig.position_mm
+        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=4.0))
+
+        assert (state.state, state.referenced) == (AxisState.STANDSTILL, True)
+        assert rig.position_mm == pytest.approx(where + 1.0, abs=0.1)  # it was still settling
+
+
+@named((V4, LS_182AP))
+async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dialect):
+    far_index = replace(PLANT, index_width_counts=40, index_at_counts=8000, index_spacing_counts=100_000)
+    async with dialect_rig(dialect, far_index, pwm={"duty": 0.1}, acceleration=2000) as rig:
+        await rig.power_on()
+        rig.drive.loop.renumber((1 << 31) - 500)
+        await rig.send(Verb.SET_PWM, SetPwmRequest(duty=0.1, duration_s=0.3))
+        await rig.until_fault(lambda faults: faults.active)
+        await rig.until(lambda state: state.command is None)
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+
+        homed = await rig.done(Verb.HOME, HomeRequest(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
+
+        assert (homed.referenced, homed.last_error) == (True, None)
+        assert not (await rig.until_fault(lambda faults: not faults.active)).active
+
+
 # -- PIC-SERVO ---------------------------------------------------------------------------------------------------------
 
 
@@ -223,7 +298,8 @@ async def test_a_counter_that_wraps_is_a_warning(dialect):
 
         assert (codes(sample), sample.first.stops) == (["position_wrap"], False)
         assert sample.first.text == FaultCode.POSITION_WRAP.remedy
-        assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
+        state = await rig.rig.client.state(AXIS)
+        assert (state.state, state.referenced) == (AxisState.CONTINUOUS_MOTION, False)
 
 
 @named(DIALECTS)

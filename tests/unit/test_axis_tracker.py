@@ -179,3 +179,17 @@ def test_an_open_loop_fails_a_command_unless_it_is_meant_to_open_it(moving):
     moving.started(4.0)
     moving.observed(OFF, at(4.1), 0)
     assert (moving.state, moving.energised) == (AxisState.ERROR_STOP, False)
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_fault_that_loses_the_position_takes_the_reference_away_and_nothing_but_a_new_one_brings_it_back(stops):
+    tracker = AxisTracker("x", "mm")
+    tracker.observed(ON, at(1.0), 0)
+    tracker.referenced = True
+
+    tracker.observed(replace(ON, faults=(Fault("lost", "home", stops=stops, loses_position=True),)), at(2.0), 0)
+    assert (tracker.referenced, tracker.position_lost, tracker.view().position_lost) == (False, True, True)
+
+    tracker.cleared(3.0)
+    tracker.observed(ON, at(3.1), 0)
+    assert (tracker.referenced, tracker.position_lost) == (False, False)

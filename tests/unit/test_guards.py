@@ -21,6 +21,7 @@ READY = AxisView(
     state=AxisState.STANDSTILL,
     enabled=True,
     referenced=True,
+    position_lost=False,
     stop_latched=False,
     link=LinkState.UP,
     faults=(),
@@ -100,3 +101,12 @@ def test_an_acceleration_above_the_limit_is_refused():
         guards.check_acceleration(READY, LIMITS, 51)
 
     assert refusal.value.limit == 50
+
+
+def test_a_lost_position_gets_no_meaning_before_reset():
+    guards.check_position_kept(READY)
+
+    with pytest.raises(WrongState, match="its position is lost: the counter wrapped") as refusal:
+        guards.check_position_kept(replace(READY, position_lost=True, faults=("the counter wrapped",)))
+
+    assert refusal.value.remedy == "send reset first"

@@ -5,7 +5,7 @@ positioning mode, and with the loop opened on purpose.
 """
 
 from ldcnd.drivers.driver import AxisReading, Fault
-from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode, diagnose
+from ldcnd.drivers.ldcn.faults import LOSE_POSITION, WARNINGS, FaultCode, diagnose
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
@@ -94,7 +94,12 @@ class DriveState:
     def _diagnose(self, status: Status) -> tuple[Fault, ...]:
         open_on_purpose = self.loop_may_open and not status.flags & StatusFlag.HOME_IN_PROGRESS
         return tuple(
-            Fault(fault.code.value, fault.remedy, stops=fault.code not in WARNINGS)
+            Fault(
+                fault.code.value,
+                fault.remedy,
+                stops=fault.code not in WARNINGS,
+                loses_position=fault.code in LOSE_POSITION,
+            )
             for fault in diagnose(self._profile, status, pic_ae=self.amp_enabled, absolute_mode=self.absolute)
             if not (open_on_purpose and fault.code is FaultCode.POSITION_ERROR)
         )

@@ -45,6 +45,9 @@ class FaultCode(StrEnum):
 WARNINGS = frozenset({FaultCode.CURRENT_LIMIT, FaultCode.POSITION_WRAP, FaultCode.SERVO_OVERRUN})
 """What does not switch the motor off: current limiting only lowers the PWM value (PIC-SERVO manual, 4.3)."""
 
+LOSE_POSITION = frozenset({FaultCode.ENCODER_OR_HALL, FaultCode.POSITION_WRAP})
+"""What takes the meaning from the position: counts were missed, or the counter started again at its other end."""
+
 _REMEDIES = MappingProxyType(
     {
         FaultCode.STOP_INPUT: "the stop input is open: close the emergency stop circuit, then reset",
@@ -56,14 +59,18 @@ _REMEDIES = MappingProxyType(
         FaultCode.OVERCURRENT: (
             "the current stayed at its limit for the overload time: check for a jam and the current setting, then reset"
         ),
-        FaultCode.ENCODER_OR_HALL: "encoder or Hall signals are lost: check sensor cable and supply, then reset",
+        FaultCode.ENCODER_OR_HALL: (
+            "encoder or Hall signals are lost: check sensor cable and supply, reset, find the reference position again"
+        ),
         FaultCode.POSITION_ERROR: (
             "the motor left the position error limit: check for a jam, gains and acceleration, then reset"
         ),
         FaultCode.SENSOR_FAULT: "the analog position sensor is disconnected or at its end: check its cable, then reset",
         FaultCode.POWER_LOST: "the motor supply is off: switch it on, then reset",
         FaultCode.CURRENT_LIMIT: "the motor current was limited: if it lasts check for a jam; reset clears the flag",
-        FaultCode.POSITION_WRAP: "the 32-bit position counter wrapped around: find the reference position again",
+        FaultCode.POSITION_WRAP: (
+            "the 32-bit position counter wrapped around: reset, find the reference position again"
+        ),
         FaultCode.SERVO_OVERRUN: "the drive's processor was late for a servo cycle: harmless unless it lasts",
     }
 )
