@@ -19,7 +19,7 @@ from ldcnd.model.monitors import MonitorName, MonitorSample
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.replies import CommandReply, StopReply
-from ldcnd.model.requests import REPLY_MODELS, Request, Verb
+from ldcnd.model.requests import LONGEST_NAME, REPLY_MODELS, Request, StopRequest, Verb
 from ldcnd.model.samples import SAMPLE_MODELS, FaultSample, StateSample, TelemetryItem
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
@@ -225,9 +225,13 @@ class RigClient:
         """Ask what a motion would do; no effect."""
         return await self.axis_question(axis, PLAN, request, PlanReply)
 
-    async def stop(self, axis: str | None = None, timeout_s: float = 5.0) -> StopReply:
-        """Stop one axis, or the whole rig."""
-        answers = await self._session.query(self._keys.stop(axis), timeout_s=timeout_s, urgent=True)
+    async def stop(self, axis: str | None = None, timeout_s: float = 5.0, client: str | None = None) -> StopReply:
+        """Stop one axis, or the whole rig; the events tell the first 64 characters of `client` as who it was."""
+        request = StopRequest(client=client[:LONGEST_NAME] if client else None)
+        payload, encoding = encode(request, Encoding.MSGPACK)
+        answers = await self._session.query(
+            self._keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True
+        )
         return self._one(answers, StopReply)
 
     @asynccontextmanager

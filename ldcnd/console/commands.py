@@ -107,11 +107,13 @@ def command_routes(rigs: Rigs) -> list[Route]:
 
     async def stop(request: Request) -> Response:
         client = rigs.client(request.path_params["rig"])
-        return _json(await client.stop(decode(StopScope, await _body(request), Encoding.JSON).axis, STOP_TIME_S))
+        scope = decode(StopScope, await _body(request), Encoding.JSON)
+        return _json(await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client))
 
-    async def stop_all(_: Request) -> Response:
+    async def stop_all(request: Request) -> Response:
+        who = request.state.visitor.client
         async with asyncio.TaskGroup() as group:
-            stops = {rig: group.create_task(_stopped(rigs.client(rig)), name=f"stop {rig}") for rig in rigs.names}
+            stops = {rig: group.create_task(_stopped(rigs.client(rig), who), name=f"stop {rig}") for rig in rigs.names}
         return _json(StopsReply(rigs={rig: task.result() for rig, task in stops.items()}))
 
     routes = {
@@ -123,9 +125,9 @@ def command_routes(rigs: Rigs) -> list[Route]:
     return [Route(path, answering_errors(answer), methods=["POST"]) for path, answer in routes.items()]
 
 
-async def _stopped(client: RigClient) -> StopReply | ErrorReply:
+async def _stopped(client: RigClient, who: str) -> StopReply | ErrorReply:
     try:
-        return await client.stop(timeout_s=STOP_TIME_S)
+        return await client.stop(timeout_s=STOP_TIME_S, client=who)
     except LdcndError as error:
         return error_reply(error)
 

@@ -12,7 +12,7 @@ from ldcnd.daemon.rig import Rig
 from ldcnd.errors import CommandExpired, DuplicateDaemon, LdcndError, OutcomeUnknown, RequestRefused
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import BufferMode, MoveRequest, Request, Verb
+from ldcnd.model.requests import BufferMode, MoveRequest, Request, StopRequest, Verb
 from ldcnd.model.why import WhyReply, WhyRequest
 
 AT_ONCE = frozenset({Verb.POWER, Verb.RESET, Verb.SET_POSITION, Verb.SET_GAINS, Verb.STOP, Verb.QUICK_STOP})
@@ -96,6 +96,26 @@ class CommandDesk:
         status = CommandStatus.DONE if verb in AT_ONCE or not moving else CommandStatus.EXECUTING
         self._ledger.answered(command_id, reply, status)
         return reply
+
+    def stopped(
+        self, names: tuple[str, ...], confirmed: tuple[str, ...], request: StopRequest, login: str | None
+    ) -> None:
+        """Enter stops that were carried out already, with who has asked for them: one event for each axis.
+
+        Args:
+            names: the axes that were stopped.
+            confirmed: those whose drives acknowledged it.
+            request: what came with the stop; nothing but its `client` is looked at.
+            login: whose link it came over, for the record.
+        """
+        for name in names:
+            status, reason = CommandStatus.DONE, None
+            if not self._rig.axis(name).stoppable:
+                status, reason = CommandStatus.REFUSED, "its drive cannot be stopped over its line"
+            elif name not in confirmed:
+                status, reason = CommandStatus.UNKNOWN, "the drive did not confirm it; the axis is latched"
+            command_id = self._next_command_id()
+            self._ledger.open(Entry(command_id, name, Verb.STOP, request, request.client, login, status, reason))
 
     def why(self, axis: AxisService, request: WhyRequest) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that; no effect."""

@@ -20,7 +20,7 @@ from ldcnd.model.meta import BusInfo, CommandList, DaemonInfo
 from ldcnd.model.monitors import MonitorSample
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.replies import CommandReply, StopReply
-from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
+from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS, StopRequest
 from ldcnd.model.samples import SAMPLE_MODELS
 from ldcnd.model.schemas import PUBLIC_MODELS, schema_name, schema_text
 from ldcnd.model.traces import TraceChunk, TraceHeader
@@ -121,8 +121,9 @@ def _rig_commands() -> Iterator[Channel]:
 
 
 def _stops() -> Iterator[Channel]:
-    yield _channel(_KEYS.stop(), Kind.STOP, StopReply, None, "Stop every axis, and latch.")
-    yield _channel(_KEYS.stop(_AXIS), Kind.STOP, StopReply, None, "Stop one axis, and latch.")
+    said = "Of the payload, which may be missing or nonsense, `client` is entered into the events."
+    yield _channel(_KEYS.stop(), Kind.STOP, StopReply, StopRequest, f"Stop every axis, and latch. {said}")
+    yield _channel(_KEYS.stop(_AXIS), Kind.STOP, StopReply, StopRequest, f"Stop one axis, and latch. {said}")
 
 
 def _channel(key: str, kind: Kind, sent: type[Frozen], taken: type[Frozen] | None = None, summary: str = "") -> Channel:

@@ -21,7 +21,7 @@ from ldcnd.model.group_moves import MoveTogetherReply, MoveTogetherRequest
 from ldcnd.model.preview import PlanReply, PlanRequest
 from ldcnd.model.rehearsal import RehearsalRequest
 from ldcnd.model.replies import StopReply
-from ldcnd.model.requests import REQUEST_MODELS, MoveAbsoluteRequest, Verb
+from ldcnd.model.requests import REQUEST_MODELS, MoveAbsoluteRequest, StopRequest, Verb
 from ldcnd.model.verbs import MOVE_TOGETHER, PLAN, REHEARSE, WHY
 from ldcnd.model.why import WhyRequest
 
@@ -139,13 +139,14 @@ class Requests:
             self._journal.stopped(name)
         except Exception:
             log.exception("stop not recorded", key=query.key)  # it is carried out all the same
-        return StopReply(axes=names, confirmed=await self._stop_once(names))
+        return StopReply(axes=names, confirmed=await self._stop_once(names, query))
 
-    async def _stop_once(self, names: tuple[str, ...]) -> tuple[str, ...]:
+    async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
         """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.
 
         Hundreds may ask at once, and the lines carry a few stops for all of them. Only a stop whose latches still hold
-        is joined: since they were set nothing has begun to move, so there is nothing that it does not stop.
+        is joined: since they were set nothing has begun to move, so there is nothing that it does not stop. What joins
+        leaves no event of its own.
         """
         under_way = self._stops.setdefault(names, [])
         if len(under_way) >= STOPS_AT_ONCE and self._are_latched(names):
@@ -166,9 +167,21 @@ class Requests:
             raise
         else:
             own.set_result(confirmed)
+            self._enter_stop(query, names, confirmed)
             return confirmed
         finally:
             under_way.remove(own)
+
+    def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
+        """Tell in the events who has asked for a stop, as far as that can be read; nothing has waited for this."""
+        try:
+            request = decode(StopRequest, query.payload, query.encoding)
+        except LdcndError:
+            request = StopRequest()
+        try:
+            self._control.commands.stopped(names, confirmed, request, query.login)
+        except Exception:
+            log.exception("stop not entered into the events", key=query.key)
 
     def _are_latched(self, names: tuple[str, ...]) -> bool:
         axes = (self._rig.axis(name) for name in names)

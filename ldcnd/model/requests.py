@@ -20,13 +20,16 @@ from ldcnd.model.replies import CommandReply
 from ldcnd.model.traces import LONGEST_WAIT_S, MOST_CHANNELS, MOST_SAMPLES, TraceAbortReply, TraceReply, TraceTrigger
 from ldcnd.model.verb import Verb as Verb  # noqa: PLC0414 - who sends a request needs its verb: one import has both
 
+LONGEST_NAME = 64
+"""Characters of a name or an id that a client gives."""
+
 
 class Request(Frozen):
     """The base of every command payload: what proves that it may be carried out, and only once."""
 
-    command_id: str | None = Field(default=None, min_length=1, max_length=64)
+    command_id: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
     """Names the command; the same id is carried out at most once and answered alike. Given by the daemon if missing."""
-    client: str | None = Field(default=None, max_length=64)
+    client: str | None = Field(default=None, max_length=LONGEST_NAME)
     """Who sends it: a name for people, in events and the log; not authenticated. A lease knows its own."""
     lease: str | None = None
     """The lease under which it is sent."""

@@ -71,7 +71,7 @@ class TopScreen(App[None]):
     async def _stop_all(self) -> None:
         self._say("stopping all axes ...")
         try:
-            answer = _stopped(await self._client.stop())
+            answer = _stopped(await self._client.stop(client="ldcnd top"))
         except LdcndError as error:
             answer = f"STOP NOT CONFIRMED: {error.message}. Use the machine's emergency stop."
         self._say(answer)

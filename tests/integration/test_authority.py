@@ -5,9 +5,11 @@ import asyncio
 import pytest
 
 from ldcnd.bus_config import GroupConfig
+from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import load_config
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import (
     CommandExpired,
     CommandIdReused,
@@ -210,8 +212,53 @@ async def test_the_events_tell_who_did_what_with_which_result():
             (CommandStatus.EXECUTING, "ann"),
             (CommandStatus.ABORTED, "ann"),
         ]
-        assert events.events[-1].reason == "aborted by stop"
+        aborted, stopped = events.events[-2:]
+        assert aborted.reason == "aborted by stop"
+        assert (stopped.verb, stopped.status, stopped.client) == (Verb.STOP, CommandStatus.DONE, None)
         assert [event.seq for event in events.events] == list(range(len(events.events)))
+
+
+async def test_the_events_tell_who_has_stopped_what():
+    async with running_rig() as rig, rig.broker.session(login="operator") as session:
+        await powered(rig)
+        ann = RigClient(session, rig.client.rig)
+        await ann.stop("x", client="ann")
+        await ann.stop(client="ann, whose name is longer than any name in the events is allowed to be")
+
+        events = await latest_events(rig.client, 5)
+
+    assert {(event.verb, event.status, event.login) for event in events} == {("stop", "done", "operator")}
+    assert [(event.axis, event.client) for event in events] == [
+        ("x", "ann"),
+        *((axis, "ann, whose name is longer than any name in the events is allowed") for axis in "xyzc"),
+    ]
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xff\xff", b"[1]", b'{"client": 7}', b'{"client": "ann", "axis": "y"}'])
+async def test_a_stop_that_does_not_say_who_it_is_from_is_carried_out_and_told_all_the_same(payload):
+    async with running_rig() as rig:
+        await powered(rig)
+
+        (answer,) = await rig.session.query("ldcn/sim/@stop/x", payload)
+        (event,) = await latest_events(rig.client, 1)
+
+        assert not answer.is_error
+        assert (await rig.client.state("x")).stop_latched
+        assert (event.axis, event.verb, event.status, event.client) == ("x", "stop", CommandStatus.DONE, None)
+
+
+async def test_a_stop_that_no_drive_confirms_is_told_as_that():
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
+    async with running_rig(chains={"line0": chain}) as rig:
+        await powered(rig)
+        chain.modules[0].power(on=False, at_s=asyncio.get_running_loop().time())
+
+        reply = await rig.client.stop("x", timeout_s=60.0, client="ann")
+        event = next(event for event in reversed(await latest_events(rig.client, 5)) if event.verb == Verb.STOP)
+
+    assert reply.confirmed == ()
+    assert (event.status, event.client) == (CommandStatus.UNKNOWN, "ann")
+    assert event.reason == "the drive did not confirm it; the axis is latched"
 
 
 async def test_two_daemons_on_one_rig_refuse_motion():

@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from ldcnd.client.events import latest_events
 from ldcnd.client.traces import arm_trace, fetch_trace, wait_for_trace
 from ldcnd.console import reading
 from ldcnd.model.axes import AxisState
@@ -95,6 +96,9 @@ async def test_stops_need_no_lease_and_latch(console):
     assert one.document["axes"] == ["x"]
     assert set(every.document["rigs"]["sim"]["axes"]) == {"x", "y", "z", "c"}
     assert (await console.rig.client.state("z")).stop_latched
+    told = await latest_events(console.rig.client, 5)
+    assert [(event.axis, event.verb) for event in told] == [(axis, "stop") for axis in "xxyzc"]
+    assert {event.client for event in told} == {"console-1"}
 
 
 async def test_a_stop_overtakes_the_commands_before_it(console):

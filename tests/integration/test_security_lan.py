@@ -198,11 +198,13 @@ async def test_events_tell_whose_certificate_a_command_came_with(rig: SecuredRig
         await client.command("z", Verb.HALT, HaltRequest(client="ann", command_id="by-ann"))
         with rig.login("operator") as stranger:  # an operator with a program that does not say who it is
             answers(stranger, "ldcn/sim/@cmd/z/halt", {"command_id": "by-somebody"})
+        await client.stop("z", client="ann")
         events = await latest_events(client, 100, "z")
 
     logins = {event.command_id: (event.client, event.login) for event in events}
     assert logins["by-ann"] == ("ann", "operator")
     assert logins["by-somebody"] == (None, None)
+    assert (events[-1].verb, events[-1].client, events[-1].login) == (Verb.STOP, "ann", "operator")
 
 
 def test_the_example_of_the_set_up_works_with_certificates_in_files(rig: SecuredRig, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,6 +11,7 @@ from ldcnd.daemon.requests import STOPS_AT_ONCE, Requests
 from ldcnd.errors import InternalError
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Answer, Query
+from ldcnd.model.requests import StopRequest
 from tests.support.session_pair import error_of
 
 KEYS = Keys("bench1")
@@ -54,11 +56,12 @@ class SlowRig:
 
 
 class Flood:
-    """Sends stops to one daemon's requests and keeps the answers."""
+    """Sends stops to one daemon's requests and keeps the answers, and what is entered into the events."""
 
     def __init__(self, rig: SlowRig, group: asyncio.TaskGroup) -> None:
         self.answers: list[Answer] = []
-        self._requests = Requests(rig, KEYS, group, None, None)
+        self.desk = Mock()
+        self._requests = Requests(rig, KEYS, group, SimpleNamespace(commands=self.desk), None)
 
     def stop(self, times: int = 1) -> None:
         for _ in range(times):
@@ -149,13 +152,28 @@ async def test_stops_that_come_after_a_flood_are_sent_again(times: int):
     assert rig.stops == sent + 1
 
 
-async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
-    rig = SlowRig(buses=(object(),))  # no line that could be written to
+async def test_who_has_stopped_is_entered_once_the_drives_have_confirmed_it():
+    rig = SlowRig()
     async with asyncio.TaskGroup() as group:
         flood = Flood(rig, group)
         flood.stop()
         await settled()
+        sent, entered = rig.stops, flood.desk.stopped.call_count
         rig.confirmed.set()
 
-    assert rig.stops == 1
+    assert (sent, entered) == (1, 0)
+    flood.desk.stopped.assert_called_once_with(("x",), ("x",), StopRequest(), None)
+
+
+async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
+    rig = SlowRig(buses=(object(),))  # no line that could be written to
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.desk.stopped.side_effect = ValueError("a bug")
+        flood.stop()
+        await settled()
+        rig.confirmed.set()
+
+    assert rig.stops == flood.desk.stopped.call_count == 1
+    assert b'"confirmed":["x"]' in flood.answers[0].payload
     assert not flood.answers[0].is_error
