@@ -39,6 +39,7 @@ def command(
     """Own the lines of a rig and serve its drives until SIGTERM or SIGINT; moving axes are stopped first.
 
     SIGHUP reads CONFIG again: limits, default speeds and rates change at once, the log names what needs a restart.
+    Options, the log level among them, keep their values.
     """
     configure_logging(json=log_json, level=log_level)
 
