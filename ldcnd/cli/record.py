@@ -2,6 +2,7 @@
 
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
@@ -15,7 +16,12 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.group(invoke_without_command=True)
-@click.option("--out", "-o", type=FILE, help="The file to write, NAME.mcap.")
+@click.option(
+    "--out",
+    "-o",
+    type=FILE,
+    help="The file to write, NAME.mcap; strftime codes stand for the start in UTC: run-%Y%m%d-%H%M%S.mcap, %% for %.",
+)
 @click.option("--rotate-mb", type=click.IntRange(1), default=250, show_default=True, help="Begin a new file then.")
 @with_target
 def command(target: Target, out: Path | None, rotate_mb: int) -> None:
@@ -25,6 +31,7 @@ def command(target: Target, out: Path | None, rotate_mb: int) -> None:
     if out is None:
         raise click.UsageError("--out is missing")
     require_mcap()
+    out = dated(out, datetime.now(UTC))
     try:
         target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
     except OSError as error:
@@ -58,6 +65,11 @@ def export(recording: Path, folder: Path) -> None:
     if done.damages:
         tell_damages(recording, done.damages)
         sys.exit(EXIT_INCOMPLETE)
+
+
+def dated(pattern: Path, start: datetime) -> Path:
+    """Return a path with the start of the recording in the place of its strftime codes; files after it have numbers."""
+    return Path(start.strftime(str(pattern)))
 
 
 async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:

@@ -4,12 +4,15 @@ import asyncio
 import re
 import signal
 from asyncio.subprocess import PIPE
+from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 from mcap.records import Channel
 
 from ldcnd.cli.main import cli
+from ldcnd.cli.record import dated
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.samples import PositionSample
@@ -32,13 +35,15 @@ def is_on_the_disk(part, topic):
 @pytest.mark.real_time
 @pytest.mark.timeout(120)
 async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
-    path, whole, tables = tmp_path / "run.mcap", tmp_path / "whole.mcap", tmp_path / "tables"
+    pattern, path, whole, tables = (tmp_path / name for name in ("run%%.mcap", "run%.mcap", "whole.mcap", "tables"))
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
-        recording = await asyncio.create_subprocess_exec(*LDCND, "record", "-o", str(path), "-e", endpoint, stderr=PIPE)
+        recording = await asyncio.create_subprocess_exec(
+            *LDCND, "record", "-o", str(pattern), "-e", endpoint, stderr=PIPE
+        )
         assert recording.stderr
         async with asyncio.timeout(45):
             await recording.stderr.readline()
-            while not is_on_the_disk(path.with_name("run.mcap.part"), "/ldcn/sim/tele/x/position"):
+            while not is_on_the_disk(path.with_name("run%.mcap.part"), "/ldcn/sim/tele/x/position"):
                 await asyncio.sleep(0.2)  # nothing tells when a file has grown
             recording.send_signal(signal.SIGTERM)
             _, told = await recording.communicate()
@@ -51,6 +56,12 @@ async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):
     assert (exported.exit_code, exported.output.split()[0]) == (0, count)
     assert (tables / "ldcn.sim.tele.x.position.csv").read_text().startswith("t_ns,received_ns,")
     assert (recovered.exit_code, recovered.output.split()[0]) == (0, count)
+
+
+def test_a_name_tells_when_the_recording_began():
+    start = datetime(2031, 2, 3, 4, 5, 6, tzinfo=UTC)
+
+    assert dated(Path("%Y/run-%Y%m%d-%H%M%S.mcap"), start) == Path("2031/run-20310203-040506.mcap")
 
 
 async def test_a_damaged_recording_is_recovered_and_exported_as_far_as_it_goes_and_says_where_it_ends(tmp_path):
