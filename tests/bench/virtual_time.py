@@ -11,14 +11,14 @@ from typing import TypeVar
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.wire_log import WireEvent, WireRecord
-from ldcnd.config import RigConfig
 from ldcnd.daemon.process import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.sim.jumping_loop import JumpingLoop
+from tests.bench import commands_and_polls
 from tests.bench.report import Row
-from tests.support.rig import RunningRig, running_rig
+from tests.bench.saturated_rig import on_jumping_clock, saturating
+from tests.support.rig import RunningRig
 
 DRIVES = 31
 COMMANDS = 400
@@ -35,37 +35,15 @@ def rows(seconds: float) -> list[Row]:
         Row("longest wait of a command / longest exchange", _run(DRIVES, _longest_wait), target=1.0, at_most=True),
         Row("full collections in steady state", _run(8, lambda rig: _collections(rig, seconds)), "", 0.0, at_most=True),
     ]
+    found += commands_and_polls.rows(seconds)
     for drives in (1, 8, DRIVES):
         speed = _run(drives, lambda rig: _speed(rig, min(seconds, 10.0)))
         found.append(Row(f"simulated line and daemon, {drives} drive(s): virtual seconds per second", speed, "x"))
     return found
 
 
-def saturating(drives: int, **bus_settings: object) -> RigConfig:
-    """Return a rig that wants more polls than its line can carry, with other settings of its line."""
-    axes = [
-        {
-            "name": f"a{number}",
-            "address": number,
-            "model": "ls-182ap",
-            "velocity": 1.0,
-            "acceleration": 1.0,
-            "rates": {"position": 2000.0, "velocity": 2000.0, "adc": 2000.0, "state": 1.0},
-        }
-        for number in range(1, drives + 1)
-    ]
-    bus = {"name": "line0", "port": "sim:line0", "baud": 115_200, "overload": "skip", "axis": axes, **bus_settings}
-    modules = [{"model": "ls182ap"}] * drives
-    return RigConfig.model_validate({"rig": "bench", "bus": [bus], "sim": [{"name": "line0", "module": modules}]})
-
-
 def _run(drives: int, work: Callable[[RunningRig], Awaitable[ResultT]]) -> ResultT:
-    async def within() -> ResultT:
-        async with running_rig(saturating(drives)) as rig:
-            return await work(rig)
-
-    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
-        return runner.run(within())
+    return on_jumping_clock(saturating(drives), work)
 
 
 def _bus(rig: RunningRig) -> Bus:

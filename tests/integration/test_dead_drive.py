@@ -7,7 +7,7 @@ from itertools import pairwise
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.model.axes import LinkState
-from tests.bench.virtual_time import saturating
+from tests.bench.saturated_rig import saturating
 from tests.support.chain_rig import rig_on
 
 DRIVES = 8

@@ -1,0 +1,26 @@
+"""Commands do not starve polls, and a command that is alone waits for nothing but the exchange on the wire."""
+
+import pytest
+
+from ldcnd.bus.exchange_queue import COMMANDS_PER_POLL
+from tests.bench.commands_and_polls import CALLERS, CROWDS, MOST_ROUNDS, MOST_WAIT, ORDERS, Load, shared
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("drives", CROWDS)
+def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(order, drives):
+    seen = shared(order, drives, Load.HALF, 6.0)
+
+    assert seen.commands == pytest.approx(0.5, abs=0.05)
+    assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
+    assert 0.5 < seen.longest_wait <= MOST_WAIT
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("drives", CROWDS)
+def test_commands_that_always_wait_leave_every_axis_a_poll_in_two_rounds(order, drives):
+    seen = shared(order, drives, Load.FULL, 6.0)
+
+    assert CALLERS > COMMANDS_PER_POLL
+    assert seen.commands > 0.6
+    assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
