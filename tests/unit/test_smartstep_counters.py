@@ -2,7 +2,7 @@ import random
 
 import pytest
 
-from ldcnd.drivers.smartstep.counters import Counter, CounterQuality, CounterReading, CounterValue
+from ldcnd.drivers.smartstep.counters import GUARD_READS, Counter, CounterQuality, CounterReading, CounterValue
 from ldcnd.drivers.smartstep.operating_modes import OperatingMode
 
 
@@ -111,3 +111,30 @@ def test_words_after_the_end_are_ignored():
     reading.take(99)
 
     assert reading.value == CounterValue(0x0001_8000)
+
+
+def test_counter_that_stands_near_a_boundary_is_read_in_three_words_once_it_is_known():
+    _, at_first = read(Counter.FEEDBACK, lambda _: 0)
+    value, afterwards = read(Counter.FEEDBACK, lambda _: 0, last_at_rest=0)
+
+    assert value == CounterValue(0)
+    assert (at_first, afterwards) == (3 + GUARD_READS, 3)
+
+
+def test_counter_that_has_come_near_a_boundary_is_still_suspect():
+    _, reads = read(Counter.FEEDBACK, lambda _: 0x0005_0000, last_at_rest=0x0004_8000)
+
+    assert reads == 3 + GUARD_READS
+
+
+def test_trembling_where_it_stood_is_never_off_by_65536():
+    rng = random.Random(4)
+    uncertain = 0
+    for _ in range(2000):
+        value, _ = read(Counter.FEEDBACK, lambda _: 0x0005_0000 - rng.randrange(2), last_at_rest=0x0005_0000)
+
+        assert value is not None
+        assert value.raw in (0x0005_0000, 0x0004_FFFF)
+        uncertain += value.quality is CounterQuality.RESOLVED
+
+    assert uncertain <= 10

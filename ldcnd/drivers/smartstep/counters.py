@@ -2,7 +2,8 @@
 
 High, low, high and "equal is good" is wrong for a counter that rests on a boundary of 65536 and trembles by one: both
 high halves may agree and still not belong to the low half. So the low half decides which of two adjacent high halves is
-its own, and near a boundary further high halves are read to learn whether there are two.
+its own, and near a boundary further high halves are read to learn whether there are two. A counter that is where it was
+at standstill is not read on: there is nothing left to learn.
 Sources: manual 5 and 6 with their notes; the rule was found by simulation, as the manual gives none.
 """
 
@@ -109,10 +110,12 @@ class CounterReading:
         high = _high_of(seen, low)
         if high is None:
             self._begin_again()
-        elif len(seen) == 1 and _is_near_boundary(low) and len(self._highs) < 2 + GUARD_READS:
             return
-        else:
-            self._accept(high * _WORD + low)
+        raw = high * _WORD + low
+        known = self._last_at_rest is not None and _is_near(self._last_at_rest, raw)
+        is_suspect = len(seen) == 1 and _is_near_boundary(low) and not known
+        if not is_suspect or len(self._highs) == 2 + GUARD_READS:
+            self._accept(raw)
 
     def _begin_again(self) -> None:
         self._highs.clear()
@@ -146,6 +149,10 @@ def _is_near_boundary(low: int) -> bool:
 def _nearest_to(last: int, raw: int) -> int:
     """Return `raw`, or its neighbour 65536 away if that one is close to a value known from standstill."""
     for candidate in ((raw + _WORD) % _RANGE, (raw - _WORD) % _RANGE):
-        if min((candidate - last) % _RANGE, (last - candidate) % _RANGE) < GUARD_COUNTS:
+        if _is_near(last, candidate):
             return candidate
     return raw
+
+
+def _is_near(last: int, raw: int) -> bool:
+    return min((raw - last) % _RANGE, (last - raw) % _RANGE) < GUARD_COUNTS
