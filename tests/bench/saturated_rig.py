@@ -29,6 +29,15 @@ def saturating(drives: int, **bus_settings: object) -> RigConfig:
     return RigConfig.model_validate({"rig": "bench", "bus": [bus], "sim": [{"name": "line0", "module": modules}]})
 
 
+def saturating_smartsteps() -> RigConfig:
+    """Return a rig of two SmartSteps that wants more words than their line can carry."""
+    rates = {"position": 10.0, "velocity": 50.0, "state": 20.0}
+    axes = [{"name": f"s{unit}", "address": unit, "model": "smartstep", "rates": rates} for unit in (1, 2)]
+    bus = {"name": "steps", "port": "sim:steps", "family": "smartstep", "axis": axes}
+    sim = {"name": "steps", "unit": [{"number": unit} for unit in (1, 2)]}
+    return RigConfig.model_validate({"rig": "bench", "bus": [bus], "sim": [sim]})
+
+
 def on_jumping_clock(config: RigConfig, work: Callable[[RunningRig], Awaitable[ResultT]]) -> ResultT:
     """Run a rig on a loop of its own for as long as some work takes."""
 

@@ -15,9 +15,9 @@ from ldcnd.daemon.process import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from tests.bench import commands_and_polls
+from tests.bench import commands_and_polls, trace_upload
 from tests.bench.report import Row
-from tests.bench.saturated_rig import on_jumping_clock, saturating
+from tests.bench.saturated_rig import on_jumping_clock, saturating, saturating_smartsteps
 from tests.support.rig import RunningRig
 
 DRIVES = 31
@@ -31,15 +31,23 @@ def rows(seconds: float) -> list[Row]:
     alive_per_s, _ = _run(DRIVES, lambda rig: _with_one_dead(rig, seconds))
     found = [
         Row(f"jumping clock: line busy, {DRIVES} drives", busy, target=0.9999),
+        Row("jumping clock: line busy, 2 SmartSteps", smartsteps_busy(seconds), target=0.999),
         Row(f"jumping clock: good polls with 1 of {DRIVES} dead, share", alive_per_s / full_per_s, target=0.98),
         Row("longest wait of a command / longest exchange", _run(DRIVES, _longest_wait), target=1.0, at_most=True),
         Row("full collections in steady state", _run(8, lambda rig: _collections(rig, seconds)), "", 0.0, at_most=True),
     ]
     found += commands_and_polls.rows(seconds)
+    found += trace_upload.rows()
     for drives in (1, 8, DRIVES):
         speed = _run(drives, lambda rig: _speed(rig, min(seconds, 10.0)))
         found.append(Row(f"simulated line and daemon, {drives} drive(s): virtual seconds per second", speed, "x"))
     return found
+
+
+def smartsteps_busy(seconds: float) -> float:
+    """Return for which share of so many virtual seconds a line of SmartSteps that is asked for too much is busy."""
+    _, busy = on_jumping_clock(saturating_smartsteps(), lambda rig: _saturated(rig, seconds))
+    return busy
 
 
 def _run(drives: int, work: Callable[[RunningRig], Awaitable[ResultT]]) -> ResultT:
