@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from ldcnd.bus.cost import Cost
-from ldcnd.bus.response_times import FULL, PeriodicTask, busy_periods_s, load_of, meets_deadlines, response_times_s
+from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
@@ -17,16 +17,17 @@ STEPS = 16
 
 @dataclass(frozen=True, slots=True)
 class Poll:
-    """One periodic exchange.
+    """What is asked for periodically, in one exchange or a few.
 
     Attributes:
         axis: whose.
         items: what it asks for in the worst case.
         rate_hz: how often at most.
-        cost: of the exchange with all these items.
-        mean_s: of the exchange with what it asks for on average.
+        cost: with all these items.
+        mean_s: with what it asks for on average.
         request_bytes: what is sent.
         reply_bytes: what comes back at most.
+        exchanges: that it takes.
     """
 
     axis: str
@@ -36,11 +37,12 @@ class Poll:
     mean_s: float
     request_bytes: int = 0
     reply_bytes: int = 0
+    exchanges: int = 1
 
     @property
     def task(self) -> PeriodicTask:
         """As the analysis sees it."""
-        return PeriodicTask(1.0 / self.rate_hz, self.cost.longest_s)
+        return PeriodicTask(1.0 / self.rate_hz, self.cost.longest_s, self.exchanges)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +110,7 @@ def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True
     Args:
         polls: what is asked of it.
         urgent: what goes before them.
-        by_deadline: the earliest deadline goes first; otherwise polls take turns.
+        by_deadline: the earliest deadline goes first; otherwise axes take turns, exchange by exchange.
     """
     tasks = [poll.task for poll in polls]
     probes = [urgent.probe] if urgent.probe else []
@@ -116,22 +118,34 @@ def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True
     stop_s = longest_s + urgent.stop_s
     return LinePlan(
         polls=tuple(polls),
-        responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else busy_periods_s(tasks, probes)),
+        responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else _in_turns_s(polls, probes)),
         load=load_of([*tasks, *probes]),
         mean_load=math.fsum(poll.rate_hz * poll.mean_s for poll in polls) + load_of(probes),
-        commands_per_s=_most_commands_per_s(tasks, probes, urgent.command_s, by_deadline=by_deadline),
+        commands_per_s=_most_commands_per_s(polls, probes, urgent.command_s, by_deadline=by_deadline),
         stop_wait_s=longest_s,
         stop_s=stop_s,
         stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
     )
 
 
-def in_time(tasks: Sequence[PeriodicTask], urgent: Sequence[PeriodicTask], *, by_deadline: bool) -> bool:
-    """Tell whether every task is always over before its next turn."""
+def in_time(polls: Sequence[Poll], urgent: Sequence[PeriodicTask], *, by_deadline: bool) -> bool:
+    """Tell whether every poll is always over before its next turn."""
     if by_deadline:
-        return meets_deadlines(tasks, *urgent)
-    bounds_s = busy_periods_s(tasks, urgent)
-    return all(bound_s <= task.period_s for bound_s, task in zip(bounds_s, tasks, strict=True))
+        return meets_deadlines([poll.task for poll in polls], *urgent)
+    bounds_s = _in_turns_s(polls, urgent)
+    return all(bound_s <= poll.task.period_s for bound_s, poll in zip(bounds_s, polls, strict=True))
+
+
+def _in_turns_s(polls: Sequence[Poll], urgent: Sequence[PeriodicTask]) -> list[float]:
+    places: dict[str, list[int]] = {}
+    for place, poll in enumerate(polls):
+        places.setdefault(poll.axis, []).append(place)
+    bounds_s = [0.0] * len(polls)
+    units = [[polls[place].task for place in unit] for unit in places.values()]
+    for unit, unit_bounds_s in zip(places.values(), taking_turns_s(units, urgent), strict=True):
+        for place, bound_s in zip(unit, unit_bounds_s, strict=True):
+            bounds_s[place] = bound_s
+    return bounds_s
 
 
 def largest(fits: Callable[[float], bool], least: float, most: float) -> float | None:
@@ -156,14 +170,14 @@ def largest(fits: Callable[[float], bool], least: float, most: float) -> float |
 
 
 def _most_commands_per_s(
-    tasks: Sequence[PeriodicTask], probes: Sequence[PeriodicTask], command_s: float, *, by_deadline: bool
+    polls: Sequence[Poll], probes: Sequence[PeriodicTask], command_s: float, *, by_deadline: bool
 ) -> float:
-    room = (FULL - load_of([*tasks, *probes])) / command_s
+    room = (FULL - load_of([*(poll.task for poll in polls), *probes])) / command_s
     least = room / 2**STEPS
     if room <= 0.0:
         return 0.0
 
     def fits(rate: float) -> bool:
-        return in_time(tasks, [*probes, PeriodicTask(1.0 / rate, command_s)], by_deadline=by_deadline)
+        return in_time(polls, [*probes, PeriodicTask(1.0 / rate, command_s)], by_deadline=by_deadline)
 
     return largest(fits, least, room) or 0.0

@@ -11,7 +11,7 @@ together, at one of a finite number of offsets.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 FULL = 0.98
@@ -27,10 +27,12 @@ class PeriodicTask:
     Attributes:
         period_s: least time between two turns.
         cost_s: longest occupation of the line.
+        exchanges: that it is made of; where units take turns, those of others come between any two.
     """
 
     period_s: float
     cost_s: float
+    exchanges: int = 1
 
 
 def load_of(tasks: Sequence[PeriodicTask]) -> float:
@@ -90,19 +92,28 @@ def meets_deadlines(tasks: Sequence[PeriodicTask], *urgent: PeriodicTask) -> boo
     return True
 
 
-def busy_periods_s(tasks: Sequence[PeriodicTask], urgent: Sequence[PeriodicTask] = ()) -> list[float]:
-    """Return a bound like `response_times_s` for a line whose polls take turns in whatever order.
+def taking_turns_s(units: Sequence[Sequence[PeriodicTask]], urgent: Sequence[PeriodicTask] = ()) -> list[list[float]]:
+    """Return a bound like `response_times_s` for a line whose units take turns, exchange by exchange.
 
-    A line that never idles while something is due has done all that is due by the end of a busy period, the longest of
-    which begins with everything due at once.
+    An exchange that is due waits for at most one of each other unit. So a unit is never served more slowly than by a
+    line of its own on which each exchange takes as long as one of every unit; there it does what has the earliest
+    deadline. Besides, a line that never idles while something is due has done all that is due by the end of a busy
+    period, the longest of which begins with everything due at once. The lesser bound counts.
+
+    Args:
+        units: the polls of each unit.
+        urgent: what goes before all of them whenever it is there.
 
     Returns:
-        Seconds, in the order of `tasks`; infinity for all of them when the line is full.
+        Seconds, in the order of `units`; infinity for all of them when the line is full.
     """
-    everything = [*tasks, *urgent]
+    everything = [*(task for tasks in units for task in tasks), *urgent]
     if load_of(everything) > FULL:
-        return [math.inf] * len(tasks)
-    return [_busy_period_s(everything, 0.0)] * len(tasks)
+        return [[math.inf] * len(tasks) for tasks in units]
+    busy_s = _busy_period_s(everything, 0.0)
+    round_s = math.fsum(max(task.cost_s / task.exchanges for task in tasks) for tasks in units)
+    alone = [[replace(task, cost_s=task.exchanges * round_s) for task in tasks] for tasks in units]
+    return [[min(busy_s, bound_s) for bound_s in response_times_s(tasks, urgent=urgent)] for tasks in alone]
 
 
 @dataclass(frozen=True, slots=True)

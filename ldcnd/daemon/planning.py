@@ -100,7 +100,7 @@ class _Line:
     @property
     def fits(self) -> bool:
         probes = [self.urgent.probe] if self.urgent.probe else []
-        return in_time([poll.task for poll in self.polls], probes, by_deadline=self.by_deadline)
+        return in_time(self.polls, probes, by_deadline=self.by_deadline)
 
 
 def _line(bus: BusConfig) -> _Line:

@@ -35,6 +35,7 @@ def polls_of(bus: BusConfig, timing: LineTiming) -> list[Poll]:
                         mean_s=words * cost.longest_s,
                         request_bytes=words * len(word.request),
                         reply_bytes=words * word.reply_bytes,
+                        exchanges=words,
                     )
                 )
     return polls

@@ -74,6 +74,11 @@ def test_the_simulated_rig_holds_with_room_for_commands():
     assert bus.node_baud == pytest.approx(113_636, abs=1)
 
 
+@pytest.mark.parametrize("path", sorted(SIMULATED.parent.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_shipped_rig_holds(path):
+    assert plan_rig(load_config(path)).holds
+
+
 def test_a_plan_that_cannot_hold_is_refused_with_changes_that_make_it_hold():
     overfull = config(axes=8, baud=19_200, position=30.0, velocity=30.0, adc=2.0, state=5.0)
 
@@ -206,6 +211,14 @@ def test_a_smartstep_line_is_planned_word_by_word():
 
 def test_a_smartstep_line_that_is_asked_for_too_much_is_never_idle():
     assert smartsteps_busy(10.0) >= 0.999
+
+
+def test_an_item_of_a_smartstep_does_not_wait_for_all_that_is_asked_of_the_other_one():
+    (bus,) = plan_rig(smartstep(velocity=1.0, state=0.5)).buses
+
+    velocity, *_ = (poll for poll in bus.polls if poll.items[0].item == "velocity")
+    # a state that has just begun and then its own word; before each of these words one of the other drive
+    assert velocity.response_s == pytest.approx(2 * (3 + 1) * velocity.longest_s)
 
 
 def test_a_smartstep_line_is_let_pass_unless_it_is_told_to_refuse():

@@ -9,7 +9,7 @@ from ldcnd.bus.cost import Cost
 from ldcnd.bus.exchange_queue import Choose, ExchangeQueue
 from ldcnd.bus.poll_plan import Poll, Urgent, largest, plan_line
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s
+from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 
 MS = 0.001
 URGENT = Urgent(command_s=2 * MS, stop_s=1 * MS, recovery_s=3 * MS, margin_s=5 * MS)
@@ -143,6 +143,30 @@ def test_the_bound_is_reached():
     just_after = [1e-7, 1e-7, 0.0]
 
     assert observed_s(tasks, just_after, 3.0)[0] == pytest.approx(bounds_s[0], abs=1e-6)
+
+
+def test_a_unit_waits_for_one_exchange_of_each_other_unit():
+    seldom, often = PeriodicTask(0.1, 2 * MS), PeriodicTask(1.0, 200 * MS, exchanges=100)
+
+    (seldom_s,), (often_s,) = taking_turns_s([[seldom], [often]])
+
+    assert seldom_s == pytest.approx(4 * MS)
+    assert often_s == pytest.approx(206 * MS)  # at worst, not twice as long, because the other one has so little to do
+
+
+def test_where_turns_would_promise_nothing_the_longest_busy_time_does():
+    heavy, light = PeriodicTask(0.1, 50 * MS), PeriodicTask(10.0, 4 * MS)
+
+    (heavy_s,), *lights_s = taking_turns_s([[heavy], *[[light]] * 9])
+
+    assert heavy_s == pytest.approx(86 * MS)
+    assert lights_s == [[pytest.approx(86 * MS)]] * 9
+
+
+def test_what_is_urgent_delays_whoever_takes_turns():
+    ((bound_s,),) = taking_turns_s([[PeriodicTask(0.1, 5 * MS)]], [PeriodicTask(0.1, 7 * MS)])
+
+    assert bound_s == pytest.approx(12 * MS)
 
 
 def test_the_earliest_deadline_goes_first_among_the_polls_that_are_due():

@@ -131,12 +131,12 @@ class UnitPoller(Poller[int | Refusal]):
         The line takes its next turn before it delivers the last reply; which word is next depends on that reply, so
         the turn after this one is put off until then.
         """
-        self.due_at_s = now_s + self._profile.first_character_s + PUT_OFF_S
+        queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.first_character_s + PUT_OFF_S
         if self._misses >= MISSES_BEFORE_BACKOFF:
             self._address = Register.PRESENT_ALARM
         else:
             if self._item is None:
-                self._begin(now_s)
+                self._begin(now_s, queued_at_s)
             wanted = self._counter.wanted if self._counter else None
             self._address = wanted.address if wanted else self._left.pop(0)
         return with_response_time(reference(self.node, self._address), self._profile)
@@ -154,7 +154,9 @@ class UnitPoller(Poller[int | Refusal]):
             self._words[self._address] = reply
             if not self._left:
                 self._finish(self._item, timing)
-        self._next_turn(timing.received_at_s if self._item else min(self._due_s.values()))
+        due_s = min(self._due_s.values())
+        # behind the others that are due, also with what is late: units take turns word by word
+        self._next_turn(timing.received_at_s if self._item else max(timing.received_at_s, due_s))
 
     def missed(self, error: BusError) -> None:
         """See `Poller`."""
@@ -177,9 +179,18 @@ class UnitPoller(Poller[int | Refusal]):
 
     # -- items -------------------------------------------------------------------------------------------------------
 
-    def _begin(self, now_s: float) -> None:
-        """Take up the item that has waited longest."""
-        item = self._item = min(self._due_s, key=self._due_s.__getitem__)
+    def _begin(self, now_s: float, queued_at_s: float) -> None:
+        """Take up the item that is due and has the earliest deadline: its next turn.
+
+        What has become due since the turn was asked for waits for another one, or it would pass over a late item at the
+        last moment.
+        """
+
+        def urgency(item: Item) -> tuple[bool, float]:
+            due_s = self._due_s[item]
+            return due_s > queued_at_s, due_s + self._periods_s.get(item, 0.0)
+
+        item = self._item = min(self._due_s, key=urgency)
         due_s = self._due_s[item]
         if item is Basic.IDENTITY:
             self._due_s[item] = NEVER_S
