@@ -24,12 +24,14 @@ class ModuleWatch(Poller[Status]):
         self.node = address
         self.status: int | None = None
         self.due_at_s = asyncio.get_running_loop().time()
+        self.deadline_at_s = self.due_at_s + PERIOD_S
         self._exchange = commands.read_status(Node(address, ANY_DIALECT), STATUS_BYTE_ONLY)
 
     def next_exchange(self, now_s: float) -> Exchange[Status]:
         """See `Poller`; a late turn does not shift the next one."""
         behind = max(0, int((now_s - self.due_at_s) / PERIOD_S))
         self.due_at_s += (behind + 1) * PERIOD_S
+        self.deadline_at_s = self.due_at_s + PERIOD_S
         return self._exchange
 
     def deliver(self, reply: Status, timing: Timing) -> None:  # noqa: ARG002 - part of the contract
