@@ -5,12 +5,24 @@ piles them up.
 """
 
 from abc import ABC, abstractmethod
+from enum import IntEnum
 from typing import Generic, TypeVar
 
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 
 ReplyT = TypeVar("ReplyT")
+
+NO_DEADLINE_S = float("inf")
+"""Deadline of a poll that only wants time of the line that nobody else's wants; it is never late."""
+
+
+class Priority(IntEnum):
+    """Whose polls go first on a line that has fallen behind, highest first."""
+
+    HIGH = 0
+    NORMAL = 1
+    LOW = 2
 
 
 class Poller(ABC, Generic[ReplyT]):
@@ -20,11 +32,13 @@ class Poller(ABC, Generic[ReplyT]):
         node: whom it asks; a node that does not answer is asked more and more seldom.
         due_at_s: when it wants its next slot, in loop time; read by the bus after each slot.
         deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
+        priority: how it fares while the line cannot carry all polls; does not change while it waits for a turn.
     """
 
     node: int
     due_at_s: float
     deadline_at_s: float = 0.0
+    priority: Priority = Priority.NORMAL
 
     @abstractmethod
     def next_exchange(self, now_s: float) -> Exchange[ReplyT]:

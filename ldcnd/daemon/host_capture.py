@@ -1,7 +1,7 @@
 """Sampling one axis from the host: a poller that takes whatever time of the line nobody else's poll wants.
 
-Its polls have no deadline, so of all polls that are due they go last: the telemetry of the line, the traced axis's own
-included, keeps its turns, and waits for at most the one exchange that is on the wire.
+Its polls have no deadline and a low priority, so of all polls that are due they go last: the telemetry of the line, the
+traced axis's own included, keeps its turns, and waits for at most the one exchange that is on the wire.
 """
 
 import asyncio
@@ -9,12 +9,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
-
-NO_DEADLINE_S = float("inf")
 
 Raw = tuple[int | float | None, ...]
 Values = tuple[float | None, ...]
@@ -77,6 +75,7 @@ class HostCapture(Poller[AxisReading]):
         self.node = node
         self.due_at_s = start_at_s
         self.deadline_at_s = NO_DEADLINE_S
+        self.priority = Priority.LOW
         self.samples: list[HostSample] = []
         self.trigger_index: int | None = None
         self.filled = asyncio.Event()

@@ -6,9 +6,10 @@ import random
 import pytest
 
 from ldcnd.bus.cost import Cost
-from ldcnd.bus.exchange_queue import Choose, ExchangeQueue
+from ldcnd.bus.exchange_queue import ExchangeQueue
 from ldcnd.bus.poll_plan import Poll, Urgent, largest, plan_line
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poll_rank import Choose
+from ldcnd.bus.poller import Poller, Priority
 from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 
 MS = 0.001
@@ -35,11 +36,25 @@ class Turns(Poller[None]):
 
 
 def observed_s(
-    tasks: list[PeriodicTask], starts_s: list[float], until_s: float, choose: Choose | None = None
+    tasks: list[PeriodicTask],
+    starts_s: list[float],
+    until_s: float,
+    choose: Choose | None = None,
+    dice: random.Random | None = None,
 ) -> list[float]:
-    """Let the real queue order the tasks; return the longest time of each from being due to being over."""
+    """Let the real queue order the tasks; return the longest time of each from being due to being over.
+
+    Args:
+        tasks: what is asked of the line.
+        starts_s: first turns.
+        until_s: when to end.
+        choose: among equals.
+        dice: draw the priorities; all have the same one if missing.
+    """
     queue: ExchangeQueue = ExchangeQueue(choose)
     turns = [Turns(task, start) for task, start in zip(tasks, starts_s, strict=True)]
+    for each in turns:
+        each.priority = dice.choice(list(Priority)) if dice else Priority.NORMAL
     longest = dict.fromkeys(turns, 0.0)
     for each in turns:
         queue.schedule(each, each.due_at_s)
@@ -134,6 +149,21 @@ def test_no_poll_is_later_than_its_bound_whoever_chooses_among_equals(seed):
         for seen_s, bound_s in zip(observed_s(tasks, starts_s, 4.0, choose), bounds_s, strict=True):
             assert seen_s <= bound_s + 1e-9
     assert max(chosen) > 3
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_where_a_plan_holds_no_poll_is_later_than_its_bound_whatever_the_priorities(seed):
+    dice = random.Random(seed)
+    tasks = []
+    while not tasks or meets_deadlines(tasks):
+        held, tasks = tasks, [*tasks, PeriodicTask(dice.choice([0.02, 0.03, 0.06, 0.12]), dice.uniform(0.8, 4.0) * MS)]
+    bounds_s = response_times_s(held)
+
+    for choose in (None, lambda polls, _now_s: dice.choice(polls)):
+        for _ in range(5):
+            starts_s = [dice.choice([0.0, dice.uniform(0.0, task.period_s)]) for task in held]
+            for seen_s, bound_s in zip(observed_s(held, starts_s, 4.0, choose, dice), bounds_s, strict=True):
+                assert seen_s <= bound_s + 1e-9
 
 
 def test_the_bound_is_reached():

@@ -206,7 +206,8 @@ async def test_polling_for_long_leaves_nothing_behind_in_the_queue():
     async with smartstep_line([simulated(1)]) as line:
         heard.listen(line, "u1")
         await asyncio.sleep(300.0)
-        kept = len(line.bus._queue._later) + len(line.bus._queue._due)
+        polls = line.bus._queue._polls
+        kept = len(polls._later) + len(polls._turns) + len(polls._due)
 
     assert len(heard.readings) > 800
     assert kept < 50
