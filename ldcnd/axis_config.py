@@ -9,7 +9,7 @@ from ldcnd import smartstep_config
 from ldcnd.config_names import DeviceIdentity, Name
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
 from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
-from ldcnd.model.axes import AxisLimits
+from ldcnd.model.axes import AxisLimits, PollPriority
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.requests import HomeMethod, HomeStop
 from ldcnd.smartstep_config import SmartStepUnitConfig
@@ -158,6 +158,9 @@ class AxisConfig(Frozen):
     """Bounds of `track`; without them the axis follows no set-points."""
     rates: RatesConfig = RatesConfig()
     """How often each item is published."""
+    priority: PollPriority = "normal"
+    """How its polls fare while the line cannot carry all of them: the highest go first; low ones give way, but still \
+come now and then."""
     loss: LossConfig = LossConfig()
     """What the axis does when somebody disappears in mid-motion."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)

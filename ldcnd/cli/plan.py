@@ -42,9 +42,10 @@ def _table(bus: BusPlan) -> str:
     ]
     for poll in bus.polls:
         size = f"{poll.request_bytes}/{poll.reply_bytes}"
+        remarks = f"{'' if poll.priority == 'normal' else f'  {poll.priority}'}{'' if poll.holds else '  late'}"
         lines += [
             f"  {poll.axis:12} {item.item:20} {item.rate_hz:5g} Hz {size:>7} {_ms(poll.longest_s):>10}"
-            f" {_ms(item.response_s):>12}{'' if poll.holds else '  late'}"
+            f" {_ms(item.response_s):>12}{remarks}"
             for item in poll.items
         ]
     if bus.remedies:

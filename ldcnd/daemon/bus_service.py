@@ -7,7 +7,7 @@ from typing import Any
 
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import Poller, Priority
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.daemon.axis_poller import AxisPoller, Deliver, wanted_rates_hz
 from ldcnd.daemon.axis_service import AxisService
@@ -97,11 +97,12 @@ class BusService:
             log.warning("group stop not sent", bus=self.bus.settings.name, reason=error.message)
 
     def reconfigure(self, configs: Mapping[str, AxisConfig]) -> None:
-        """Take other limits, speeds and rates of axes, by name."""
+        """Take other limits, speeds, rates and priorities of axes, by name."""
         for axis in self.axes:
             config, before = configs[axis.config.name], axis.config
             axis.reconfigure(config)
-            if config.rates != before.rates and self.report is not None:
+            polled_anew = (config.rates, config.priority) != (before.rates, before.priority)
+            if polled_anew and self.report is not None:
                 self._poll(axis, asyncio.get_running_loop().time())
 
     def subscribed(self, axis: AxisService, item: TelemetryItem, *, present: bool) -> None:
@@ -209,6 +210,7 @@ class BusService:
             self.bus.remove_poller(previous)
         own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed))
         poller = own or AxisPoller(axis.driver, self._rates_hz(axis, now_s), now_s, self._listener(axis), axis.missed)
+        poller.priority = Priority[axis.config.priority.upper()]
         self._pollers[axis.config.name] = poller
         self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)
         self.bus.add_poller(poller)

@@ -92,7 +92,7 @@ class Daemon:
         return capture_of(snapshot_of(self.rig.line(bus), self._run.clock), self._config, self._run, cause)
 
     def reconfigure(self, config: RigConfig) -> None:
-        """Take other limits, speeds and rates of axes; everything else is as before, see `plan_reload`."""
+        """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`."""
         self._config = config
         self._describing.plan = plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)

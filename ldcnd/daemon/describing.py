@@ -135,6 +135,7 @@ def axis_info(bus: BusService, axis: AxisService) -> AxisInfo:
         adc_full_scale=driver.adc_full_scale,
         monitors=tuple(name.value for name in driver.monitors),
         trace_channels=axis.traces.channels,
+        priority=config.priority,
         registers=tuple(
             RegisterInfo(name=register.name, value=register.value, provenance=register.provenance)
             for register in driver.registers()

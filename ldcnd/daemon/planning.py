@@ -224,6 +224,7 @@ def _described(bus: BusConfig, plan: LinePlan) -> list[PollPlan]:
             response_s=_bounded(response_s),
             holds=response_s <= poll.task.period_s,
             items=tuple(_items(axes[poll.axis], poll, response_s)),
+            priority=axes[poll.axis].priority,
         )
         for poll, response_s in zip(plan.polls, plan.responses_s, strict=True)
     ]

@@ -1,8 +1,8 @@
 """What a changed configuration means for a rig that runs: which changes it takes, which need a restart. Pure.
 
-Taken is what only later commands and polls look at: limits, velocities and accelerations that requests leave out, and
-polling rates. A motion under way keeps the values that it was started with. All the rest says where drives are, what
-they are, or how the daemon was built.
+Taken is what only later commands and polls look at: limits, velocities and accelerations that requests leave out,
+polling rates and priorities. A motion under way keeps the values that it was started with. All the rest says where
+drives are, what they are, or how the daemon was built.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig
 from ldcnd.errors import ConfigError
 
-APPLICABLE = ("limits", "velocity", "acceleration", "rates")
+APPLICABLE = ("limits", "velocity", "acceleration", "rates", "priority")
 """Keys of an axis that are looked up anew by every command, or by the poller that is made when they change."""
 FAMILY = "ldcn"
 """The family whose axes have these keys; the others' take no motion over the line and pace their own polls."""

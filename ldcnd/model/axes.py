@@ -1,11 +1,15 @@
 """What an axis can be: its states, how sure the daemon is of them, and what describes it."""
 
 from enum import StrEnum
+from typing import Literal
 
 from pydantic import Field
 
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.verb import Verb
+
+PollPriority = Literal["high", "normal", "low"]
+"""How the polls of an axis fare while its line cannot carry all of them."""
 
 
 class AxisState(StrEnum):
@@ -115,5 +119,7 @@ class AxisInfo(Frozen):
     """The monitors it publishes below `monitor/`."""
     trace_channels: tuple[str, ...] = ()
     """What a trace can record."""
+    priority: PollPriority = "normal"
+    """How its polls fare while its line cannot carry all of them."""
     registers: tuple[RegisterInfo, ...] = ()
     """What the drive's write-only registers hold, as far as the daemon knows."""

@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from ldcnd.model.axes import PollPriority
 from ldcnd.model.frozen import Frozen
 
 
@@ -37,6 +38,8 @@ class PollPlan(Frozen):
     """It is always over before its next turn."""
     items: tuple[ItemPlan, ...]
     """What it carries."""
+    priority: PollPriority = "normal"
+    """How it fares while the line cannot carry all polls; what is promised does not depend on it."""
 
 
 class BusPlan(Frozen):

@@ -32,12 +32,13 @@ def test_same_configuration_changes_nothing():
     assert reload.changed == reload.refused == ()
 
 
-def test_limits_speeds_and_rates_apply():
+def test_limits_speeds_rates_and_priorities_apply():
     wanted = document()
     axis(wanted, "x")["limits"]["velocity"] = 40
     axis(wanted, "x")["velocity"] = 25
     axis(wanted, "y")["acceleration"] = 300
     axis(wanted, "y")["rates"]["adc"] = 1
+    axis(wanted, "y")["priority"] = "high"
 
     reload = plan_reload(RUNNING, validated(wanted))
 
@@ -47,6 +48,7 @@ def test_limits_speeds_and_rates_apply():
         "bus.line0.axis.x.velocity",
         "bus.line0.axis.y.acceleration",
         "bus.line0.axis.y.rates.adc",
+        "bus.line0.axis.y.priority",
     }
     assert reload.refused == ()
 
