@@ -19,6 +19,9 @@ class Lane(IntEnum):
     BACKGROUND = 3
 
 
+STOP, COMMAND, _, BACKGROUND = Lane  # `take` runs between two packets, and Lane.STOP is looked up slowly
+
+
 class Queueable(Protocol):
     """What the queue must know of a job."""
 
@@ -102,21 +105,19 @@ class ExchangeQueue(Generic[JobT]):
 
     def take(self, now_s: float) -> JobT | Poller[Any] | None:
         """Remove and return what goes on the wire now, or None when nothing is due."""
-        if stop := self._take_job(Lane.STOP):
+        if stop := self._take_job(STOP):
             return stop
         probe, self._probe = self._probe, None
         if probe and not probe.abandoned:
             return probe
         poll_due = self._polls.is_due(now_s)
-        if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (
-            command := self._take_job(Lane.COMMAND)
-        ):
+        if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (command := self._take_job(COMMAND)):
             self._commands_in_a_row += 1
             return command
         self._commands_in_a_row = 0
         if not poll_due or self._polls_in_a_row >= POLLS_PER_BACKGROUND:
             self._polls_in_a_row = 0
-            if background := self._take_job(Lane.BACKGROUND):
+            if background := self._take_job(BACKGROUND):
                 return background
         if not poll_due:
             return None
