@@ -4,7 +4,8 @@ import asyncio
 from typing import Any, TypeVar
 
 from ldcnd.bus.exchange_queue import ExchangeQueue, Lane
-from ldcnd.bus.line import Line, Phase
+from ldcnd.bus.line import Line
+from ldcnd.bus.line_phase import Phase
 from ldcnd.bus.mute_nodes import MuteNodes
 from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poller import Poller
@@ -267,6 +268,19 @@ class Bus:
                 self.statistics.stop_wait.add(now_s - turn.wanted_at_s)
         return turn
 
+    def sent(self, turn: Turn) -> None:
+        """See `Users`; a poller that was asked has its next turn."""
+        if isinstance(turn, PollTurn):
+            self._schedule(turn.poller, turn.poller.due_at_s)
+
+    def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
+        """See `Users`: to choose a poll and what to ask takes longer than all else between two packets."""
+        exchange = turn.exchange
+        wait_s = self._order.wait_s(exchange.node, asked_at_s) if self._order else 0.0
+        at_s = asked_at_s + wait_s + exchange.reply_bytes * self.settings.bits_per_byte / self.baud
+        if poller := self._queue.look_ahead(at_s):
+            poller.prepare(at_s)
+
     def next_due_s(self) -> float:
         """See `Users`."""
         return self._queue.next_due_s()
@@ -285,8 +299,6 @@ class Bus:
             for poller in self._pollers:
                 if poller.node == also:
                     self._queue.schedule(poller, poller.due_at_s)
-        if isinstance(turn, PollTurn):
-            self._schedule(turn.poller, turn.poller.due_at_s)
 
     def missed(self, turn: Turn, now_s: float) -> None:
         """See `Users`."""

@@ -124,6 +124,10 @@ class ExchangeQueue(Generic[JobT]):
         self._polls_in_a_row += 1
         return self._polls.take(now_s)
 
+    def look_ahead(self, at_s: float) -> Poller[Any] | None:
+        """Choose the next poll ahead, see `PollQueue`; jobs may still go before it."""
+        return self._polls.look_ahead(at_s)
+
     def drain(self) -> list[JobT]:
         """Forget all pollers; remove and return all jobs, stops first."""
         self._polls = PollQueue(self._choose)

@@ -1,51 +1,37 @@
 """An open line: keeps exactly one exchange outstanding and gets back in step after a loss.
 
 Reply-driven: when a reply is complete and intact, the next request goes on the wire first; only then is the old reply
-decoded and delivered. No task and no timer per exchange.
+noted, decoded and delivered. No task and no timer per exchange.
 
 No reply is ever credited to a later request. Replies of these lines carry no sequence number, so the line relies on
 three facts: bytes that arrive sooner than the wire can carry them belong to something older; nothing but the reply may
-follow a request; after any loss the line is fenced and probed (`Resync`) before it is used again.
+follow a request; after any loss the line is fenced and probed (`Fence`) before it is used again.
 """
 
 import asyncio
-from enum import Enum
 
+from ldcnd.bus.fence import Fence
+from ldcnd.bus.line_phase import Phase
+from ldcnd.bus.pieces import CLOCK_TOLERANCE, Pieces, Whole
 from ldcnd.bus.resync import Probe, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import AT_ONCE, LANES, Turn
 from ldcnd.bus.users import Users
 from ldcnd.bus.watchdog import NEVER_S, Watchdog
+from ldcnd.bus.wire import Wire
 from ldcnd.bus.wire_log import WireEvent, WireLog
 from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
 from ldcnd.exchange import ReplyVerdict, Timing
 from ldcnd.transport.transport import Transport
 
-CLOCK_TOLERANCE = 0.9
-"""A drive's baud clock may be 3 % fast and a time stamp a little early: bytes count as too early below this share."""
-PROBE_ROUNDS = 3
-LONGEST_FENCE = 20
-"""A line that never falls silent is flushed after so many quiet times all the same."""
-_FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
+NOT_PLAIN = 0
+"""No reply has so few bytes."""
+ANY = 1
+"""What to expect where any byte would be news."""
 LATE_S = 1.0
 """A line that is so far behind what it had planned next does not turn."""
-
-
-class Phase(Enum):
-    """What the line is doing."""
-
-    IDLE = "idle"
-    REPLY = "reply"
-    LINGER = "linger"
-    """A packet that must not be repeated has its reply; a second one would prove that the first was not its own."""
-    QUIET = "quiet"
-    """After a request that draws no reply."""
-    FENCE = "fence"
-    """Waiting for late bytes to stop."""
-    SETTLE = "settle"
-    """The flush is on its way."""
-    CLOSED = "closed"
+_FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
 
 
 class Line:
@@ -60,30 +46,31 @@ class Line:
         statistics: BusStatistics,
         wire_log: WireLog,
     ) -> None:
-        self.baud = settings.baud
         self.phase = Phase.IDLE
         self._settings = settings
-        self._transport = transport
+        self._wire = Wire(settings, transport, statistics, wire_log)
         self._users = users
         self._resync = resync
+        self._fence = Fence(resync)
         self._statistics = statistics
-        self._wire_log = wire_log
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
-        self._byte_s = settings.bits_per_byte / settings.baud
         self._turn: Turn | None = None
-        self._buffer = bytearray()
+        self._sent_at_s = self._asked_at_s = 0.0
+        self._pieces = Pieces()
+        self._whole_bytes, self._whole_from_s = NOT_PLAIN, NEVER_S  # of a reply that is all that a plain turn needs
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
-        self._buffered_early = False
-        self._echo = bytearray()  # sent, and not come back yet
-        self._sent_at_s = self._request_over_s = self._fenced_at_s = 0.0
-        self._probes_left = 0  # more than 0: the line is out of step until a probe proves the opposite
-        transport.attach(self)
+        self._wire.attach(self)
+
+    @property
+    def baud(self) -> int:
+        """The rate in use."""
+        return self._wire.baud
 
     @property
     def fixed_baud(self) -> bool:
         """Whether the transport cannot change its rate."""
-        return self._transport.fixed_baud
+        return self._wire.fixed_baud
 
     def turning(self, now_s: float) -> bool:
         """Tell whether the line keeps to its own plan: it always knows when it will act next, and then does."""
@@ -117,63 +104,73 @@ class Line:
         if self.phase is Phase.CLOSED:
             return
         self._statistics.losses += 1
-        self._note(WireEvent.LOST, reason)
+        self._wire.note(WireEvent.LOST, self._loop.time(), remark=reason)
         self.close(reason)
 
     def data_received(self, data: bytes) -> None:
         """See `Receiver`."""
-        now_s = self._loop.time()
+        now_s, turn = self._loop.time(), self._turn
+        if (
+            turn
+            and len(data) == self._whole_bytes
+            and now_s >= self._whole_from_s
+            and turn.exchange.check(data) is ReplyVerdict.INTACT
+        ):
+            self._complete_plain(turn, data, now_s)
+        else:
+            self._take_apart(data, now_s)
+
+    def _take_apart(self, data: bytes, now_s: float) -> None:
+        """Find out what bytes are that need not be one whole reply."""
+        self._whole_bytes = NOT_PLAIN
         self._statistics.bytes_in += len(data)
-        if self._echo and not (data := self._strip_echo(data, now_s)):
+        own_taken_off = self._wire.without_echo(data, now_s)
+        if own_taken_off is None:
+            self._collided(data, now_s)
             return
-        if (turn := self._turn) and self.phase is Phase.LINGER:
-            self._wire_log.add(now_s, WireEvent.RECEIVED, data, "follows a reply")
+        data = own_taken_off
+        if (turn := self._turn) and data and self.phase is Phase.LINGER:
+            self._wire.note(WireEvent.RECEIVED, now_s, data, "follows a reply")
             self._distrust(turn, self._kept[0] + data, "was followed by another one", now_s)
             return
-        if turn is None or self.phase is not Phase.REPLY:
+        if data and (turn is None or self.phase is not Phase.REPLY):
             self._stray(data, now_s)
             return
-        arrived = data
-        if self._buffer:
-            data = bytes(self._buffer) + data
-            self._buffer.clear()
-        exchange, early = turn.exchange, self._buffered_early
-        while data:
-            early = early or now_s < self._request_over_s + CLOCK_TOLERANCE * len(data) * self._byte_s
-            total = exchange.total_bytes(data) if exchange.total_bytes else exchange.reply_bytes
-            if total is None or len(data) < total:
-                self._wire_log.add(now_s, WireEvent.PART, arrived)
-                self._buffer += data
-                self._buffered_early = early
+        while turn and data:
+            whole = self._pieces.add(turn.exchange, data, now_s)
+            if whole is None:
+                self._wire.note(WireEvent.PART, now_s, data)
                 return
-            reply, data = data[:total], data[total:]
-            verdict = exchange.check(reply)
-            if verdict is ReplyVerdict.FOREIGN:
-                self._wire_log.add(now_s, WireEvent.STRAY, arrived[: len(arrived) - len(data)], "foreign reply")
-                arrived = data
-                self._statistics.stray_bytes += total
-                early = self._buffered_early = False
-                continue
-            why = "came with surplus bytes" if data else "came too early" if early else _FLAWS.get(verdict, "")
-            self._wire_log.add(now_s, WireEvent.RECEIVED, arrived, why)
-            if data or early or verdict is ReplyVerdict.CORRUPT:
-                self._distrust(turn, reply + data, why, now_s)
-            elif not exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
-                # not believed before no other reply can come
-                self.phase, self._kept = Phase.LINGER, (reply, now_s)
-                self._watchdog.set(until_s)
-            elif verdict is ReplyVerdict.REJECTED:
-                self._rejected(turn)
-            else:
-                self._complete(turn, reply, now_s)
-            return
+            verdict = turn.exchange.check(whole.reply)
+            if verdict is not ReplyVerdict.FOREIGN:
+                self._judge(turn, whole, verdict, data, now_s)
+                return
+            self._wire.stray(data[: len(data) - len(whole.surplus)], now_s, "foreign reply")
+            data = whole.surplus
+
+    def _judge(self, turn: Turn, whole: Whole, verdict: ReplyVerdict, arrived: bytes, now_s: float) -> None:
+        """Believe a reply, wait for a better one, or distrust it."""
+        why = _FLAWS.get(verdict, "")
+        if whole.surplus or whole.early:
+            why = "came with surplus bytes" if whole.surplus else "came too early"
+        self._wire.note(WireEvent.RECEIVED, now_s, arrived, why)
+        if whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
+            self._distrust(turn, whole.reply + whole.surplus, why, now_s)
+        elif not turn.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
+            # not believed before no other reply can come
+            self.phase, self._kept = Phase.LINGER, (whole.reply, now_s)
+            self._watchdog.set(until_s)
+        elif verdict is ReplyVerdict.REJECTED:
+            self._rejected(turn)
+        else:
+            self._complete(turn, whole.reply, now_s)
 
     def _true_reply_by_s(self, turn: Turn) -> float:
         """Return until when the node's own reply may still come although one has come already; never when unpaced."""
         if not self._settings.paced:
             return -NEVER_S
         exchange = turn.exchange
-        wire_s = (len(exchange.request) + exchange.reply_bytes) * self._byte_s
+        wire_s = (len(exchange.request) + exchange.reply_bytes) * self._wire.byte_s
         return self._sent_at_s + wire_s + exchange.response_s + LINGER_S
 
     def _settle(self, turn: Turn, reply: bytes, now_s: float) -> None:
@@ -182,37 +179,54 @@ class Line:
         else:
             self._complete(turn, reply, now_s)
 
+    def _complete_plain(self, turn: Turn, reply: bytes, now_s: float) -> None:
+        """Write the next request before anything else: until then the wire is idle, afterwards there is time."""
+        sent_at_s, failure = self._sent_at_s, ""
+        following = self._users.take(now_s)
+        if following and not following.at_baud:
+            failure = self._put(following, self._loop.time())
+            self._wire.push()
+        else:
+            self._turn, self.phase = None, Phase.IDLE
+        self._statistics.bytes_in += len(reply)
+        self._wire.note(WireEvent.RECEIVED, now_s, reply)
+        timing = self._wire.replied(turn, reply, sent_at_s, now_s)
+        self._users.answered(turn)
+        if following is None:
+            self._next(AT_ONCE)
+        elif following.at_baud:
+            self._send(following, now_s, AT_ONCE[following.lane])
+        else:
+            self._attend(following, AT_ONCE[following.lane], failure)
+        turn.completed(reply, timing)
+        if self._turn and self._whole_bytes:
+            self._users.look_ahead(self._turn, self._asked_at_s)
+        self._wire.worked(now_s)
+
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
-        request_s, reply_s = len(turn.exchange.request) * self._byte_s, len(reply) * self._byte_s
-        sent_s = self._sent_at_s + request_s
-        timing = Timing(self._sent_at_s, sent_s, max(now_s - reply_s, sent_s), now_s)
-        self._statistics.replies += 1
-        self._statistics.wire_busy_s += request_s + reply_s
+        timing = self._wire.replied(turn, reply, self._sent_at_s, now_s)
         if isinstance(turn, Probe):
             self._probed(turn, reply, timing, now_s)
             return
         self._users.answered(turn)
-        self._release(turn)
+        self._release(turn, turn.then_baud)
         self._next(AT_ONCE)
-        self._statistics.latency[turn.lane].add(max(0.0, now_s - turn.wanted_at_s))
         turn.completed(reply, timing)
 
-    def _release(self, turn: Turn) -> None:
+    def _release(self, turn: Turn, then_baud: int | None = None) -> None:
+        """Free the line, at the rate that it has from now on."""
         self._turn, self.phase = None, Phase.IDLE
-        if turn.then_baud or turn.at_baud:
-            self._tune(turn.then_baud or self.baud)
+        if then_baud or turn.at_baud:
+            self._tune(then_baud or self.baud)
 
     def _rejected(self, turn: Turn) -> None:
         """The node did not execute our packet: the line is in step, and sending again is always safe."""
         self._statistics.rejected_packets += 1
         self._users.answered(turn)
-        self._turn, self.phase = None, Phase.IDLE
         if turn.rejected():
-            self._statistics.resent += 1
-            self._users.again(turn)
-        if turn.at_baud:
-            self._tune(self.baud)
+            self._send_again(turn)
+        self._release(turn)
         self._next()
 
     # -- losses ------------------------------------------------------------------------------------------------------
@@ -223,67 +237,76 @@ class Line:
 
     def _lose(self, turn: Turn, error: BusError, now_s: float) -> None:
         """Settle the turn whose reply will never be trusted, and fence the line."""
-        self._turn = None
-        self._buffer.clear()
         self._users.missed(turn, now_s)
         if not isinstance(turn, Probe):
-            self._probes_left = PROBE_ROUNDS
+            self._fence.doubt()
         # before the fence, which a stop that is sent again cuts short
         if turn.lost(error):
-            self._statistics.resent += 1
-            self._users.again(turn)
-        if turn.at_baud:
-            self._tune(self.baud)
-        self._fence(now_s)
+            self._send_again(turn)
+        self._release(turn)
+        self._raise_fence(now_s)
+
+    def _send_again(self, turn: Turn) -> None:
+        self._statistics.resent += 1
+        self._users.again(turn)
+
+    def _collided(self, data: bytes, now_s: float) -> None:
+        """What came back is not what was sent."""
+        if self._turn and self.phase is Phase.REPLY:
+            why = "follows an echo that differs: collision"
+            self._wire.note(WireEvent.RECEIVED, now_s, data, why)
+            self._distrust(self._turn, data, why, now_s)
+        else:
+            self._stray(data, now_s)
 
     def _stray(self, data: bytes, now_s: float) -> None:
         """Bytes that nobody asked for: late ones while fenced, a sign of being out of step otherwise."""
-        self._statistics.stray_bytes += len(data)
-        self._wire_log.add(now_s, WireEvent.STRAY, data)
+        self._wire.stray(data, now_s)
         if self.phase is Phase.FENCE and not self._users.stop_waits():
-            quiet_s = self._resync.quiet_s
-            self._watchdog.set(min(now_s + quiet_s, self._fenced_at_s + LONGEST_FENCE * quiet_s))
+            self._watchdog.set(self._fence.disturbed(now_s))
         elif self.phase is Phase.IDLE:
-            self._probes_left = PROBE_ROUNDS
-            self._fence(now_s)
+            self._fence.doubt()
+            self._raise_fence(now_s)
 
-    def _fence(self, now_s: float) -> None:
+    def _raise_fence(self, now_s: float) -> None:
         if self.phase is Phase.CLOSED:
             return
         self._statistics.resynchronisations += 1
-        self._wire_log.add(now_s, WireEvent.RESYNC)
+        self._wire.note(WireEvent.RESYNC, now_s)
         self.phase = Phase.FENCE
-        self._echo.clear()
-        self._fenced_at_s = now_s
-        self._watchdog.set(now_s if self._users.stop_waits() else now_s + self._resync.quiet_s)
+        self._wire.expect(ANY)
+        self._wire.forget_echo()
+        silent_s = self._fence.raised(now_s)
+        self._watchdog.set(now_s if self._users.stop_waits() else silent_s)
 
     def _flush(self, now_s: float) -> None:
         self.phase = Phase.SETTLE
+        flush = self._resync.flush
         echo_s = self._settings.margin_s if self._settings.echo else 0.0
-        self._watchdog.set(now_s + len(self._resync.flush) * self._byte_s + self._resync.settle_s + echo_s)
-        if self._resync.flush:
-            self._write(self._resync.flush, now_s, "flush")
+        self._watchdog.set(now_s + len(flush) * self._wire.byte_s + self._resync.settle_s + echo_s)
+        if flush:
+            self._wire.sent(flush, now_s, "flush")
+            if failure := self._wire.write(flush):
+                self.transport_lost(failure)
 
     def _flushed(self, now_s: float) -> None:
         """Behind the fence: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
-        self._transport.discard_input()
-        self._echo.clear()
+        self._wire.discard_input()
         self.phase = Phase.IDLE
-        if self._probes_left and not self._users.stop_waits():
-            exchange = self._resync.probe(self._users.failing())
-            self._probes_left = self._probes_left - 1 if exchange else 0
-            if exchange:
-                self._send(Probe(exchange, now_s), now_s, "probe")
-                return
-        self._next()
+        probe = None if self._users.stop_waits() else self._fence.probe(self._users.failing(), now_s)
+        if probe:
+            self._send(probe, now_s, "probe")
+        else:
+            self._next()
 
     def _probed(self, probe: Probe, reply: bytes, timing: Timing, now_s: float) -> None:
         probe.completed(reply, timing)
         if not probe.passed:
-            self._note(WireEvent.RECEIVED, why := "is not the known one")
+            why = "is not the known one"
+            self._wire.note(WireEvent.RECEIVED, now_s, remark=why)
             self._distrust(probe, reply, why, now_s)
             return
-        self._probes_left = 0
+        self._fence.proven()
         self._users.answered(probe)
         self._release(probe)
         self._next()
@@ -295,76 +318,59 @@ class Line:
         if self.phase is not Phase.IDLE:
             return
         now_s = self._loop.time()
-        if self._probes_left and not self._users.stop_waits():
-            self._fence(now_s)  # only a stop may use a line that is not proven to be in step
+        if not (self._fence.in_step or self._users.stop_waits()):
+            self._raise_fence(now_s)  # only a stop may use a line that is not proven to be in step
             return
         turn = self._users.take(now_s)
         if turn is None:
+            self._wire.expect(ANY)
             self._watchdog.set(self._users.next_due_s())
         else:
             self._send(turn, now_s, remarks[turn.lane])
 
     def _send(self, turn: Turn, now_s: float, remark: str) -> None:
-        exchange, settings, self._turn = turn.exchange, self._settings, turn
         if turn.at_baud:
+            self._turn = turn
             self._tune(turn.at_baud, for_good=False)
             if self.phase is Phase.CLOSED:
                 return
-        request_s, reply_s = len(exchange.request) * self._byte_s, exchange.reply_bytes * self._byte_s
-        self._sent_at_s, self._buffered_early = now_s, False
-        self._request_over_s = now_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
+        self._attend(turn, remark, self._put(turn, now_s))
+
+    def _put(self, turn: Turn, now_s: float) -> str:
+        """Write a request and do nothing else; return why the line was lost over it, if it was."""
+        self._turn, self._sent_at_s = turn, now_s
+        self.phase = Phase.REPLY if turn.exchange.reply_bytes else Phase.QUIET
+        return self._wire.write(turn.exchange.request)
+
+    def _attend(self, turn: Turn, remark: str, failure: str) -> None:
+        """Note a request that has just been written, and prepare for its reply."""
+        exchange, settings, wire, now_s = turn.exchange, self._settings, self._wire, self._sent_at_s
+        request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
+        self._pieces.begin(now_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S, wire.byte_s)
+        plain = exchange.reply_bytes and turn.plain and self._fence.in_step and not settings.echo
+        self._whole_bytes = exchange.reply_bytes if plain else NOT_PLAIN
+        self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)
+        wire.expect(max(ANY, self._whole_bytes))
+        self._asked_at_s = now_s + request_s
+        answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else 0.0
+        self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
         self._statistics.exchanges += 1
-        if exchange.reply_bytes:
-            self.phase = Phase.REPLY
-            self._transport.expect(exchange.reply_bytes + (len(exchange.request) if settings.echo else 0))
-            patience_s = exchange.response_s + settings.margin_s + self._transport.lag_s
-            self._watchdog.set(now_s + request_s + reply_s + patience_s)
-        else:
-            self.phase = Phase.QUIET
-            self._watchdog.set(now_s + request_s + exchange.response_s)
-        self._write(exchange.request, now_s, remark)
-
-    def _write(self, data: bytes, now_s: float, remark: str) -> None:
-        self._wire_log.add(now_s, WireEvent.SENT, data, remark)
-        self._statistics.bytes_out += len(data)
-        if self._settings.echo:
-            self._echo += data
-        try:
-            self._transport.write(data)
-        except TransportLost as error:
-            self.transport_lost(error.message)
-
-    def _strip_echo(self, data: bytes, now_s: float) -> bytes:
-        """Take our own bytes off the front, by count: a reply may look exactly like its request."""
-        count = min(len(data), len(self._echo))
-        if data[:count] == self._echo[:count]:
-            del self._echo[:count]
-            self._wire_log.add(now_s, WireEvent.ECHO, data[:count])
-            return data[count:]
-        self._echo.clear()
-        if self._turn and self.phase is Phase.REPLY:
-            self._wire_log.add(now_s, WireEvent.RECEIVED, data, why := "follows an echo that differs: collision")
-            self._distrust(self._turn, data, why, now_s)
-        else:
-            self._stray(data, now_s)
-        return b""
+        wire.sent(exchange.request, now_s, remark)
+        self._users.sent(turn)
+        if failure:
+            self.transport_lost(failure)
 
     def _tune(self, baud: int, *, for_good: bool = True) -> None:
         try:
-            self._transport.set_baud(baud)
+            self._wire.tune(baud, for_good=for_good)
         except TransportLost as error:
             self.transport_lost(error.message)
-            return
-        self._note(WireEvent.BAUD, str(baud))
-        self._byte_s = self._settings.bits_per_byte / baud
-        if for_good:
-            self.baud = baud
 
     # -- time --------------------------------------------------------------------------------------------------------
 
     def _expired(self, now_s: float) -> None:
         if self.phase in (Phase.LINGER, Phase.QUIET):
-            self._wire_log.add(now_s, WireEvent.SETTLED)
+            self._wire.note(WireEvent.SETTLED, now_s)
         match self.phase:
             case Phase.IDLE:
                 self._next()
@@ -380,20 +386,19 @@ class Line:
                 self._flushed(now_s)
 
     def _timed_out(self, turn: Turn, now_s: float) -> None:
+        self._wire.collect()
+        if self._turn is not turn or self.phase is not Phase.REPLY:
+            return  # the reply was there after all
         self._statistics.timeouts += 1
-        got = f"{len(self._buffer)} of {turn.exchange.reply_bytes} bytes" if self._buffer else "nothing"
+        got = f"{len(self._pieces)} of {turn.exchange.reply_bytes} bytes" if self._pieces else "nothing"
         error = ReplyTimeout(f"node {turn.exchange.node} on bus {self._settings.name} sent {got} in time")
-        self._wire_log.add(now_s, WireEvent.TIMEOUT, note=error.message)
+        self._wire.note(WireEvent.TIMEOUT, now_s, remark=error.message)
         self._lose(turn, error, now_s)
 
     def _quiet_over(self, turn: Turn, now_s: float) -> None:
         """An exchange without a reply is complete once the line may be used again."""
-        sent_s = self._sent_at_s + len(turn.exchange.request) * self._byte_s
-        self._statistics.wire_busy_s += sent_s - self._sent_at_s
+        timing = self._wire.silent(turn, self._sent_at_s, now_s)
         self._users.answered(turn)
-        self._release(turn)
+        self._release(turn, turn.then_baud)
         self._next()
-        turn.completed(b"", Timing(self._sent_at_s, sent_s, now_s, now_s))
-
-    def _note(self, event: WireEvent, note: str = "") -> None:
-        self._wire_log.add(self._loop.time(), event, b"", note)
+        turn.completed(b"", timing)

@@ -108,6 +108,11 @@ class PhaseOrder:
         self._expected_s[best.node] = shortest_s + guard_s
         return best
 
+    def wait_s(self, node: int, from_s: float) -> float:
+        """Return how long after an instant a node is likely to answer a request that is over then."""
+        tracker = self._trackers.get(node)
+        return tracker.wait_s(from_s) if tracker and tracker.locked else self._cycle_s / 2
+
     def observe(self, node: int, timing: Timing) -> None:
         """Learn from a reply to a poll."""
         tracker = self._trackers.get(node)

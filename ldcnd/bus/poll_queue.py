@@ -24,6 +24,10 @@ class PollQueue:
 
     A late poll of a lower priority waits for at most `POLLS_PER_LOWER` others for each late one before it.
 
+    Who goes next can be chosen ahead, while the line is busy. As long as the line keeps up, a poll that becomes due
+    meanwhile goes before if its deadline is earlier, so whoever has the earliest one never waits for a choice made too
+    soon.
+
     Args:
         choose: who chooses where deadlines leave a choice, see `PollRank`; None for who is due longest.
     """
@@ -37,10 +41,11 @@ class PollQueue:
         self._serial = count()
         self._behind = False
         self._passed = 0
+        self._ahead: Poller[Any] | None = None  # who was chosen ahead
 
     def schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Let a poller have its next turn at `at_s`; replaces any turn it had."""
-        if poller in self._due:
+        if poller in self._due or poller is self._ahead:
             self.unschedule(poller)
         if poller.priority is not NORMAL:
             self._only = None
@@ -50,12 +55,16 @@ class PollQueue:
     def unschedule(self, poller: Poller[Any]) -> None:
         """Forget a poller; unknown ones are ignored."""
         self._turns.pop(poller, None)
+        if poller is self._ahead:
+            self._ahead = None
         if poller in self._due:
             self._due.discard(poller)
             self._ranks[poller.priority].remove(poller)
 
     def next_due_s(self) -> float:
         """Return when the next poller is due; infinity when there is none."""
+        if self._ahead:
+            return self._ahead.due_at_s
         for rank in self._ranks:
             if rank:
                 return rank.since_s
@@ -65,19 +74,45 @@ class PollQueue:
 
     def is_due(self, now_s: float) -> bool:
         """Tell whether there is a poll to run."""
+        if self._ahead:
+            return True
+        self._rank_due(now_s)
+        if self._due:
+            return True
+        self._behind = False
+        return False
+
+    def look_ahead(self, at_s: float) -> Poller[Any] | None:
+        """Choose who of those that are due at about `at_s` goes then; None when nobody is, or one is chosen already."""
+        if self._ahead or not self.is_due(at_s):
+            return None
+        self._ahead = self._take(at_s)
+        return self._ahead
+
+    def take(self, now_s: float) -> Poller[Any]:
+        """Remove and return the poller whose turn it is; one is due."""
+        ahead = self._ahead
+        if ahead and not self._is_overtaken(ahead, now_s):
+            self._ahead = None
+            return ahead
+        return self._take(now_s)
+
+    def _is_overtaken(self, ahead: Poller[Any], now_s: float) -> bool:
+        if self._later and self._later[0][0] <= now_s:
+            self._rank_due(now_s)
+        if self._behind:
+            return False
+        return any(rank.deadline_s < ahead.deadline_at_s for rank in self._ranks)
+
+    def _rank_due(self, now_s: float) -> None:
         while self._later and self._later[0][0] <= now_s:
             at_s, serial, poller = heapq.heappop(self._later)
             if self._turns.get(poller) == serial:
                 del self._turns[poller]
                 self._due.add(poller)
                 self._ranks[poller.priority].add(poller, at_s, serial)
-        if self._due:
-            return True
-        self._behind = False
-        return False
 
-    def take(self, now_s: float) -> Poller[Any]:
-        """Remove and return the poller whose turn it is; one is due."""
+    def _take(self, now_s: float) -> Poller[Any]:
         rank = self._next_rank(now_s) if self._only is None else self._only
         poller = rank.take(now_s)
         self._due.discard(poller)

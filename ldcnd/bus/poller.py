@@ -40,6 +40,9 @@ class Poller(ABC, Generic[ReplyT]):
     deadline_at_s: float = 0.0
     priority: Priority = Priority.NORMAL
 
+    def prepare(self, at_s: float) -> None:
+        """Make ready what takes time: the next slot is likely to come at about that instant."""
+
     @abstractmethod
     def next_exchange(self, now_s: float) -> Exchange[ReplyT]:
         """Return the exchange to run now and move `due_at_s` on."""

@@ -41,6 +41,7 @@ class Probe(Turn):
     """The line's own exchange behind the fence."""
 
     __slots__ = ("passed",)
+    plain = False
 
     def __init__(self, exchange: Exchange[Any], at_s: float) -> None:
         super().__init__(exchange, Lane.STOP, at_s)

@@ -37,6 +37,12 @@ class Turn(ABC):
         self.then_baud: int | None = None
         self.at_baud: int | None = None
 
+    @property
+    def plain(self) -> bool:
+        """Whether a whole intact reply is all that it takes for the line to go on to the next turn."""
+        exchange = self.exchange
+        return exchange.repeatable and not (exchange.total_bytes or self.then_baud or self.at_baud)
+
     @abstractmethod
     def completed(self, reply: bytes, timing: Timing) -> None:
         """Take the intact reply (empty when none was due); the next request is on the wire already."""

@@ -1,6 +1,7 @@
 """How often each item of one axis is asked for; merges what is due into one exchange."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from ldcnd.axis_config import RatesConfig
 from ldcnd.bus.poller import Poller
@@ -22,6 +23,15 @@ def wanted_rates_hz(rates: RatesConfig, *, adc: bool) -> Mapping[TelemetryItem, 
         TelemetryItem.STATE: rates.state,
     }
     return {item: rate for item, rate in wanted.items() if rate > 0}
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """What to ask, and when the poll and each item are due next."""
+
+    exchange: Exchange[AxisReading]
+    due_at_s: float
+    items_due_s: dict[TelemetryItem, float]
 
 
 class AxisPoller(Poller[AxisReading]):
@@ -51,7 +61,7 @@ class AxisPoller(Poller[AxisReading]):
         self._due_s = dict.fromkeys(self._periods_s, start_at_s)
         self._deliver = deliver
         self._missed = missed
-        self._asked: frozenset[TelemetryItem] = frozenset()
+        self._prepared: _Turn | None = None
         self.due_at_s = start_at_s
         self.deadline_at_s = start_at_s + self._period_s
 
@@ -61,6 +71,7 @@ class AxisPoller(Poller[AxisReading]):
         What is asked for more often is due within its new period, what is asked for more seldom after its next turn.
         """
         self.rates_hz = rates_hz
+        self._prepared = None
         self._periods_s = {item: 1.0 / rate for item, rate in rates_hz.items()}
         self._period_s = min(self._periods_s.values())
         for item, period_s in self._periods_s.items():
@@ -69,22 +80,31 @@ class AxisPoller(Poller[AxisReading]):
         self.deadline_at_s = self.due_at_s + self._period_s
         return self.due_at_s < due_at_s
 
+    def prepare(self, at_s: float) -> None:
+        """See `Poller`."""
+        self._prepared = self._turn_at(at_s)
+
     def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
         """See `Poller`."""
-        self.due_at_s = _next_on_grid(self.due_at_s, self._period_s, now_s)
-        self.deadline_at_s = self.due_at_s + self._period_s
+        turn, self._prepared = self._prepared, None
+        if turn is None or turn.due_at_s <= now_s:
+            turn = self._turn_at(now_s)
+        self.due_at_s, self._due_s = turn.due_at_s, turn.items_due_s
+        self.deadline_at_s = turn.due_at_s + self._period_s
+        return turn.exchange
+
+    def _turn_at(self, now_s: float) -> _Turn:
         nearer_s = now_s + self._period_s / 2
-        due = []
-        for item, due_s in self._due_s.items():
-            if due_s <= nearer_s:
-                due.append(item)
-                self._due_s[item] = _next_on_grid(due_s, self._periods_s[item], now_s)
-        self._asked = frozenset(due)
-        return self._driver.reading(self._asked)
+        items_due_s = dict(self._due_s)
+        asked = [item for item, due_s in items_due_s.items() if due_s <= nearer_s]
+        for item in asked:
+            items_due_s[item] = _next_on_grid(items_due_s[item], self._periods_s[item], now_s)
+        due_at_s = _next_on_grid(self.due_at_s, self._period_s, now_s)
+        return _Turn(self._driver.reading(frozenset(asked)), due_at_s, items_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
         """See `Poller`."""
-        self._deliver(reply, self._asked, timing)
+        self._deliver(reply, reply.asked, timing)
 
     def missed(self, error: BusError) -> None:
         """See `Poller`."""

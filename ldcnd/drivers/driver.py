@@ -66,6 +66,7 @@ class AxisReading:
         homing: armed for a home capture that has not come yet.
         faults: what the drive complains about.
         reverse_limit: level of that limit switch input, `forward_limit` of the other; None while it is not shown.
+        asked: the items that this poll was for; the line may have asked for others since.
     """
 
     position_counts: int
@@ -79,6 +80,7 @@ class AxisReading:
     faults: tuple[Fault, ...]
     reverse_limit: bool | None = None
     forward_limit: bool | None = None
+    asked: frozenset[TelemetryItem] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)

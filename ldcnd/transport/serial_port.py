@@ -35,6 +35,8 @@ DRAIN_TIME_S = 1.0
 
 PSEUDO_TERMINALS = range(136, 144)
 """Major device numbers of Unix98 pseudo-terminals (Linux, admin-guide/devices.txt)."""
+USB_TERMINALS = frozenset({166, 188})
+"""Those of USB adapters (the same list)."""
 
 READ_BYTES = 4096
 CONTROL_CHARACTERS = 6
@@ -119,7 +121,10 @@ class SerialPort(Transport):
         self._incoming = incoming
         self._descriptor = port.fileno()
         self._loop = asyncio.get_running_loop()
-        self._tell_nothing_from_the_end()
+        major = os.major(os.fstat(self._descriptor).st_rdev)
+        self._is_pseudo, self._is_usb = major in PSEUDO_TERMINALS, major in USB_TERMINALS
+        self._least_bytes = 1
+        self._set_least_bytes()
         self._loop.add_reader(self._descriptor, self._readable)
 
     def attach(self, receiver: Receiver) -> None:
@@ -150,18 +155,30 @@ class SerialPort(Transport):
         if written != len(data):
             raise self._give_up(f"it took {written} of {len(data)} bytes")
 
+    def push(self) -> None:
+        """See `Transport`: a worker of the kernel carries them through a pseudo-terminal, and needs a processor."""
+        if self._is_pseudo:
+            os.sched_yield()
+
     def expect(self, reply_bytes: int) -> None:
-        """Ignore the hint: a longer VMIN would keep back every reply that comes up short, and does not pay.
+        """See `Transport`; an adapter on USB delivers in large pieces anyway and would take a transfer to be told."""
+        if reply_bytes != self._least_bytes and not self._is_usb:
+            self._least_bytes = reply_bytes
+            self._set_least_bytes()
 
-        It saves wake-ups, but the processor then sleeps deeply until the reply is over, and the next request leaves
-        later than with a wake-up for each byte (docs/explanation/timing.md).
+    def collect(self) -> None:
+        """See `Transport`."""
+        if self._least_bytes > 1 and not self._incoming.reason:
+            self._readable()
+
+    def _set_least_bytes(self) -> None:
+        """Tell the driver how many bytes are worth a wake-up (VMIN).
+
+        At least one, so that an empty read is the end and not just nothing yet.
         """
-
-    def _tell_nothing_from_the_end(self) -> None:
-        """Ask for at least one byte for each read (VMIN), so that an empty one is the end and not just nothing yet."""
         with contextlib.suppress(*PortFault):  # a port that is gone says so to its reader
             attributes = termios.tcgetattr(self._descriptor)
-            attributes[CONTROL_CHARACTERS][termios.VMIN] = 1
+            attributes[CONTROL_CHARACTERS][termios.VMIN] = self._least_bytes
             attributes[CONTROL_CHARACTERS][termios.VTIME] = 0
             termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
 
@@ -179,7 +196,7 @@ class SerialPort(Transport):
             self._port.baudrate = baud
         except PortFault as error:
             raise self._give_up(f"it refuses {baud} baud: {error}") from error
-        self._tell_nothing_from_the_end()  # pyserial has undone it
+        self._set_least_bytes()  # pyserial has undone it
 
     async def close(self) -> None:
         """See `Transport`; what was written still leaves, for at most `DRAIN_TIME_S`."""

@@ -44,9 +44,15 @@ class Transport(ABC):
             TransportLost: the pipe is gone.
         """
 
+    def push(self) -> None:  # noqa: B027 - most have nothing to do
+        """Let what was written leave before the caller goes on with something that takes its time."""
+
     @abstractmethod
     def expect(self, reply_bytes: int) -> None:
-        """Hint: the next reply has this many bytes, so one wake-up at its end is enough. May be ignored."""
+        """Hint: less than so many bytes are no news, so one wake-up for all of them is enough. May be ignored."""
+
+    def collect(self) -> None:  # noqa: B027 - most keep nothing back
+        """Deliver now what has arrived but was kept back because of `expect`."""
 
     @abstractmethod
     def discard_input(self) -> None:

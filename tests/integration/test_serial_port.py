@@ -262,6 +262,56 @@ async def test_discarding_drops_what_waits(far: FarSide, port: Transport):
     assert receiver.data == b"next"
 
 
+async def test_no_byte_is_delivered_before_all_that_are_expected_are_there(far: FarSide, port: Transport):
+    receiver = RecordingReceiver()
+    pieces: list[bytes] = []
+    receiver.data_received = pieces.append  # type: ignore[method-assign]
+    port.attach(receiver)
+    port.expect(9)
+
+    os.write(far.master, b"12345")
+    assert not select.select([port._port.fileno()], [], [], 0.05)[0]  # nothing to wake up for
+    os.write(far.master, b"6789")
+    assert select.select([port._port.fileno()], [], [], WAIT_S)[0]
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+
+    assert pieces == [b"123456789"]
+
+
+async def test_what_was_held_back_can_be_collected(far: FarSide, port: Transport):
+    receiver = RecordingReceiver()
+    port.attach(receiver)
+    port.expect(9)
+    os.write(far.master, b"12345")
+    deadline = asyncio.get_running_loop().time() + WAIT_S
+    while len(receiver.data) < 5 and asyncio.get_running_loop().time() < deadline:
+        port.collect()
+
+    assert receiver.data == b"12345"
+
+
+async def test_a_port_that_expects_more_than_comes_still_reports_its_end(far: FarSide, port: Transport):
+    receiver = RecordingReceiver()
+    port.attach(receiver)
+    port.expect(9)
+
+    os.write(far.master, b"12345")
+    far.close()
+    await receiver.wait_lost()
+
+    assert len(receiver.losses) == 1
+
+
+async def test_a_push_lets_the_kernel_carry_what_was_written(far: FarSide, port: Transport):
+    port.attach(RecordingReceiver())
+
+    port.write(b"\xaa\x01")
+    port.push()
+
+    assert await far.read(10) == b"\xaa\x01"
+
+
 def _fill(port: Transport) -> None:
     for _ in range(1000):
         port.write(bytes(1024))

@@ -125,9 +125,9 @@ class WatchfulPoller(toy.ToyPoller):
 class UnrulyLine(RuleBasedStateMachine):
     """Callers, pollers and faults in any order."""
 
-    @initialize(bytewise=st.booleans())
-    def start(self, *, bytewise: bool) -> None:
-        self.bytewise = bytewise
+    @initialize(bytewise=st.booleans(), holds_back=st.booleans())
+    def start(self, *, bytewise: bool, holds_back: bool) -> None:
+        self.bytewise, self.holds_back = bytewise, holds_back
         self.runner = asyncio.Runner(loop_factory=JumpingLoop)
         self.faults: deque[Fault] = deque()
         self.fault_of: dict[int, Fault] = {}  # for the first reply to a caller; `faults` spoil the others
@@ -148,7 +148,7 @@ class UnrulyLine(RuleBasedStateMachine):
         # the owner lives across many runs of the loop, so no group of one run can hold it
         self.owner = asyncio.get_running_loop().create_task(self.bus.run(), name="bus")
         await self.bus.wait_opened()
-        self.opener.line.bytewise = self.bytewise
+        self.opener.line.bytewise, self.opener.line.holds_back = self.bytewise, self.holds_back
 
     def _answer(self, packet: bytes) -> list[Say]:
         if packet == toy.FLUSH:

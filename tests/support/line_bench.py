@@ -65,6 +65,12 @@ class PlainUsers:
             self.taken_at_s.append(now_s)
         return turn
 
+    def sent(self, turn: Turn) -> None:
+        pass
+
+    def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
+        pass
+
     def next_due_s(self) -> float:
         return float("inf")
 

@@ -46,6 +46,8 @@ class ScriptedLine(Transport):
         script: called with each packet; replace it to change the far end's mind.
         bytewise: deliver byte by byte as the wire carries them, not each answer whole at its end.
         echo: the adapter returns what the host sends.
+        holds_back: deliver nothing before as many bytes are there as were told to be expected, like a terminal.
+        expected: as told last.
         history: everything that happened here, in order: "write <hex>", "refused", "baud <rate>",
             "discard", "close".
     """
@@ -54,6 +56,9 @@ class ScriptedLine(Transport):
         self.script = script
         self.bytewise = False
         self.echo = False
+        self.holds_back = False
+        self.expected = 1
+        self._held = b""
         self.fails_to_write = False
         self.writes: list[Written] = []
         self.history: list[str] = []
@@ -78,7 +83,9 @@ class ScriptedLine(Transport):
     def say(self, data: bytes) -> None:
         """Deliver bytes at once, whoever asked."""
         if self._receiver and not self._gone:
-            self._receiver.data_received(data)
+            self._held += data
+            if not self.holds_back or len(self._held) >= self.expected:
+                self.collect()
 
     def lose(self, reason: str = "unplugged") -> None:
         """Pull the plug."""
@@ -110,10 +117,20 @@ class ScriptedLine(Transport):
             self._play(said, over_s)
 
     def expect(self, reply_bytes: int) -> None:
-        """Ignore the hint."""
+        """See `Transport`; what is enough now is delivered in the loop's next turn."""
+        self.expected = reply_bytes
+        if len(self._held) >= reply_bytes:
+            self._loop.call_soon(self.collect)
+
+    def collect(self) -> None:
+        """See `Transport`."""
+        data, self._held = self._held, b""
+        if data and self._receiver and not self._gone:
+            self._receiver.data_received(data)
 
     def discard_input(self) -> None:
-        """Drop nothing: what has arrived was delivered."""
+        """Drop what is held back; all else that has arrived was delivered."""
+        self._held = b""
         self.history.append("discard")
 
     def set_baud(self, baud: int) -> None:

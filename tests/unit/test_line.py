@@ -2,7 +2,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.line import Phase
+from ldcnd.bus.line_phase import Phase
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.exchange import Exchange, Timing
 from tests.support import toy_family as toy
@@ -319,3 +319,93 @@ class _Counting:
     def call_at(self, when, callback, *args):
         self._made.append(when)
         return self._call_at(when, callback, *args)
+
+
+async def test_nothing_is_noted_or_counted_before_the_next_request_is_written():
+    bench = Bench()
+    bench.add(1)
+    bench.add(2)
+    seen: list[tuple[int, int]] = []
+    write = bench.wire.write
+
+    def watched(data: bytes) -> None:
+        seen.append((bench.statistics.replies, len(bench.log.records())))
+        write(data)
+
+    bench.wire.write = watched  # type: ignore[method-assign]
+    await settle()
+
+    assert seen == [(0, 1)]  # the first request alone
+    events = [record.event for record in bench.log.records()]
+    assert events == [WireEvent.SENT, WireEvent.RECEIVED, WireEvent.SENT, WireEvent.RECEIVED]
+
+
+async def test_a_whole_reply_is_one_wake_up():
+    bench = Bench()
+    bench.wire.bytewise = bench.wire.holds_back = True
+
+    bench.add(1)
+    assert bench.wire.expected == toy.REPLY_BYTES
+    await settle()
+
+    assert bench.story == ["completed 1"]
+    assert [record.event for record in bench.log.records()] == [WireEvent.SENT, WireEvent.RECEIVED]
+    assert bench.wire.expected == 1  # on an idle line every byte is news
+
+
+@pytest.mark.parametrize("settings", [{"repeatable": False}, {"reply_bytes": 0}, {"then_baud": 57_600}])
+async def test_every_byte_is_news_to_an_exchange_that_is_more_than_its_reply(settings):
+    bench = Bench()
+
+    bench.add(1, **settings)
+
+    assert bench.wire.expected == 1
+
+
+async def test_every_byte_is_news_behind_an_echo():
+    bench = Bench(echo=True)
+
+    bench.add(1)
+
+    assert bench.wire.expected == 1
+
+
+async def test_a_short_reply_that_was_held_back_is_seen_when_the_time_is_over():
+    bench = Bench()
+    bench.wire.holds_back = True
+    bench.replies({1: [Say(toy.reply(1)[:-2])]})
+
+    turn = bench.add(1)
+    await settle()
+
+    assert f"sent {toy.REPLY_BYTES - 2} of {toy.REPLY_BYTES} bytes in time" in str(turn.error)
+    parts = [record.data for record in bench.log.records() if record.event is WireEvent.PART]
+    assert parts == [toy.reply(1)[:-2]]
+
+
+async def test_stray_bytes_are_seen_on_a_line_that_has_come_to_rest():
+    bench = Bench()
+    bench.wire.holds_back = True
+    bench.add(1)
+    await settle()
+
+    bench.wire.say(b"\xf0")
+
+    assert bench.line.phase is Phase.FENCE
+    assert bench.statistics.stray_bytes == 1
+
+
+async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_its_way():
+    bench = Bench()
+    story: list[str] = []
+    bench.wire.push = lambda: story.append("push")  # type: ignore[method-assign]
+    loop = asyncio.get_running_loop()
+    bench.line._wire.worked(loop.time() - 1.0)  # a second for the one before
+
+    bench.add(1)
+    second = bench.add(2)
+    second.completed = lambda _reply, _timing: story.append("completed 2")  # type: ignore[method-assign]
+    bench.add(3)
+    await settle()
+
+    assert story == ["push", "push", "completed 2"]

@@ -204,3 +204,95 @@ def test_a_line_that_is_asked_too_much_keeps_the_rates_of_high_ones_and_polls_th
         assert min(granted[:3]) >= 0.98
         assert min(granted) * 20.0 > 0.2
         assert sum(granted[27:]) / 4 < sum(granted[3:27]) / 24 < 1.0
+
+
+@orders
+def test_who_was_chosen_ahead_goes_next(order):
+    first, second = poller(1, NORMAL, 5.0), poller(2, NORMAL, 6.0)
+    queue = queued(order, first, second)
+
+    assert queue.look_ahead(1.001) is first
+    assert queue.look_ahead(1.001) is None  # it is chosen already
+    assert queue.next_due_s() == first.due_at_s
+
+    assert nodes(queue, 1.001, 2) == [1, 2]
+    assert not queue.is_due(1.001)
+
+
+@orders
+def test_nobody_is_chosen_ahead_who_is_not_due_yet(order):
+    queue = PollQueue(CHOOSERS[order])
+    queue.schedule(poller(1, NORMAL, 5.0), 1.0015)
+
+    assert queue.look_ahead(1.001) is None
+    assert nodes(queue, 1.0015, 1) == [1]
+
+
+@orders
+def test_who_will_be_due_by_then_can_be_chosen_ahead(order):
+    queue = PollQueue(CHOOSERS[order])
+    queue.schedule(poller(1, NORMAL, 5.0), 1.0005)
+
+    assert queue.look_ahead(1.001)
+    assert nodes(queue, 1.0004, 1) == [1]  # the line is free a little sooner than expected
+
+
+@orders
+@pytest.mark.parametrize(("deadline_s", "taken"), [(4.9, [2, 1]), (5.1, [1, 2])])
+def test_only_an_earlier_deadline_overtakes_who_was_chosen_ahead(order, deadline_s, taken):
+    queue = queued(order, poller(1, NORMAL, 5.0))
+    queue.look_ahead(1.001)
+    queue.schedule(poller(2, NORMAL, deadline_s), 1.0015)
+
+    assert nodes(queue, 1.0015, 2) == taken
+
+
+@orders
+def test_who_was_chosen_ahead_can_be_forgotten(order):
+    first, second = poller(1, NORMAL, 5.0), poller(2, NORMAL, 6.0)
+    queue = queued(order, first, second)
+    queue.look_ahead(1.001)
+
+    queue.unschedule(first)
+
+    assert nodes(queue, 1.001, 1) == [2]
+    assert not queue.is_due(1.001)
+
+
+@orders
+def test_another_turn_replaces_the_one_that_was_chosen_ahead(order):
+    first, second = poller(1, NORMAL, 5.0), poller(2, NORMAL, 6.0)
+    queue = queued(order, first, second)
+    queue.look_ahead(1.001)
+
+    queue.schedule(first, 2.0)
+
+    assert nodes(queue, 1.001, 1) == [2]
+    assert not queue.is_due(1.999)
+    assert nodes(queue, 2.0, 1) == [1]
+
+
+@given(seed=st.integers(0, 2**32))
+def test_to_choose_ahead_changes_nothing_for_the_earliest_deadline(seed):
+    """In any mixture of periods, choosing ahead or not, the earliest deadline that is due goes first."""
+    dice = random.Random(seed)
+    periods = [dice.uniform(0.005, 0.05) for _ in range(6)]
+    orders_taken = []
+    for ahead in (False, True):
+        queue = PollQueue(None)
+        pollers = [poller(node, NORMAL, period_s) for node, period_s in enumerate(periods)]
+        for each in pollers:
+            queue.schedule(each, 0.0)
+        taken, now_s = [], 0.0
+        for _ in range(200):
+            if queue.is_due(now_s):
+                each = queue.take(now_s)
+                taken.append(each.node)
+                each.due_at_s += periods[each.node]
+                each.deadline_at_s = each.due_at_s + periods[each.node]
+                queue.schedule(each, each.due_at_s)
+            if ahead:
+                queue.look_ahead(now_s + 0.001)
+            now_s += 0.001
+        orders_taken.append(taken)
+    assert orders_taken[0] == orders_taken[1]

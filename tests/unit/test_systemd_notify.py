@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.axis_config import AxisConfig
-from ldcnd.bus.line import Phase
+from ldcnd.bus.line_phase import Phase
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.assembly import build_daemon
@@ -168,7 +168,7 @@ async def test_watchdog_starves_while_a_line_has_lost_its_deadline(manager: Mana
         while line.phase is not Phase.REPLY:
             await asyncio.sleep(0.0001)
         line._watchdog.cancel()
-        line._transport.write = lambda _data: None  # type: ignore[method-assign]
+        line._wire.write = lambda _data: ""  # type: ignore[method-assign]
         line._turn = None  # whatever comes is a stray: the line waits for ever
         await asyncio.sleep(1)
         manager.heard()

@@ -10,6 +10,7 @@ from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 from ldcnd.errors import BadReply
+from ldcnd.model.samples import TelemetryItem
 
 _MOVE_DONE, _POWER_ON, _LIMIT1, _LIMIT2, _HOMING = map(
     int,
@@ -53,8 +54,8 @@ class DriveState:
         self.motion_locked = False
         self.servo_divisor = 1
 
-    def reading(self, status: Status) -> AxisReading:
-        """Interpret a status packet.
+    def reading(self, status: Status, asked: frozenset[TelemetryItem] = frozenset()) -> AxisReading:
+        """Interpret a status packet that was asked for because of these items.
 
         Raises:
             BadReply: position, velocity or the auxiliary byte is missing.
@@ -81,6 +82,7 @@ class DriveState:
             faults=self.faults(status),
             reverse_limit=bool(flags & _LIMIT1) if shows_limits else None,
             forward_limit=bool(flags & _LIMIT2) if shows_limits else None,
+            asked=asked,
         )
 
     def faults(self, status: Status) -> tuple[Fault, ...]:

@@ -115,14 +115,14 @@ class LdcnAxis(AxisDriver):
             mask = reading_items(self.profile, items)
             if self.state.absolute:
                 mask |= StatusItem.ADC
-            prepared = self._readings[asked] = self._prepare_reading(mask)
+            prepared = self._readings[asked] = self._prepare_reading(mask, items)
         return prepared
 
-    def _prepare_reading(self, mask: StatusItem) -> Exchange[AxisReading]:
+    def _prepare_reading(self, mask: StatusItem, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
         exchange = commands.read_status(self._node, mask)
 
         def decode(data: bytes) -> AxisReading:
-            return self.state.reading(decode_status(self.profile, mask, data))
+            return self.state.reading(decode_status(self.profile, mask, data), items)
 
         return Exchange(
             node=exchange.node,

@@ -50,6 +50,10 @@ class SmartStepPort(Transport):
         """See `Transport`."""
         self._port.expect(reply_bytes)
 
+    def collect(self) -> None:
+        """See `Transport`."""
+        self._port.collect()
+
     def discard_input(self) -> None:
         """See `Transport`."""
         self._port.discard_input()

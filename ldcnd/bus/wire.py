@@ -1,0 +1,142 @@
+"""One open transport: its rate, the bytes that pass over it, and the record of them."""
+
+import asyncio
+
+from ldcnd.bus.echo import Echo
+from ldcnd.bus.settings import BusSettings
+from ldcnd.bus.statistics import BusStatistics
+from ldcnd.bus.turn import Turn
+from ldcnd.bus.wire_log import WireEvent, WireLog
+from ldcnd.errors import TransportLost
+from ldcnd.exchange import Timing
+from ldcnd.transport.transport import Receiver, Transport
+
+LONG_WORK_S = 100e-6
+"""What takes longer would hold up the request before it where the kernel has no other processor to carry it on."""
+WORK_WEIGHT = 0.1
+"""Of the latest work behind a request in what is expected of the next."""
+
+
+class Wire:
+    """What a line has at its end: counts, logs, and knows how long bytes take.
+
+    Attributes:
+        baud: the rate of all turns that have none of their own.
+        byte_s: how long a byte takes now, in seconds.
+        fixed_baud: the transport cannot change its rate.
+    """
+
+    def __init__(
+        self, settings: BusSettings, transport: Transport, statistics: BusStatistics, wire_log: WireLog
+    ) -> None:
+        self.baud = settings.baud
+        self.byte_s = settings.bits_per_byte / settings.baud
+        self.fixed_baud = transport.fixed_baud
+        self._bits_per_byte = settings.bits_per_byte
+        self._transport = transport
+        self._statistics = statistics
+        self._log = wire_log
+        self._loop = asyncio.get_running_loop()
+        self._echo = Echo() if settings.echo else None
+        self._work_s = 0.0
+
+    @property
+    def lag_s(self) -> float:
+        """See `Transport`."""
+        return self._transport.lag_s
+
+    def attach(self, receiver: Receiver) -> None:
+        """See `Transport`."""
+        self._transport.attach(receiver)
+
+    def tune(self, baud: int, *, for_good: bool) -> None:
+        """Change the rate.
+
+        Raises:
+            TransportLost: the pipe is gone.
+        """
+        self._transport.set_baud(baud)
+        self._log.add(self._loop.time(), WireEvent.BAUD, note=str(baud))
+        self.byte_s = self._bits_per_byte / baud
+        if for_good:
+            self.baud = baud
+
+    def expect(self, reply_bytes: int) -> None:
+        """See `Transport`; with an echo every byte counts."""
+        self._transport.expect(1 if self._echo is not None else reply_bytes)
+
+    def push(self) -> None:
+        """See `Transport`; for a request with much to do behind it, to judge by the ones before."""
+        if self._work_s > LONG_WORK_S:
+            self._transport.push()
+
+    def worked(self, since_s: float) -> None:
+        """Learn that all is done that was to be done behind a request."""
+        self._work_s += WORK_WEIGHT * (self._loop.time() - since_s - self._work_s)
+
+    def collect(self) -> None:
+        """See `Transport`."""
+        self._transport.collect()
+
+    def discard_input(self) -> None:
+        """Forget what has come in and what is still to come back."""
+        self._transport.discard_input()
+        self.forget_echo()
+
+    def write(self, data: bytes) -> str:
+        """Hand bytes to the transport and do nothing else, `sent` is due behind it; return why it is lost, if it is."""
+        try:
+            self._transport.write(data)
+        except TransportLost as error:
+            return error.message
+        return ""
+
+    # -- what passes ---------------------------------------------------------------------------------------------------
+
+    def sent(self, data: bytes, at_s: float, remark: str) -> None:
+        """Note what was written."""
+        self._log.add(at_s, WireEvent.SENT, data, remark)
+        self._statistics.bytes_out += len(data)
+        if self._echo is not None:
+            self._echo.sent(data)
+
+    def without_echo(self, data: bytes, now_s: float) -> bytes | None:
+        """Take our own bytes off what has come in; None when it should be our own bytes and is not."""
+        if not self._echo:
+            return data
+        stripped = self._echo.strip(data)
+        if stripped is None:
+            return None
+        own, rest = stripped
+        self._log.add(now_s, WireEvent.ECHO, own)
+        return rest
+
+    def forget_echo(self) -> None:
+        """Expect nothing of ours back any more."""
+        if self._echo:
+            self._echo.clear()
+
+    def replied(self, turn: Turn, reply: bytes, sent_at_s: float, now_s: float) -> Timing:
+        """Count an intact reply; return when it was true."""
+        statistics = self._statistics
+        request_s, reply_s = len(turn.exchange.request) * self.byte_s, len(reply) * self.byte_s
+        sent_s = sent_at_s + request_s
+        statistics.replies += 1
+        statistics.wire_busy_s += request_s + reply_s
+        statistics.latency[turn.lane].add(max(0.0, now_s - turn.wanted_at_s))
+        return Timing(sent_at_s, sent_s, max(now_s - reply_s, sent_s), now_s)
+
+    def silent(self, turn: Turn, sent_at_s: float, now_s: float) -> Timing:
+        """Count a request that draws no reply; return when it took effect."""
+        request_s = len(turn.exchange.request) * self.byte_s
+        self._statistics.wire_busy_s += request_s
+        return Timing(sent_at_s, sent_at_s + request_s, now_s, now_s)
+
+    def stray(self, data: bytes, now_s: float, why: str = "") -> None:
+        """Note bytes that belong to no request."""
+        self._statistics.stray_bytes += len(data)
+        self._log.add(now_s, WireEvent.STRAY, data, why)
+
+    def note(self, event: WireEvent, now_s: float, data: bytes = b"", remark: str = "") -> None:
+        """Note anything else."""
+        self._log.add(now_s, event, data, remark)
