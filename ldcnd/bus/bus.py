@@ -156,12 +156,12 @@ class Bus:
     @property
     def baud(self) -> int:
         """The rate in use, or the rate of the next opening."""
-        return self._line.baud if self._line else self.settings.baud
+        return self._line.wire.baud if self._line else self.settings.baud
 
     @property
     def fixed_baud(self) -> bool:
         """Whether the port cannot change its rate."""
-        return self._line is not None and self._line.fixed_baud
+        return self._line is not None and self._line.wire.fixed_baud
 
     async def wait_opened(self) -> None:
         """Return as soon as the line is open."""

@@ -35,7 +35,12 @@ _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rej
 
 
 class Line:
-    """One open transport and what is on it; a `Receiver`, made anew at every opening."""
+    """One open transport and what is on it; a `Receiver`, made anew at every opening.
+
+    Attributes:
+        phase: what it is doing.
+        wire: what it has at its end.
+    """
 
     def __init__(
         self,
@@ -48,7 +53,7 @@ class Line:
     ) -> None:
         self.phase = Phase.IDLE
         self._settings = settings
-        self._wire = Wire(settings, transport, statistics, wire_log)
+        self.wire = Wire(settings, transport, statistics, wire_log)
         self._users = users
         self._resync = resync
         self._fence = Fence(resync)
@@ -58,19 +63,9 @@ class Line:
         self._turn: Turn | None = None
         self._sent_at_s = self._asked_at_s = 0.0
         self._pieces = Pieces()
-        self._whole_bytes, self._whole_from_s = NOT_PLAIN, NEVER_S  # of a reply that is all that a plain turn needs
+        self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain turn
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
-        self._wire.attach(self)
-
-    @property
-    def baud(self) -> int:
-        """The rate in use."""
-        return self._wire.baud
-
-    @property
-    def fixed_baud(self) -> bool:
-        """Whether the transport cannot change its rate."""
-        return self._wire.fixed_baud
+        self.wire.attach(self)
 
     def turning(self, now_s: float) -> bool:
         """Tell whether the line keeps to its own plan: it always knows when it will act next, and then does."""
@@ -104,33 +99,30 @@ class Line:
         if self.phase is Phase.CLOSED:
             return
         self._statistics.losses += 1
-        self._wire.note(WireEvent.LOST, self._loop.time(), remark=reason)
+        self.wire.note(WireEvent.LOST, self._loop.time(), remark=reason)
         self.close(reason)
 
     def data_received(self, data: bytes) -> None:
         """See `Receiver`."""
         now_s, turn = self._loop.time(), self._turn
-        if (
-            turn
-            and len(data) == self._whole_bytes
-            and now_s >= self._whole_from_s
-            and turn.exchange.check(data) is ReplyVerdict.INTACT
-        ):
-            self._complete_plain(turn, data, now_s)
-        else:
-            self._take_apart(data, now_s)
+        if turn and len(data) == self._missing and now_s >= self._whole_from_s:
+            reply = self._pieces.held + data
+            if turn.exchange.check(reply) is ReplyVerdict.INTACT:
+                self._complete_plain(turn, reply, data, now_s)
+                return
+        self._take_apart(data, now_s)
 
     def _take_apart(self, data: bytes, now_s: float) -> None:
         """Find out what bytes are that need not be one whole reply."""
-        self._whole_bytes = NOT_PLAIN
+        was_plain, self._missing = self._missing, NOT_PLAIN
         self._statistics.bytes_in += len(data)
-        own_taken_off = self._wire.without_echo(data, now_s)
+        own_taken_off = self.wire.without_echo(data, now_s)
         if own_taken_off is None:
             self._collided(data, now_s)
             return
         data = own_taken_off
         if (turn := self._turn) and data and self.phase is Phase.LINGER:
-            self._wire.note(WireEvent.RECEIVED, now_s, data, "follows a reply")
+            self.wire.note(WireEvent.RECEIVED, now_s, data, "follows a reply")
             self._distrust(turn, self._kept[0] + data, "was followed by another one", now_s)
             return
         if data and (turn is None or self.phase is not Phase.REPLY):
@@ -139,21 +131,23 @@ class Line:
         while turn and data:
             whole = self._pieces.add(turn.exchange, data, now_s)
             if whole is None:
-                self._wire.note(WireEvent.PART, now_s, data)
+                self.wire.note(WireEvent.PART, now_s, data)
+                if was_plain and not self._pieces.early:
+                    self._missing = turn.exchange.reply_bytes - len(self._pieces.held)
+                self.wire.expect(max(ANY, self._missing))
                 return
             verdict = turn.exchange.check(whole.reply)
             if verdict is not ReplyVerdict.FOREIGN:
                 self._judge(turn, whole, verdict, data, now_s)
                 return
-            self._wire.stray(data[: len(data) - len(whole.surplus)], now_s, "foreign reply")
+            self.wire.stray(data[: len(data) - len(whole.surplus)], now_s, "foreign reply")
             data = whole.surplus
 
     def _judge(self, turn: Turn, whole: Whole, verdict: ReplyVerdict, arrived: bytes, now_s: float) -> None:
         """Believe a reply, wait for a better one, or distrust it."""
-        why = _FLAWS.get(verdict, "")
-        if whole.surplus or whole.early:
-            why = "came with surplus bytes" if whole.surplus else "came too early"
-        self._wire.note(WireEvent.RECEIVED, now_s, arrived, why)
+        flaw = "came too early" if whole.early else _FLAWS.get(verdict, "")
+        why = "came with surplus bytes" if whole.surplus else flaw
+        self.wire.note(WireEvent.RECEIVED, now_s, arrived, why)
         if whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
             self._distrust(turn, whole.reply + whole.surplus, why, now_s)
         elif not turn.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
@@ -170,7 +164,7 @@ class Line:
         if not self._settings.paced:
             return -NEVER_S
         exchange = turn.exchange
-        wire_s = (len(exchange.request) + exchange.reply_bytes) * self._wire.byte_s
+        wire_s = (len(exchange.request) + exchange.reply_bytes) * self.wire.byte_s
         return self._sent_at_s + wire_s + exchange.response_s + LINGER_S
 
     def _settle(self, turn: Turn, reply: bytes, now_s: float) -> None:
@@ -179,18 +173,18 @@ class Line:
         else:
             self._complete(turn, reply, now_s)
 
-    def _complete_plain(self, turn: Turn, reply: bytes, now_s: float) -> None:
+    def _complete_plain(self, turn: Turn, reply: bytes, arrived: bytes, now_s: float) -> None:
         """Write the next request before anything else: until then the wire is idle, afterwards there is time."""
         sent_at_s, failure = self._sent_at_s, ""
         following = self._users.take(now_s)
         if following and not following.at_baud:
             failure = self._put(following, self._loop.time())
-            self._wire.push()
+            self.wire.push()
         else:
             self._turn, self.phase = None, Phase.IDLE
-        self._statistics.bytes_in += len(reply)
-        self._wire.note(WireEvent.RECEIVED, now_s, reply)
-        timing = self._wire.replied(turn, reply, sent_at_s, now_s)
+        self._statistics.bytes_in += len(arrived)
+        self.wire.note(WireEvent.RECEIVED, now_s, arrived)
+        timing = self.wire.replied(turn, reply, sent_at_s, now_s)
         self._users.answered(turn)
         if following is None:
             self._next(AT_ONCE)
@@ -199,13 +193,13 @@ class Line:
         else:
             self._attend(following, AT_ONCE[following.lane], failure)
         turn.completed(reply, timing)
-        if self._turn and self._whole_bytes:
+        if self._turn and self._missing:
             self._users.look_ahead(self._turn, self._asked_at_s)
-        self._wire.worked(now_s)
+        self.wire.worked(now_s)
 
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
-        timing = self._wire.replied(turn, reply, self._sent_at_s, now_s)
+        timing = self.wire.replied(turn, reply, self._sent_at_s, now_s)
         if isinstance(turn, Probe):
             self._probed(turn, reply, timing, now_s)
             return
@@ -218,7 +212,7 @@ class Line:
         """Free the line, at the rate that it has from now on."""
         self._turn, self.phase = None, Phase.IDLE
         if then_baud or turn.at_baud:
-            self._tune(then_baud or self.baud)
+            self._tune(then_baud or self.wire.baud)
 
     def _rejected(self, turn: Turn) -> None:
         """The node did not execute our packet: the line is in step, and sending again is always safe."""
@@ -254,14 +248,14 @@ class Line:
         """What came back is not what was sent."""
         if self._turn and self.phase is Phase.REPLY:
             why = "follows an echo that differs: collision"
-            self._wire.note(WireEvent.RECEIVED, now_s, data, why)
+            self.wire.note(WireEvent.RECEIVED, now_s, data, why)
             self._distrust(self._turn, data, why, now_s)
         else:
             self._stray(data, now_s)
 
     def _stray(self, data: bytes, now_s: float) -> None:
         """Bytes that nobody asked for: late ones while fenced, a sign of being out of step otherwise."""
-        self._wire.stray(data, now_s)
+        self.wire.stray(data, now_s)
         if self.phase is Phase.FENCE and not self._users.stop_waits():
             self._watchdog.set(self._fence.disturbed(now_s))
         elif self.phase is Phase.IDLE:
@@ -272,10 +266,10 @@ class Line:
         if self.phase is Phase.CLOSED:
             return
         self._statistics.resynchronisations += 1
-        self._wire.note(WireEvent.RESYNC, now_s)
+        self.wire.note(WireEvent.RESYNC, now_s)
         self.phase = Phase.FENCE
-        self._wire.expect(ANY)
-        self._wire.forget_echo()
+        self.wire.expect(ANY)
+        self.wire.forget_echo()
         silent_s = self._fence.raised(now_s)
         self._watchdog.set(now_s if self._users.stop_waits() else silent_s)
 
@@ -283,15 +277,15 @@ class Line:
         self.phase = Phase.SETTLE
         flush = self._resync.flush
         echo_s = self._settings.margin_s if self._settings.echo else 0.0
-        self._watchdog.set(now_s + len(flush) * self._wire.byte_s + self._resync.settle_s + echo_s)
+        self._watchdog.set(now_s + len(flush) * self.wire.byte_s + self._resync.settle_s + echo_s)
         if flush:
-            self._wire.sent(flush, now_s, "flush")
-            if failure := self._wire.write(flush):
+            self.wire.sent(flush, now_s, "flush")
+            if failure := self.wire.write(flush):
                 self.transport_lost(failure)
 
     def _flushed(self, now_s: float) -> None:
         """Behind the fence: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
-        self._wire.discard_input()
+        self.wire.discard_input()
         self.phase = Phase.IDLE
         probe = None if self._users.stop_waits() else self._fence.probe(self._users.failing(), now_s)
         if probe:
@@ -303,7 +297,7 @@ class Line:
         probe.completed(reply, timing)
         if not probe.passed:
             why = "is not the known one"
-            self._wire.note(WireEvent.RECEIVED, now_s, remark=why)
+            self.wire.note(WireEvent.RECEIVED, now_s, remark=why)
             self._distrust(probe, reply, why, now_s)
             return
         self._fence.proven()
@@ -323,7 +317,7 @@ class Line:
             return
         turn = self._users.take(now_s)
         if turn is None:
-            self._wire.expect(ANY)
+            self.wire.expect(ANY)
             self._watchdog.set(self._users.next_due_s())
         else:
             self._send(turn, now_s, remarks[turn.lane])
@@ -340,17 +334,18 @@ class Line:
         """Write a request and do nothing else; return why the line was lost over it, if it was."""
         self._turn, self._sent_at_s = turn, now_s
         self.phase = Phase.REPLY if turn.exchange.reply_bytes else Phase.QUIET
-        return self._wire.write(turn.exchange.request)
+        return self.wire.write(turn.exchange.request)
 
     def _attend(self, turn: Turn, remark: str, failure: str) -> None:
         """Note a request that has just been written, and prepare for its reply."""
-        exchange, settings, wire, now_s = turn.exchange, self._settings, self._wire, self._sent_at_s
+        exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
         self._pieces.begin(now_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S, wire.byte_s)
         plain = exchange.reply_bytes and turn.plain and self._fence.in_step and not settings.echo
-        self._whole_bytes = exchange.reply_bytes if plain else NOT_PLAIN
+        self._missing = exchange.reply_bytes if plain else NOT_PLAIN
         self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)
-        wire.expect(max(ANY, self._whole_bytes))
+        # woken for the byte before the last, a program that had much to do is quicker to answer the last one
+        wire.expect(max(ANY, self._missing - int(wire.is_laborious)))
         self._asked_at_s = now_s + request_s
         answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else 0.0
         self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
@@ -362,7 +357,7 @@ class Line:
 
     def _tune(self, baud: int, *, for_good: bool = True) -> None:
         try:
-            self._wire.tune(baud, for_good=for_good)
+            self.wire.tune(baud, for_good=for_good)
         except TransportLost as error:
             self.transport_lost(error.message)
 
@@ -370,7 +365,7 @@ class Line:
 
     def _expired(self, now_s: float) -> None:
         if self.phase in (Phase.LINGER, Phase.QUIET):
-            self._wire.note(WireEvent.SETTLED, now_s)
+            self.wire.note(WireEvent.SETTLED, now_s)
         match self.phase:
             case Phase.IDLE:
                 self._next()
@@ -386,18 +381,18 @@ class Line:
                 self._flushed(now_s)
 
     def _timed_out(self, turn: Turn, now_s: float) -> None:
-        self._wire.collect()
+        self.wire.collect()
         if self._turn is not turn or self.phase is not Phase.REPLY:
             return  # the reply was there after all
         self._statistics.timeouts += 1
-        got = f"{len(self._pieces)} of {turn.exchange.reply_bytes} bytes" if self._pieces else "nothing"
+        got = f"{len(held)} of {turn.exchange.reply_bytes} bytes" if (held := self._pieces.held) else "nothing"
         error = ReplyTimeout(f"node {turn.exchange.node} on bus {self._settings.name} sent {got} in time")
-        self._wire.note(WireEvent.TIMEOUT, now_s, remark=error.message)
+        self.wire.note(WireEvent.TIMEOUT, now_s, remark=error.message)
         self._lose(turn, error, now_s)
 
     def _quiet_over(self, turn: Turn, now_s: float) -> None:
         """An exchange without a reply is complete once the line may be used again."""
-        timing = self._wire.silent(turn, self._sent_at_s, now_s)
+        timing = self.wire.silent(turn, self._sent_at_s, now_s)
         self._users.answered(turn)
         self._release(turn, turn.then_baud)
         self._next()

@@ -25,22 +25,23 @@ class Whole:
 
 
 class Pieces:
-    """The bytes of a reply so far."""
+    """The bytes of a reply so far.
 
-    __slots__ = ("_byte_s", "_early", "_held", "_over_s")
+    Attributes:
+        held: these bytes.
+        early: some came sooner than the wire can carry them.
+    """
+
+    __slots__ = ("_byte_s", "_over_s", "early", "held")
 
     def __init__(self) -> None:
-        self._held = b""
-        self._early = False
+        self.held = b""
+        self.early = False
         self._over_s = self._byte_s = 0.0
-
-    def __len__(self) -> int:
-        """Return how many bytes there are."""
-        return len(self._held)
 
     def begin(self, request_over_s: float, byte_s: float) -> None:
         """Forget what came; wait for the reply to a request that is over at that instant."""
-        self._held, self._early = b"", False
+        self.held, self.early = b"", False
         self._over_s, self._byte_s = request_over_s, CLOCK_TOLERANCE * byte_s
 
     def earliest_s(self, count: int) -> float:
@@ -49,12 +50,12 @@ class Pieces:
 
     def add(self, exchange: Exchange[Any], data: bytes, now_s: float) -> Whole | None:
         """Add bytes that have just arrived; return the reply once it is whole."""
-        data = self._held + data
-        self._early = self._early or now_s < self.earliest_s(len(data))
+        data = self.held + data
+        self.early = self.early or now_s < self.earliest_s(len(data))
         total = exchange.total_bytes(data) if exchange.total_bytes else exchange.reply_bytes
         if total is None or len(data) < total:
-            self._held = data
+            self.held = data
             return None
-        whole = Whole(data[:total], data[total:], self._early)
-        self._held, self._early = b"", False
+        whole = Whole(data[:total], data[total:], self.early)
+        self.held, self.early = b"", False
         return whole

@@ -67,8 +67,13 @@ class Wire:
 
     def push(self) -> None:
         """See `Transport`; for a request with much to do behind it, to judge by the ones before."""
-        if self._work_s > LONG_WORK_S:
+        if self.is_laborious:
             self._transport.push()
+
+    @property
+    def is_laborious(self) -> bool:
+        """Whether much is done behind each request; what answers replies is then out of the processor's caches."""
+        return self._work_s > LONG_WORK_S
 
     def worked(self, since_s: float) -> None:
         """Learn that all is done that was to be done behind a request."""

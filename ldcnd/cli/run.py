@@ -12,7 +12,7 @@ from ldcnd.config import RigConfig, load_config, single_line
 from ldcnd.daemon.assembly import open_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.planning import require_plan
-from ldcnd.daemon.process import held_awake, last_words, loop_factory, settle_heap
+from ldcnd.daemon.process import held_awake, last_words, loop_factory, senders_wait, settle_heap
 from ldcnd.daemon.service import Service
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import configure_logging, get_logger
@@ -72,7 +72,12 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
         settle_heap()
         try:
             with last_words(partial(write_captures, daemon)):
-                await service.run()
+                async with asyncio.TaskGroup() as group:
+                    arranging = group.create_task(senders_wait(), name="senders wait")
+                    try:
+                        await service.run()
+                    finally:
+                        arranging.cancel()
         finally:
             for number in handlers:
                 loop.remove_signal_handler(number)

@@ -42,7 +42,7 @@ from ldcnd.messaging.sweep import Sweep
 from ldcnd.messaging.workers import Workers
 from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.messaging.zenoh_values import TRAVEL, to_answers, to_sample, to_stamp
+from ldcnd.messaging.zenoh_values import TRAVEL, Stamps, to_answers, to_sample, to_stamp
 
 __all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
 
@@ -130,13 +130,13 @@ class ZenohSession(Session):
         self._urgent_workers = Workers("zenoh urgent", 2)
         self._declared: list[_Declared] = []
         self._outlets: dict[str, _Outlet] = {}
-        self._stamp_id = session.new_timestamp().get_id()
+        self._stamps = Stamps(session.new_timestamp().get_id())
         self._closed = False
 
     def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
         """Publish; cheaper once the key's publisher is declared, which happens in the background."""
         self._must_be_open()
-        timestamp = to_stamp(measured_at_ns, self._stamp_id)
+        timestamp = self._stamps.of(measured_at_ns)
         outlet = self._outlets.get(key) or self._new_outlet(key, qos)
         try:
             if outlet.publisher and outlet.qos is qos:
@@ -165,7 +165,7 @@ class ZenohSession(Session):
             if not admitted and workers.is_full:
                 # ends the query without an answer, and may hold up the link of this one client
                 return
-            path = _AnswerPath(asked, workers, self._stamp_id, intake.leave if admitted else lambda: None)
+            path = _AnswerPath(asked, workers, self._stamps.stamp_id, intake.leave if admitted else lambda: None)
             query = Query(
                 key=str(asked.key_expr),
                 parameters=dict(asked.parameters),  # type: ignore[call-overload] # its stub has no true iterator

@@ -63,5 +63,24 @@ def to_stamp(at_ns: int | None, stamp_id: zenoh.TimestampId) -> zenoh.Timestamp 
     return None if at_ns is None else zenoh.Timestamp(zenoh.NTP64(*divmod(at_ns, 10**9)), stamp_id)
 
 
+class Stamps:
+    """Makes timestamps for one thread; several samples of one instant, as a poll brings them, share one.
+
+    Attributes:
+        stamp_id: of the session.
+    """
+
+    def __init__(self, stamp_id: zenoh.TimestampId) -> None:
+        self.stamp_id = stamp_id
+        self._at_ns: int | None = None
+        self._latest: zenoh.Timestamp | None = None
+
+    def of(self, at_ns: int | None) -> zenoh.Timestamp | None:
+        """See `to_stamp`."""
+        if at_ns != self._at_ns:
+            self._at_ns, self._latest = at_ns, to_stamp(at_ns, self.stamp_id)
+        return self._latest
+
+
 def _stamped_ns(timestamp: zenoh.Timestamp | None) -> int | None:
     return None if timestamp is None else timestamp.get_time_as_ntp64().as_nanos()

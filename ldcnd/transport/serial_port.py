@@ -17,7 +17,7 @@ import fcntl
 import os
 import termios
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import serial
 import serial_asyncio
@@ -124,6 +124,7 @@ class SerialPort(Transport):
         major = os.major(os.fstat(self._descriptor).st_rdev)
         self._is_pseudo, self._is_usb = major in PSEUDO_TERMINALS, major in USB_TERMINALS
         self._least_bytes = 1
+        self._attributes: list[Any] = []  # as the driver has them; empty when that is not known
         self._set_least_bytes()
         self._loop.add_reader(self._descriptor, self._readable)
 
@@ -177,7 +178,7 @@ class SerialPort(Transport):
         At least one, so that an empty read is the end and not just nothing yet.
         """
         with contextlib.suppress(*PortFault):  # a port that is gone says so to its reader
-            attributes = termios.tcgetattr(self._descriptor)
+            attributes = self._attributes = self._attributes or termios.tcgetattr(self._descriptor)
             attributes[CONTROL_CHARACTERS][termios.VMIN] = self._least_bytes
             attributes[CONTROL_CHARACTERS][termios.VTIME] = 0
             termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
@@ -196,6 +197,7 @@ class SerialPort(Transport):
             self._port.baudrate = baud
         except PortFault as error:
             raise self._give_up(f"it refuses {baud} baud: {error}") from error
+        self._attributes = []
         self._set_least_bytes()  # pyserial has undone it
 
     async def close(self) -> None:

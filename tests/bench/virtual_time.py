@@ -68,7 +68,7 @@ async def _saturated(rig: RunningRig, seconds: float) -> tuple[float, float]:
 
 
 async def _with_one_dead(rig: RunningRig, seconds: float) -> tuple[float, float]:
-    chain = _bus(rig)._line._wire._transport._chain
+    chain = _bus(rig)._line.wire._transport._chain
     chain.modules[-1].power(on=False, at_s=asyncio.get_running_loop().time())
     return await _saturated(rig, seconds)
 

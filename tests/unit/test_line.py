@@ -171,7 +171,7 @@ async def test_the_rate_changes_before_the_next_request():
         "baud 19200",
         f"write {toy.request(1, 2).hex()}",
     ]
-    assert bench.line.baud == 19_200
+    assert bench.line.wire.baud == 19_200
     assert bench.story == ["completed 1", "completed 2"]
 
 
@@ -182,7 +182,7 @@ async def test_a_lost_reply_changes_no_rate():
     bench.add(1, then_baud=19_200)
     await settle()
 
-    assert bench.line.baud == 115_200
+    assert bench.line.wire.baud == 115_200
 
 
 async def test_an_exchange_at_another_rate_leaves_the_line_at_its_own():
@@ -217,7 +217,7 @@ async def test_the_fence_of_an_exchange_at_another_rate_is_at_the_lines_own():
         f"write {toy.FLUSH.hex()}",
     ]
     assert bench.story == ["lost 1", "completed 2"]
-    assert bench.line.baud == 115_200
+    assert bench.line.wire.baud == 115_200
 
 
 async def test_a_port_that_is_lost_on_its_way_to_another_rate_loses_the_turn():
@@ -400,7 +400,7 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     story: list[str] = []
     bench.wire.push = lambda: story.append("push")  # type: ignore[method-assign]
     loop = asyncio.get_running_loop()
-    bench.line._wire.worked(loop.time() - 1.0)  # a second for the one before
+    bench.line.wire.worked(loop.time() - 1.0)  # a second for the one before
 
     bench.add(1)
     second = bench.add(2)
@@ -409,3 +409,51 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     await settle()
 
     assert story == ["push", "push", "completed 2"]
+
+
+async def test_a_laborious_line_is_woken_for_the_byte_before_the_last_one():
+    bench = Bench()
+    bench.wire.bytewise = bench.wire.holds_back = True
+    bench.line.wire.worked(asyncio.get_running_loop().time() - 1.0)
+
+    bench.add(1)
+    bench.add(2)
+    assert bench.wire.expected == toy.REPLY_BYTES - 1
+    await settle(REQUEST_S + 0.0001 + REPLY_S - REPLY_S / toy.REPLY_BYTES / 2)
+    assert bench.wire.expected == 1
+    await settle()
+
+    assert bench.story == ["completed 1", "completed 2"]
+    events = [record.event for record in bench.log.records()]
+    assert events == 2 * [WireEvent.SENT, WireEvent.PART, WireEvent.RECEIVED]
+    assert bench.statistics.bytes_in == 2 * toy.REPLY_BYTES
+
+
+async def test_the_next_request_is_written_first_also_behind_a_reply_in_pieces():
+    bench = Bench()
+    bench.wire.bytewise = True
+    bench.add(1)
+    bench.add(2)
+    seen: list[int] = []
+    write = bench.wire.write
+
+    def watched(data: bytes) -> None:
+        seen.append(bench.statistics.replies)
+        write(data)
+
+    bench.wire.write = watched  # type: ignore[method-assign]
+    await settle()
+
+    assert seen == [0]
+    assert bench.story == ["completed 1", "completed 2"]
+
+
+async def test_an_early_piece_spoils_the_reply_also_when_the_rest_comes_in_time():
+    bench = Bench()
+    whole = toy.reply(1)
+    bench.replies({1: [Say(whole[:2], after_s=-REQUEST_S), Say(whole[2:], after_s=0.0005)]})
+
+    bench.add(1)
+    await settle()
+
+    assert bench.story == ["lost 1"]
