@@ -27,8 +27,7 @@ from ldcnd.transport.transport import Transport
 
 NOT_PLAIN = 0
 """No reply has so few bytes."""
-ANY = 1
-"""What to expect where any byte would be news."""
+ANY = 1  # byte to expect where each would be news
 LATE_S = 1.0
 """A line that is so far behind what it had planned next does not turn."""
 _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
@@ -182,6 +181,7 @@ class Line:
             self.wire.push()
         else:
             self._turn, self.phase = None, Phase.IDLE
+        began_s = self._loop.time()
         self._statistics.bytes_in += len(arrived)
         self.wire.note(WireEvent.RECEIVED, now_s, arrived)
         timing = self.wire.replied(turn, reply, sent_at_s, now_s)
@@ -195,7 +195,7 @@ class Line:
         turn.completed(reply, timing)
         if self._turn and self._missing:
             self._users.look_ahead(self._turn, self._asked_at_s)
-        self.wire.worked(now_s)
+        self.wire.worked(began_s)
 
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""

@@ -11,7 +11,7 @@ from ldcnd.errors import TransportLost
 from ldcnd.exchange import Timing
 from ldcnd.transport.transport import Receiver, Transport
 
-LONG_WORK_S = 100e-6
+LONG_WORK_S = 120e-6
 """What takes longer would hold up the request before it where the kernel has no other processor to carry it on."""
 WORK_WEIGHT = 0.1
 """Of the latest work behind a request in what is expected of the next."""

@@ -1,50 +1,85 @@
-"""System calls of the daemon's main thread for each poll, counted by strace; what timers wake it for is told apart."""
+"""System calls of the main thread for each poll, counted by strace; what timers wake it for is told apart."""
 
 import shutil
 import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from tests.bench.processes import config_text, daemon, free_endpoint, paced_line, settle
+from tests.bench.processes import (
+    SUBJECT_CPU,
+    PacedLine,
+    config_text,
+    daemon,
+    free_endpoint,
+    heard,
+    paced_line,
+    process,
+    settle,
+)
 from tests.bench.report import Row
 
+MODULES = 8
+BAUD = 115_200
 COUNT_S = 2
 START_S = 6.0
 REQUEST = '"\\252"'
 """How strace shows the header of a packet."""
+OF_THE_LINE = ("read(", "ioctl(", "sched_yield(")
+"""What is called for a line besides writing and waiting."""
 
 
 def rows(line_program: Path, folder: Path) -> list[Row]:
-    """Count the calls that belong to a line that is polled all the time."""
+    """Count the calls that belong to a line that is polled all the time: of a bus alone, and of the whole daemon."""
     strace = shutil.which("strace")
     if strace is None:
         print("no strace: system calls are not counted")
         return []
-    return [*_counted(strace, line_program, folder, burst=True), *_counted(strace, line_program, folder, burst=False)]
+    found = []
+    for burst in (True, False):
+        how = "in one piece" if burst else "byte by byte"
+        with paced_line(line_program, modules=MODULES, ready_baud=BAUD, burst=burst) as line, _bare_bus(line) as it:
+            found.append(_row(f"system calls of a poll, nothing published, replies {how}", strace, it, folder, 3.1))
+        with (
+            paced_line(line_program, modules=MODULES, ready_baud=0, burst=burst) as line,
+            _daemon(line, folder) as it,
+        ):
+            found.append(_row(f"system calls of a poll, whole daemon, replies {how}", strace, it, folder))
+    return found
 
 
-def _counted(strace: str, line_program: Path, folder: Path, *, burst: bool) -> list[Row]:
-    with paced_line(line_program, modules=1, ready_baud=0, burst=burst) as line:
-        config = folder / "calls.toml"
-        config.write_text(
-            config_text(line.terminal, modules=1, baud=115_200, uvloop=False, hz=2000.0, items=("velocity",))
-        )
-        trace = folder / "calls.txt"
-        with daemon(config, free_endpoint()) as running:
-            settle(START_S)
-            tracing = subprocess.Popen(  # noqa: S603
-                (strace, "-s", "1", "-o", trace, "-p", str(running.pid)), stderr=subprocess.DEVNULL
-            )
-            settle(COUNT_S)
-            tracing.terminate()
-            tracing.wait()
+@contextmanager
+def _bare_bus(line: PacedLine) -> Iterator[subprocess.Popen]:
+    command = (sys.executable, "-m", "tests.bench.bare_bus", line.terminal, str(MODULES))
+    with process(command, cpu=SUBJECT_CPU, nice=-10, pipe=True) as running:
+        assert heard(running).strip() == "polling"
+        settle(1.0)
+        yield running
+
+
+@contextmanager
+def _daemon(line: PacedLine, folder: Path) -> Iterator[subprocess.Popen]:
+    config = folder / "calls.toml"
+    config.write_text(
+        config_text(line.terminal, modules=MODULES, baud=BAUD, uvloop=False, hz=2000.0, items=("velocity",))
+    )
+    with daemon(config, free_endpoint()) as running:
+        settle(START_S)
+        yield running
+
+
+def _row(name: str, strace: str, running: subprocess.Popen, folder: Path, target: float | None = None) -> Row:
+    trace = folder / "calls.txt"
+    tracing = subprocess.Popen(  # noqa: S603
+        (strace, "-s", "1", "-o", trace, "-p", str(running.pid)), stderr=subprocess.DEVNULL
+    )
+    settle(COUNT_S)
+    tracing.terminate()
+    tracing.wait()
     calls = trace.read_text().splitlines()
     polls = sum(1 for call in calls if call.startswith("write(") and REQUEST in call)
     waits = [call for call in calls if call.startswith("epoll_wait(")]
     timers = sum(1 for call in waits if call.rstrip().endswith("= 0"))
-    line_calls = polls + sum(1 for call in calls if call.startswith("read(")) + len(waits) - timers
-    how = "in one piece" if burst else "byte by byte"
-    target = 3.1 if burst else None
-    return [
-        Row(f"system calls for each poll, replies {how}", line_calls / polls, "", target, at_most=True),
-        Row(f"wake-ups by timers, replies {how}", timers / COUNT_S, "/s"),
-    ]
+    others = sum(1 for call in calls if call.startswith(OF_THE_LINE))
+    return Row(name, (polls + len(waits) - timers + others) / polls, "", target, at_most=True)

@@ -1,0 +1,59 @@
+"""A bus that polls the drives of a paced line as fast as it can and does nothing with what they say."""
+
+import asyncio
+import logging
+import sys
+from dataclasses import replace
+
+import structlog
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.poller import Poller
+from ldcnd.bus.settings import BusSettings
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.status import Status, StatusItem
+from ldcnd.errors import BusError
+from ldcnd.exchange import Exchange, Timing
+from ldcnd.transport.port_url import port_opener
+
+BAUD = 115_200
+ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+
+
+class Asker(Poller[Status]):
+    """Asks one drive for nine bytes, again and again."""
+
+    def __init__(self, address: int) -> None:
+        self.node = address
+        self.due_at_s = 0.0
+        # polls know no short replies, see `LdcnAxis.reading`
+        self._exchange = replace(commands.read_status(Node(address, PROFILES["ls-182ap"]), ITEMS), total_bytes=None)
+
+    def next_exchange(self, now_s: float) -> Exchange[Status]:
+        """See `Poller`."""
+        self.due_at_s = self.deadline_at_s = now_s
+        return self._exchange
+
+    def deliver(self, reply: Status, timing: Timing) -> None:
+        """See `Poller`."""
+
+    def missed(self, error: BusError) -> None:
+        """See `Poller`."""
+
+
+async def main(terminal: str, modules: int) -> None:
+    """Poll until terminated."""
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    bus = Bus(BusSettings("bench", BAUD, margin_s=0.02), port_opener(terminal, BAUD))
+    async with asyncio.TaskGroup() as group:
+        group.create_task(bus.run(), name="bus")
+        await bus.wait_opened()
+        for address in range(1, modules + 1):
+            bus.add_poller(Asker(address))
+        print("polling", flush=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1], int(sys.argv[2])))
