@@ -26,6 +26,7 @@ STATUS_ITEMS, REPLY_BYTES = 0x4F, 13
 FLOOR = "C floor"
 SETTLE_S = 0.5
 ROUND_S = 1.0
+TRIES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,16 +102,19 @@ def _rounds(subjects, listeners, rounds) -> list[dict[str, Round]]:
 
 
 def _round(subject: Subject, listener) -> Round:
-    subject.resume()
-    settle(SETTLE_S)
-    before = _received(listener)
-    cpu_s = subject.cpu_s()
-    subject.line.figures()
-    settle(ROUND_S)
-    figures = subject.line.figures()
-    cpu_s = subject.cpu_s() - cpu_s
-    if not figures.exchanges:
-        raise RuntimeError(f"{subject.name} sent nothing for {ROUND_S} s")
+    for _ in range(TRIES):  # one that was stopped in the middle of an exchange may need a while
+        subject.resume()
+        settle(SETTLE_S)
+        before = _received(listener)
+        cpu_s = subject.cpu_s()
+        subject.line.figures()
+        settle(ROUND_S)
+        figures = subject.line.figures()
+        cpu_s = subject.cpu_s() - cpu_s
+        if figures.exchanges:
+            break
+    else:
+        raise RuntimeError(f"{subject.name} sent nothing for {TRIES} times {ROUND_S} s")
     samples = _received(listener) - before
     subject.stop()
     return Round(

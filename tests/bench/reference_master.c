@@ -14,6 +14,7 @@
 #include <unistd.h>
 
 #define PATIENCE_US 100000
+#define SILENCE_US 20000
 
 static void ring(int number) { (void)number; }
 
@@ -45,13 +46,12 @@ int main(int count, char **argument)
             else if (got < 0 && errno == EINTR) alarms++;
             else return 1;
         }
-        if (have < bytes) {
-            tcflush(line, TCIFLUSH);
-            continue;
-        }
         unsigned sum = 0;
         for (int i = 0; i < bytes - 1; i++)
             sum += reply[i];
-        if ((sum & 0xFF) != reply[bytes - 1]) tcflush(line, TCIFLUSH);
+        if (have < bytes || (sum & 0xFF) != reply[bytes - 1]) { /* out of step: wait for the line to fall silent */
+            usleep(SILENCE_US);
+            tcflush(line, TCIFLUSH);
+        }
     }
 }
