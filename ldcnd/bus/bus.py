@@ -276,8 +276,8 @@ class Bus:
     def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
         """See `Users`: to choose a poll and what to ask takes longer than all else between two packets."""
         exchange = turn.exchange
-        wait_s = self._order.wait_s(exchange.node, asked_at_s) if self._order else 0.0
-        at_s = asked_at_s + wait_s + exchange.reply_bytes * self.settings.bits_per_byte / self.baud
+        reply_s = exchange.reply_bytes * self.settings.bits_per_byte / self.baud
+        at_s = self._order.free_at_s(exchange.node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s
         if poller := self._queue.look_ahead(at_s):
             poller.prepare(at_s)
 

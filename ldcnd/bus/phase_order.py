@@ -108,10 +108,17 @@ class PhaseOrder:
         self._expected_s[best.node] = shortest_s + guard_s
         return best
 
-    def wait_s(self, node: int, from_s: float) -> float:
-        """Return how long after an instant a node is likely to answer a request that is over then."""
+    def free_at_s(self, node: int, asked_at_s: float, reply_s: float) -> float:
+        """Return when the line is likely to be free again behind a request that is over at an instant.
+
+        Args:
+            node: who is asked.
+            asked_at_s: when the request is over, in loop time.
+            reply_s: what the reply takes at the line's nominal rate.
+        """
         tracker = self._trackers.get(node)
-        return tracker.wait_s(from_s) if tracker and tracker.locked else self._cycle_s / 2
+        wait_s = tracker.wait_s(asked_at_s) if tracker and tracker.locked else self._cycle_s / 2
+        return asked_at_s + wait_s + self._stretch * reply_s
 
     def observe(self, node: int, timing: Timing) -> None:
         """Learn from a reply to a poll."""

@@ -12,6 +12,8 @@ SHORTEST_ROUND, LONGEST_ROUND = 0.5, 1.5
 """Turns for which a late poll waits, as shares of how many are late. The longest one keeps the longest gap below two
 mean ones, also when several are passed over.
 """
+FEW = 4
+"""So many wait for a turn less than that: turns are counted, not seconds, and with few of them chance weighs more."""
 
 Choose = Callable[[Sequence[Poller[Any]], float], Poller[Any]]
 """Which of several polls to run now, at an instant in loop time; there is always one."""
@@ -70,10 +72,11 @@ class PollRank:
 
     def _take_late(self, choose: Choose, now_s: float) -> Poller[Any]:
         since, _, first = self._late[0]
-        if self._turn - since >= LONGEST_ROUND * len(self._late):
+        late = len(self._late)
+        if self._turn - since >= LONGEST_ROUND * late - FEW / late:
             del self._late[0]
             return first
-        before = self._turn - SHORTEST_ROUND * len(self._late)
+        before = self._turn - SHORTEST_ROUND * late
         among = [poller for turn, _, poller in self._late if turn <= before] or [first]
         chosen = choose(among, now_s)
         del self._late[among.index(chosen)]  # both begin with who is late longest
