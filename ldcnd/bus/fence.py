@@ -31,7 +31,7 @@ class Fence:
         self._rounds_left = 0
 
     def raised(self, now_s: float) -> float:
-        """Begin to wait for silence; return how long that takes at least."""
+        """Begin to wait for silence; return until when, if no byte comes."""
         self._since_s = now_s
         return now_s + self._resync.quiet_s
 

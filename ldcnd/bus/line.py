@@ -60,7 +60,7 @@ class Line:
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
         self._turn: Turn | None = None
-        self._sent_at_s = self._asked_at_s = 0.0
+        self._sent_at_s = 0.0
         self._pieces = Pieces()
         self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain turn
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
@@ -194,7 +194,7 @@ class Line:
             self._attend(following, AT_ONCE[following.lane], failure)
         turn.completed(reply, timing)
         if self._turn and self._missing:
-            self._users.look_ahead(self._turn, self._asked_at_s)
+            self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * self.wire.byte_s)
         self.wire.worked(began_s)
 
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
@@ -346,7 +346,6 @@ class Line:
         self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)
         # woken for the byte before the last, a program that had much to do is quicker to answer the last one
         wire.expect(max(ANY, self._missing - int(wire.is_laborious)))
-        self._asked_at_s = now_s + request_s
         answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else 0.0
         self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
         self._statistics.exchanges += 1
