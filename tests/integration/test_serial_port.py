@@ -303,13 +303,30 @@ async def test_a_port_that_expects_more_than_comes_still_reports_its_end(far: Fa
     assert len(receiver.losses) == 1
 
 
-async def test_a_push_lets_the_kernel_carry_what_was_written(far: FarSide, port: Transport):
-    port.attach(RecordingReceiver())
+async def test_a_push_yields_the_processor_once_on_a_pseudo_terminal(port: Transport, monkeypatch):
+    yielded: list[bool] = []
+    monkeypatch.setattr(os, "sched_yield", lambda: yielded.append(True))
 
-    port.write(b"\xaa\x01")
     port.push()
 
-    assert await far.read(10) == b"\xaa\x01"
+    assert yielded == [True]
+
+
+async def test_a_port_that_is_no_pseudo_terminal_needs_no_push(port: Transport, monkeypatch):
+    yielded: list[bool] = []
+    monkeypatch.setattr(os, "sched_yield", lambda: yielded.append(True))
+    port._is_pseudo = False
+
+    port.push()
+
+    assert yielded == []
+
+
+async def test_an_adapter_on_usb_is_not_told_what_to_expect(far: FarSide, port: Transport):
+    port._is_usb = True
+    port.expect(9)
+
+    assert termios.tcgetattr(port._descriptor)[6][termios.VMIN] == 1
 
 
 def _fill(port: Transport) -> None:

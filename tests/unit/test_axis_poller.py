@@ -99,3 +99,36 @@ def test_an_item_that_is_wanted_more_seldom_keeps_the_state_at_its_rate():
     asked = Counter(item for _, items in polls(axis, 11.0) for item in items)
     assert asked[STATE] == pytest.approx(50, abs=2)
     assert asked[POSITION] == pytest.approx(10, abs=1)
+
+
+def test_to_prepare_a_poll_changes_nothing_but_when_the_work_is_done():
+    plain, prepared = (poller({POSITION: 20.0, ADC: 7.0, STATE: 3.0}) for _ in range(2))
+
+    for number in range(200):
+        at_s = number * 0.05
+        prepared.prepare(at_s)
+        due_at_s = prepared.due_at_s
+        assert due_at_s == plain.due_at_s  # it is not asked yet
+
+        assert prepared.next_exchange(at_s) == plain.next_exchange(at_s)
+        assert (prepared.due_at_s, prepared.deadline_at_s) == (plain.due_at_s, plain.deadline_at_s)
+
+
+def test_what_was_prepared_for_a_turn_that_has_passed_is_not_asked():
+    axis = poller({POSITION: 10.0, ADC: 1.0})
+    axis.next_exchange(0.0)
+    axis.prepare(0.1)
+
+    assert axis.next_exchange(1.0) == {POSITION, ADC}
+    assert axis.due_at_s == pytest.approx(1.1)
+
+
+def test_other_rates_forget_what_was_prepared():
+    axis = poller({POSITION: 10.0})
+    axis.next_exchange(0.0)
+    axis.prepare(0.1)
+
+    axis.retime({POSITION: 2.0}, 0.1)
+    axis.next_exchange(0.1)
+
+    assert axis.due_at_s == pytest.approx(0.6)

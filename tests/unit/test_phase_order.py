@@ -141,3 +141,20 @@ async def test_it_does_no_harm_where_nothing_can_be_predicted():
     by_phase = await saturated(16, 1.0, by_phase=True, late_s=late_s)
 
     assert by_phase.per_s / by_deadline.per_s >= 0.98
+
+
+def test_the_line_is_free_after_the_cycle_and_a_reply_at_the_drives_rate():
+    order, phase_s, stretch = PhaseOrder(ServoCycle(CYCLE_S, 1.014)), 0.0001, 1.014
+    asked_at_s = 1000.0
+    assert order.free_at_s(7, asked_at_s, REPLY_S) == pytest.approx(asked_at_s + CYCLE_S / 2 + stretch * REPLY_S)
+
+    for _ in range(50):
+        asked_at_s += 0.0403
+        began_s = tick_after(asked_at_s, phase_s, 0.0)
+        order.observe(
+            7, Timing(asked_at_s - REQUEST_S, asked_at_s, began_s + 0.014 * REPLY_S, began_s + stretch * REPLY_S)
+        )
+    asked_at_s += 0.0403
+
+    expected_s = tick_after(asked_at_s, phase_s, 0.0) + stretch * REPLY_S
+    assert order.free_at_s(7, asked_at_s, REPLY_S) == pytest.approx(expected_s, abs=20e-6)
