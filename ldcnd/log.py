@@ -18,9 +18,9 @@ PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERR
 """Levels as syslog and the journal number them."""
 
 
-def get_logger(name: str) -> structlog.stdlib.BoundLogger:
+def get_logger(name: str) -> structlog.typing.FilteringBoundLogger:
     """Return the logger of one part of the daemon; `name` is its noun."""
-    logger: structlog.stdlib.BoundLogger = structlog.stdlib.get_logger(f"ldcnd.{name}")
+    logger: structlog.typing.FilteringBoundLogger = structlog.get_logger(f"ldcnd.{name}")
     return logger
 
 
@@ -32,10 +32,7 @@ def configure_logging(*, json: bool = False, level: str = "info") -> None:
         level: debug, info, warning or error.
     """
     journal = not json and is_journal(sys.stderr, os.environ)
-    processors: list[structlog.typing.Processor] = [
-        structlog.stdlib.filter_by_level,
-        structlog.processors.format_exc_info,
-    ]
+    processors: list[structlog.typing.Processor] = [structlog.processors.format_exc_info]
     if journal:
         handler = _journal_handler(sys.stderr)
         processors.append(_text_and_fields)
@@ -48,8 +45,10 @@ def configure_logging(*, json: bool = False, level: str = "info") -> None:
         ]
     structlog.configure(
         processors=processors,
-        wrapper_class=structlog.stdlib.BoundLogger,
+        # what is not wanted costs a call and no more; loggers are put together once
+        wrapper_class=structlog.make_filtering_bound_logger(level),
         logger_factory=structlog.stdlib.LoggerFactory(),
+        cache_logger_on_first_use=True,
     )
     logging.basicConfig(handlers=[handler], level=level.upper(), format="%(message)s", force=True)
 

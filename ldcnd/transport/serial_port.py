@@ -27,7 +27,7 @@ from ldcnd.errors import TransportLost
 from ldcnd.transport.incoming import Incoming
 from ldcnd.transport.transport import Receiver, Transport
 
-log: structlog.stdlib.BoundLogger = structlog.stdlib.get_logger("ldcnd.serial_port")
+log: structlog.typing.FilteringBoundLogger = structlog.get_logger("ldcnd.serial_port")
 
 OPEN_TIME_S = 5.0
 DRAIN_TIME_S = 1.0
