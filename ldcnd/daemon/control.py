@@ -19,6 +19,7 @@ class Control:
     authority: Authority
     commands: CommandDesk
     rig: RigDesk
+    events: EventLog
 
 
 def build_control(
@@ -38,4 +39,5 @@ def build_control(
         authority,
         CommandDesk(rig, authority, ledger, clock, next_command_id, instance),
         RigDesk(rig, authority, ledger, events, clock),
+        events,
     )

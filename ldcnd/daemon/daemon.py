@@ -116,6 +116,7 @@ class Daemon:
         refused, what moves comes to rest, tokens go, lines close.
         """
         async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
+            declared.callback(self._control.events.tell)  # last of all
             leases = LeaseWatch(self.rig, self._control.authority, self._run.clock, group)
             requests = Requests(self.rig, self._keys, group, self._control, leases)
             serving = [group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses]

@@ -1,7 +1,9 @@
 """The latest events of a rig: kept for those who come late, published for those who listen."""
 
+import asyncio
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.ledger import Entry
@@ -12,31 +14,66 @@ from ldcnd.model.events import CommandEvent, EventList, EventsRequest
 
 log = get_logger("events")
 
+TOLD_AFTER_S = 0.003
+UNTOLD_EVENTS = 64
+"""With so many they are told at once."""
 KEPT_EVENTS = 1000
 PAGE_BYTES = 12_000
 """Events in one reply: with its other fields it stays below what a payload may have."""
 
 
+@dataclass(frozen=True, slots=True)
+class _News:
+    """What has happened and is not told yet."""
+
+    t: int
+    seq: int
+    number: int
+    entry: Entry
+    error: LdcndError | None
+
+
 class EventLog:
-    """Numbers, keeps and publishes what happens to commands."""
+    """Numbers, keeps and publishes what happens to commands.
+
+    An event has its numbers and its instant at once. It is told a little later, because to tell it takes as long as all
+    else that a command waits for on its way to the line, and nobody who waits for the command waits for that.
+    """
 
     def __init__(self, publisher: Publisher, clock: Clock, run: str) -> None:
         self._run = run
         self._end = 0
         self._publisher = publisher
         self._clock = clock
+        self._loop = asyncio.get_running_loop()
         self._kept: deque[CommandEvent] = deque(maxlen=KEPT_EVENTS)
         self._sequence: dict[str, int] = {}
+        self._news: list[_News] = []
 
     def changed(self, entry: Entry, error: LdcndError | None) -> None:
         """Take a change of the ledger."""
         seq = self._sequence.get(entry.axis, 0)
         self._sequence[entry.axis] = seq + 1
+        if not self._news:
+            self._loop.call_later(TOLD_AFTER_S, self.tell)
+        self._news.append(_News(self._clock.now_ns(), seq, self._end, entry, error))
+        self._end += 1
+        if len(self._news) >= UNTOLD_EVENTS:
+            self.tell()
+
+    def tell(self) -> None:
+        """Publish and log all that has happened so far."""
+        news, self._news = self._news, []
+        for each in news:
+            self._tell(each)
+
+    def _tell(self, news: _News) -> None:
+        entry, error = news.entry, news.error
         event = CommandEvent(
-            t=self._clock.now_ns(),
-            seq=seq,
+            t=news.t,
+            seq=news.seq,
             run=self._run,
-            number=self._end,
+            number=news.number,
             axis=entry.axis,
             command_id=entry.command_id,
             verb=entry.verb.value,
@@ -46,7 +83,6 @@ class EventLog:
             reason=entry.reason,
             code=error.code.value if error else None,
         )
-        self._end += 1
         self._kept.append(event)
         self._publisher.publish_event(event)
         log.info(
@@ -62,6 +98,7 @@ class EventLog:
 
     def page(self, request: EventsRequest) -> EventList:
         """Return the events that were asked for, as many as one reply takes."""
+        self.tell()
         oldest = self._end - len(self._kept)
         if request.from_number is None:
             matching = [event for event in self._kept if request.axis in (None, event.axis)]

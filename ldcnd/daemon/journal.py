@@ -20,15 +20,19 @@ class Journal:
     """Knows which line an axis is on; what concerns the rig as a whole is written to all lines."""
 
     def __init__(self, rig: Rig) -> None:
-        self._rig = rig
+        logs = [(line.bus.wire_log, [axis.config.name for axis in line.axes]) for line in rig.buses]
+        self._logs = {name: [log] for log, names in logs for name in names}
+        self._logs[RIG_ITSELF] = [log for log, _ in logs]
 
     def asked(self, axis: str, verb: str, request: Frozen, lease: str | None = None) -> None:
         """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
-        fields = request.model_dump(mode="json", exclude_defaults=True)
-        token = lease or fields.get("lease")
-        if token is not None:
-            fields["lease"] = fingerprint(token)
-        self._note(axis, f"{axis}/{verb} {json.dumps(fields)}")
+        token = lease or getattr(request, "lease", None)
+        if token is None:
+            payload = request.model_dump_json(exclude_defaults=True)
+        else:
+            fields = request.model_dump(mode="json", exclude_defaults=True)
+            payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":"))
+        self._note(axis, f"{axis}/{verb} {payload}")
 
     def stopped(self, axis: str | None) -> None:
         """Note a stop of an axis, or of the rig."""
@@ -36,9 +40,8 @@ class Journal:
 
     def _note(self, axis: str, text: str) -> None:
         now_s = asyncio.get_running_loop().time()
-        for line in self._rig.buses:
-            if axis == RIG_ITSELF or any(axis == one.config.name for one in line.axes):
-                line.bus.wire_log.add(now_s, WireEvent.COMMAND, text.encode())
+        for log in self._logs[axis]:
+            log.add(now_s, WireEvent.COMMAND, text.encode())
 
 
 def fingerprint(token: str) -> str:

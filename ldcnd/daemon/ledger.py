@@ -90,22 +90,33 @@ class Ledger:
         if entry is None:
             return
         error = answer if isinstance(answer, LdcndError) else None
-        self._entries[command_id] = replace(entry, answer=answer)
-        self.reached(command_id, status, error.message if error else None, error)
+        self._reached(entry, answer, status, error.message if error else None, error)
 
     def reached(
         self, command_id: str, status: CommandStatus, reason: str | None = None, error: LdcndError | None = None
     ) -> None:
         """Note how far a command has got; a final status is kept."""
-        entry = self._entries.get(command_id)
-        if entry is None or entry.status in FINAL or entry.status is status:
-            return
-        entry = self._entries[command_id] = replace(entry, status=status, reason=reason)
-        self._changed(entry, error)
+        if entry := self._entries.get(command_id):
+            self._reached(entry, entry.answer, status, reason, error)
 
     def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None) -> None:
         """Take from an axis that a command is over."""
         self.reached(command.command_id, status, reason)
+
+    def _reached(
+        self,
+        entry: Entry,
+        answer: CommandReply | LdcndError | None,
+        status: CommandStatus,
+        reason: str | None,
+        error: LdcndError | None,
+    ) -> None:
+        news = entry.status not in FINAL and entry.status is not status
+        if not news:
+            status, reason = entry.status, entry.reason
+        entry = self._entries[entry.command_id] = replace(entry, answer=answer, status=status, reason=reason)
+        if news:
+            self._changed(entry, error)
 
     def _forget_one(self) -> None:
         for command_id, entry in self._entries.items():

@@ -35,10 +35,11 @@ class SlowRig:
     confirmed: asyncio.Event = field(default_factory=asyncio.Event)
     stops: int = 0
     fails: bool = False
-    buses: tuple[object, ...] = ()
+    wire_log: Mock = field(default_factory=Mock)
 
     def __post_init__(self) -> None:
         self.axes = {"x": SimpleNamespace(tracker=Tracker(), stoppable=True, config=SimpleNamespace(name="x"))}
+        self.buses = (SimpleNamespace(bus=SimpleNamespace(wire_log=self.wire_log), axes=tuple(self.axes.values())),)
 
     def axis(self, name: str) -> SimpleNamespace:
         return self.axes[name]
@@ -166,7 +167,8 @@ async def test_who_has_stopped_is_entered_once_the_drives_have_confirmed_it():
 
 
 async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
-    rig = SlowRig(buses=(object(),))  # no line that could be written to
+    rig = SlowRig()
+    rig.wire_log.add.side_effect = OSError("no room")
     async with asyncio.TaskGroup() as group:
         flood = Flood(rig, group)
         flood.desk.stopped.side_effect = ValueError("a bug")

@@ -1,0 +1,68 @@
+"""Events have their numbers at once and are told together, a moment later."""
+
+import asyncio
+from unittest.mock import Mock
+
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.event_log import TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
+from ldcnd.daemon.ledger import Entry
+from ldcnd.daemon.publishing import Publisher
+from ldcnd.errors import BusDown
+from ldcnd.model.events import CommandStatus, EventsRequest
+from ldcnd.model.requests import PowerRequest, Verb
+
+
+class Told:
+    """An event log that happens at 1 s and counts up by 1 ns, and what it has published."""
+
+    def __init__(self) -> None:
+        self.publisher = Mock(spec=Publisher)
+        ticks = iter(range(10**9, 2 * 10**9))
+        self.log = EventLog(self.publisher, Clock(lambda: next(ticks)), "run-1")
+
+    def happens(self, status: CommandStatus = CommandStatus.ACCEPTED, error: BusDown | None = None) -> None:
+        entry = Entry("c1", "x", Verb.POWER, PowerRequest(on=False), client=None, status=status)
+        self.log.changed(entry, error)
+
+    def published(self) -> list[tuple[int, int, int, str, str | None]]:
+        events = [call.args[0] for call in self.publisher.publish_event.call_args_list]
+        return [(event.t, event.seq, event.number, event.status.value, event.code) for event in events]
+
+
+async def test_events_are_told_together_with_the_instants_at_which_they_happened():
+    told = Told()
+    told.happens()
+    await asyncio.sleep(TOLD_AFTER_S / 2)
+    told.happens(CommandStatus.FAILED, BusDown("no line"))
+    assert told.published() == []
+
+    await asyncio.sleep(TOLD_AFTER_S)
+
+    assert told.published() == [(10**9, 0, 0, "accepted", None), (10**9 + 1, 1, 1, "failed", "bus_down")]
+
+
+async def test_who_asks_is_told_at_once_and_nobody_twice():
+    told = Told()
+    told.happens()
+
+    page = told.log.page(EventsRequest())
+    await asyncio.sleep(2 * TOLD_AFTER_S)
+
+    assert [event.number for event in page.events] == [0]
+    assert len(told.published()) == 1
+
+
+async def test_a_flood_is_not_kept():
+    told = Told()
+    for _ in range(UNTOLD_EVENTS):
+        told.happens()
+
+    assert [number for _, _, number, _, _ in told.published()] == list(range(UNTOLD_EVENTS))
+
+
+async def test_at_the_end_all_is_told():
+    told = Told()
+    told.happens()
+    told.log.tell()
+
+    assert len(told.published()) == 1
