@@ -1,12 +1,14 @@
 """One axis at work: takes commands in turn, lets stops overtake them, digests readings, publishes.
 
-Commands of one axis run one after another in its own task. A stop never waits for them: it withdraws what is still
+Commands of one axis run one after another: one that finds the axis free in the task of its caller, who then does not
+wait for another one, those that had to wait in the axis's own. A stop never waits for them: it withdraws what is still
 queued, and whatever a command does next finds that the epoch has moved on.
 """
 
 import asyncio
 import contextlib
 import math
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
@@ -84,7 +86,9 @@ class AxisService:
         self._next_command_id = next_command_id
         self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
         self._commands = AxisCommands(self._motion)
-        self._queue: asyncio.Queue[_Pending | None] = asyncio.Queue(QUEUED_COMMANDS)  # None only wakes
+        self._waiting: deque[_Pending] = deque()
+        self._woken = asyncio.Event()
+        self._working = asyncio.Lock()  # by whoever carries out a command or a step
         self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
         tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
@@ -101,19 +105,20 @@ class AxisService:
         pending = None
         try:
             while True:
-                pending = await self._next()
-                if pending is None:
-                    await self._step()
-                elif not pending.future.done():
-                    await self._carry_out(pending)
+                await self._wake_up()
+                async with self._working:
+                    pending = self._waiting.popleft() if self._waiting else None
+                    if pending is None:
+                        await self._step()
+                    elif not pending.future.done():
+                        await self._carry_out(pending)
         finally:
             self._closed = True
             self._epoch += 1
             self._changed.set()
-            ending = ShuttingDown(f"axis {self.config.name}: the daemon is stopping", axis=self.config.name)
             if pending and not pending.future.done():
-                pending.future.set_exception(ending)
-            self._refuse_queued(ending)
+                pending.future.set_exception(self._ending())
+            self._refuse_queued(self._ending())
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
@@ -141,8 +146,7 @@ class AxisService:
         self._changed.set()
         self._commands.observed(reading, timing)
         if self._commands.step_due:
-            with contextlib.suppress(asyncio.QueueFull):  # then the axis is awake anyway
-                self._queue.put_nowait(None)
+            self._woken.set()
         t, t_error_ns = self._clock.stamp(timing)
         self.telemetry.reading(reading, asked, t, t_error_ns)
 
@@ -187,16 +191,16 @@ class AxisService:
                 f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
             )
         if self._closed:
-            raise ShuttingDown("the daemon is stopping", axis=self.config.name)
+            raise self._ending()
+        turn = self._turn(command_id, verb)
+        if self._waiting or self._working.locked():
+            return await self._enqueue(turn, request)
         try:
-            return await self._enqueue(command_id, verb, request)
-        except asyncio.QueueFull:
-            raise TooManyRequests(
-                f"axis {self.config.name}: {QUEUED_COMMANDS} commands wait already",
-                axis=self.config.name,
-                limit=QUEUED_COMMANDS,
-                remedy="wait for a reply before sending the next command",
-            ) from None
+            async with self._working:
+                return await self._obey(turn, request)
+        finally:
+            if not math.isinf(self._commands.deadline_s):
+                self._woken.set()  # for the steps of what has begun
 
     async def in_turn(self, mode: BufferMode, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
@@ -264,36 +268,47 @@ class AxisService:
             return True
         return False
 
-    async def _enqueue(self, command_id: str, verb: Verb, request: Request) -> CommandReply:
+    async def _enqueue(self, turn: Turn, request: Request) -> CommandReply:
+        if len(self._waiting) >= QUEUED_COMMANDS:
+            raise TooManyRequests(
+                f"axis {self.config.name}: {QUEUED_COMMANDS} commands wait already",
+                axis=self.config.name,
+                limit=QUEUED_COMMANDS,
+                remedy="wait for a reply before sending the next command",
+            )
         future: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
-        self._queue.put_nowait(_Pending(self._turn(command_id, verb), request, future))
+        self._waiting.append(_Pending(turn, request, future))
+        self._woken.set()
         return await future
 
     def _turn(self, command_id: str, verb: Verb) -> Turn:
         epoch = self._epoch
 
         def still_wanted() -> None:
+            if self._closed:
+                raise self._ending()
             if epoch != self._epoch:
                 raise self._overtaken(verb)
 
         return Turn(command_id, verb, still_wanted)
 
     async def _carry_out(self, pending: _Pending) -> None:
-        turn = pending.turn
         try:
-            if turn.verb in TRACE_VERBS:
-                reply = await self.traces.carry_out(turn.command_id, turn.verb, pending.request)
-            elif self._parameters and Parameters.takes(turn.verb):
-                reply = await self._parameters.carry_out(turn.command_id, turn.verb, pending.request)
-            else:
-                reply = await self._commands.carry_out(turn, pending.request)
+            reply = await self._obey(pending.turn, pending.request)
         except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
             if not pending.future.done():
                 pending.future.set_exception(error)
             return
-        log.info("accepted", axis=self.config.name, verb=turn.verb.value, command_id=turn.command_id)
         if not pending.future.done():
             pending.future.set_result(reply)
+
+    async def _obey(self, turn: Turn, request: Request) -> CommandReply:
+        turn.still_wanted()
+        if turn.verb in TRACE_VERBS:
+            return await self.traces.carry_out(turn.command_id, turn.verb, request)
+        if self._parameters and Parameters.takes(turn.verb):
+            return await self._parameters.carry_out(turn.command_id, turn.verb, request)
+        return await self._commands.carry_out(turn, request)
 
     def _require_reachable(self) -> None:
         guards.check_reachable(self.tracker.view())
@@ -302,16 +317,15 @@ class AxisService:
         """Read the drive's state out of turn."""
         return await self._bus.execute(self.driver.reading(frozenset()))
 
-    async def _next(self) -> _Pending | None:
-        """Return the next command, or None when a step of the procedure under way may be due."""
-        if self._commands.step_due:
-            return None
+    async def _wake_up(self) -> None:
+        """Return when a command waits or a step of the procedure under way may be due."""
+        if self._waiting or self._commands.step_due:
+            return
+        self._woken.clear()
         deadline_s = self._commands.deadline_s
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
-                return await self._queue.get()
-        except TimeoutError:
-            return None
+                await self._woken.wait()
 
     async def _step(self) -> None:
         """Let the procedure under way take its step, if one is due."""
@@ -323,10 +337,13 @@ class AxisService:
             log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
 
     def _refuse_queued(self, error: RequestRefused) -> None:
-        while not self._queue.empty():
-            pending = self._queue.get_nowait()
-            if pending and not pending.future.done():
+        while self._waiting:
+            pending = self._waiting.popleft()
+            if not pending.future.done():
                 pending.future.set_exception(error)
+
+    def _ending(self) -> ShuttingDown:
+        return ShuttingDown(f"axis {self.config.name}: the daemon is stopping", axis=self.config.name)
 
     def _overtaken(self, what: str) -> StopLatched:
         return StopLatched(

@@ -79,6 +79,7 @@ class LdcnAxis(AxisDriver):
         self.state = DriveState(spec.name, profile)
         self._bus = bus
         self._node = Node(spec.address, profile)
+        self._stops = {mode: commands.stop_motor(self._node, control) for mode, control in STOP_CONTROLS.items()}
         self._loaded: Trajectory | None = None
         self._book = RegisterBook(profile)
         self._gains = spec.gains
@@ -189,7 +190,7 @@ class LdcnAxis(AxisDriver):
     async def stop(self, mode: StopMode) -> None:
         """See `AxisDriver`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
         self._book.doubt(("velocity",))
-        await self._bus.execute(commands.stop_motor(self._node, STOP_CONTROLS[mode]), Lane.STOP)
+        await self._bus.execute(self._stops[mode], Lane.STOP)
         self.state.amp_enabled = mode is not StopMode.OFF
         self.state.loop_may_open = self.state.absolute = False
         if self.state.homing_armed:

@@ -1,0 +1,68 @@
+"""Commands of one axis take turns: at once when it is free, in order when it is not, and a stop overtakes them all."""
+
+import asyncio
+
+from ldcnd.client.events import follow_events, latest_events
+from ldcnd.daemon.axis_service import QUEUED_COMMANDS
+from ldcnd.errors import StopLatched, TooManyRequests
+from ldcnd.model.axes import LinkState
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import PowerRequest, Verb
+from tests.support.rig import EPOCH_NS, RunningRig, running_rig
+
+
+async def at_once(rig: RunningRig, count: int) -> list[CommandReply | BaseException]:
+    """Ask to close the loop so many times without waiting for answers; that takes several exchanges each time."""
+    await rig.until("x", lambda state: state.link is LinkState.UP)
+    asked = [rig.client.command("x", Verb.POWER, PowerRequest(on=True, command_id=f"c{n}")) for n in range(count)]
+    return await asyncio.gather(*asked, return_exceptions=True)
+
+
+async def test_so_many_commands_wait_and_no_more():
+    async with running_rig() as rig:
+        answers = await at_once(rig, QUEUED_COMMANDS + 3)
+
+    taken = QUEUED_COMMANDS + 1  # one does not wait
+    assert [type(answer) for answer in answers[:taken]] == [CommandReply] * taken
+    refused = answers[taken:]
+    assert [(type(error), getattr(error, "limit", None)) for error in refused] == [(TooManyRequests, 8)] * 2
+
+
+async def test_commands_that_had_to_wait_are_carried_out_in_order():
+    async with running_rig() as rig, follow_events(rig.client) as events:
+        await at_once(rig, QUEUED_COMMANDS)
+        async with asyncio.timeout(60):
+            found = [await anext(events) for _ in range(2 * QUEUED_COMMANDS)]
+
+    done = [event.command_id for event in found if event.status is CommandStatus.DONE]
+    assert done == [f"c{n}" for n in range(QUEUED_COMMANDS)]
+
+
+async def test_a_stop_overtakes_all_that_waits():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        asked = asyncio.create_task(at_once(rig, 5), name="asked")
+        await asyncio.sleep(0.001)  # the first is on the wire
+        await rig.client.stop("x")
+        _, *waited = await asked
+        state = await rig.client.state("x")
+
+    assert [type(answer) for answer in waited] == [StopLatched] * 4
+    assert state
+    assert state.stop_latched
+
+
+async def test_an_event_can_be_asked_for_at_once_and_is_published_a_moment_later():
+    async with running_rig() as rig, follow_events(rig.client) as events:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        loop = asyncio.get_running_loop()
+        asked_ns = EPOCH_NS + round(loop.time() * 1e9)
+        reply = await rig.client.command("x", Verb.POWER, PowerRequest(on=False))
+        replied_ns = EPOCH_NS + round(loop.time() * 1e9)
+        listed = await latest_events(rig.client, 2)
+        told = [await anext(events) for _ in range(2)]
+
+    assert told == listed
+    assert [event.command_id for event in listed] == [reply.command_id] * 2
+    assert asked_ns <= listed[0].t <= listed[1].t <= replied_ns
