@@ -14,7 +14,8 @@ from ldcnd.model.events import CommandEvent, EventList, EventsRequest
 
 log = get_logger("events")
 
-TOLD_AFTER_S = 0.003
+TOLD_AFTER_S = 0.005
+"""Longer than a command takes that is one exchange at 115200 baud and waits for another one."""
 UNTOLD_EVENTS = 64
 """With so many they are told at once."""
 KEPT_EVENTS = 1000

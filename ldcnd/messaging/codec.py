@@ -9,7 +9,7 @@ import math
 import sys
 from collections.abc import Mapping
 from enum import StrEnum
-from functools import cache
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -212,6 +212,7 @@ def as_json(payload: bytes, encoding: str, longest: int = MAX_RECEIVED_BYTES) ->
     return _from_msgpack(payload) if _told(payload, encoding) is Encoding.MSGPACK else payload
 
 
+@lru_cache(maxsize=64)
 def _named(encoding: str) -> Encoding | None:
     try:
         return Encoding(encoding.partition(";")[0].strip().lower())

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tests.bench.processes import (
+    PIC_SERVO,
     SUBJECT_CPU,
     Subject,
     config_text,
@@ -20,9 +21,10 @@ from tests.bench.processes import (
 )
 
 MODULES = 8
-ITEMS = ("position", "velocity", "adc")
-STATUS_ITEMS, REPLY_BYTES = 0x4F, 13
-"""What a poll for these items asks an LS-182AP for, and what comes back."""
+ITEMS = ("position", "velocity", "adc", "state")
+"""What is published of each poll: with the faults, which come with the state, five topics."""
+STATUS_ITEMS, REPLY_BYTES = 0x0F, 10
+"""What a poll for these items asks a PIC-SERVO for, and what comes back."""
 FLOOR = "C floor"
 SETTLE_S = 0.5
 ROUND_S = 1.0
@@ -71,18 +73,17 @@ def measure(programs: tuple[Path, Path], folder: Path, baud: int, rounds: int) -
     """Run floor, daemon on asyncio and daemon on uvloop side by side."""
     line_program, floor_program = programs
     with ExitStack() as stack:
-        line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=baud))
+        line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=baud, drive=PIC_SERVO))
         command = (floor_program, line.terminal, str(baud), str(MODULES), str(STATUS_ITEMS), str(REPLY_BYTES))
         running = stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10))
         subjects = [Subject(FLOOR, running, line)]
         listeners = {}
         subjects[0].stop()
         for name, uvloop in (("ldcnd, asyncio", False), ("ldcnd, uvloop", True)):
-            line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=0))
+            line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=0, drive=PIC_SERVO))
             config = folder / f"bench-{baud}-{uvloop}.toml"
-            config.write_text(
-                config_text(line.terminal, modules=MODULES, baud=baud, uvloop=uvloop, hz=2000.0, items=ITEMS)
-            )
+            rig = {"modules": MODULES, "baud": baud, "hz": 2000.0, "items": ITEMS, "drive": PIC_SERVO}
+            config.write_text(config_text(line.terminal, uvloop=uvloop, **rig))
             endpoint = free_endpoint()
             running = stack.enter_context(daemon(config, endpoint))
             listeners[name] = stack.enter_context(subscriber(endpoint))

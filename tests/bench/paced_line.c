@@ -1,14 +1,15 @@
-/* A line of LS-182AP drives behind a pseudo-terminal, paced to the byte: the far end of the bench.
+/* A line of LDCN or NMC drives behind a pseudo-terminal, paced to the byte: the far end of the bench.
  *
  * One thread that sleeps until shortly before each byte and then spins: to spin all the time would keep the kernel's own
  * work on the terminal waiting. Every instant follows from when the request was read, so being late once does not add
  * up. It answers what a host needs to bring a line up and to poll it; nothing moves.
  *
- * usage: paced_line MODULES SEED READY_BAUD BURST
+ * usage: paced_line MODULES SEED READY_BAUD BURST DEVICE VERSION
  *   READY_BAUD  0: just powered up, without addresses, at 19200; else addressed 1..MODULES at this rate
  *   BURST       1: a reply arrives in one piece at its end; 0: byte by byte
+ *   DEVICE, VERSION  what the drives say they are: 90 20 for LS-182AP, 0 4 for PIC-SERVO
  * Prints {"terminal": PATH} and, for every SIGUSR1, one line of figures since the one before.
- * Source of the protocol: LS-182AP manual, "Serial command interface", "Command description".
+ * Source of the protocol: LS-182AP manual, "Serial command interface", "Command description"; PIC-SERVO manual, 5.2.
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -33,7 +34,7 @@
 
 struct module { int address; int group; int items; };
 static struct module module_at[32];
-static int modules, addressed, divisor = 0x3F;
+static int modules, addressed, divisor = 0x3F, device, version;
 static uint64_t dice;
 
 static unsigned char packet[32];
@@ -95,12 +96,12 @@ static void status(int items)
     reply_bytes = 0;
     put(0x69, 1); /* move done, power on, no diagnostic */
     if (items & 0x01) put((int)exchange_count, 4);
-    if (items & 0x02) put((int)(exchange_count & 0x3FF), 2);
+    if (items & 0x02) put((int)(exchange_count & 0xFF), device == 90 ? 2 : 1);
     if (items & 0x04) put((int)(exchange_count & 0x7), 2);
     if (items & 0x08) put(0, 1);
     if (items & 0x10) put(0, 4);
-    if (items & 0x20) { put(90, 1); put(20, 1); }
-    if (items & 0x40) put(0, 2);
+    if (items & 0x20) { put(device, 1); put(version, 1); }
+    if (items & 0x40 && device == 90) put(0, 2);
     int sum = 0;
     for (int i = 0; i < reply_bytes; i++)
         sum += reply[i];
@@ -192,10 +193,12 @@ static void want_report(int number) { (void)number; report_wanted = 1; }
 
 int main(int count, char **argument)
 {
-    if (count != 5) return 2;
+    if (count != 7) return 2;
     modules = atoi(argument[1]);
     dice = strtoull(argument[2], NULL, 10);
     int ready_baud = atoi(argument[3]), burst = atoi(argument[4]);
+    device = atoi(argument[5]);
+    version = atoi(argument[6]);
     power_up();
     if (ready_baud) {
         divisor = (int)(CLOCK_HZ / ready_baud + 0.5) - 1;

@@ -107,10 +107,25 @@ class PacedLine:
         return LineFigures(**json.loads(told(self._running)))
 
 
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What is on a paced line: a model of the configuration and what it says it is."""
+
+    model: str
+    device: int
+    version: int
+
+
+LS_182AP = Drive("ls-182ap", 90, 20)
+PIC_SERVO = Drive("pic-servo-v4", 0, 4)
+
+
 @contextmanager
-def paced_line(program: Path, *, modules: int, ready_baud: int, burst: bool = False) -> Iterator[PacedLine]:
+def paced_line(
+    program: Path, *, modules: int, ready_baud: int, burst: bool = False, drive: Drive = LS_182AP
+) -> Iterator[PacedLine]:
     """Run a paced line; its modules have addresses and a rate already, or are as after power-up (rate 0)."""
-    command = (program, str(modules), "1", str(ready_baud), "1" if burst else "0")
+    command = (program, str(modules), "1", str(ready_baud), str(int(burst)), str(drive.device), str(drive.version))
     with process(command, cpu=LINE_CPU, nice=-20, pipe=True) as running:
         yield PacedLine(running)
 
@@ -143,16 +158,25 @@ class Subject:
         return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks.iterdir()) / 1e9
 
 
-def config_text(*terminals: str, modules: int, baud: int, uvloop: bool, hz: float, items: Sequence[str]) -> str:
+def config_text(
+    *terminals: str,
+    modules: int,
+    baud: int,
+    uvloop: bool,
+    hz: float,
+    items: Sequence[str],
+    drive: Drive = LS_182AP,
+) -> str:
     """Return the configuration of a daemon that polls its lines at a rate, or as often as they allow."""
     rates = ", ".join(f"{item} = {hz if item in items else 0}" for item in ("position", "velocity", "adc"))
+    rates += f", state = {hz if 'state' in items else 1}"
     text = f'rig = "bench"\n[daemon]\nuvloop = {str(uvloop).lower()}\n'
     for line, terminal in enumerate(terminals):
         text += f'[[bus]]\nname = "line{line}"\nport = "{terminal}"\nbaud = {baud}\nmargin_ms = 20\noverload = "skip"\n'
         for number in range(1, modules + 1):
             text += (
-                f'[[bus.axis]]\nname = "a{number + line * modules}"\naddress = {number}\nmodel = "ls-182ap"\n'
-                f"velocity = 1\nacceleration = 1\nrates = {{ {rates}, state = 1 }}\n"
+                f'[[bus.axis]]\nname = "a{number + line * modules}"\naddress = {number}\nmodel = "{drive.model}"\n'
+                f"velocity = 1\nacceleration = 1\nrates = {{ {rates} }}\n"
             )
     return text
 

@@ -24,7 +24,12 @@ PATIENCE_S = 120.0
 
 def rows(line_program: Path, folder: Path) -> list[Row]:
     """Compare with what the line itself costs: the rest of the exchange under way, then the command's own."""
-    took_s, bare_s = _asked(line_program, folder)
+    return [row for uvloop in (False, True) for row in _rows(line_program, folder, uvloop=uvloop)]
+
+
+def _rows(line_program: Path, folder: Path, *, uvloop: bool) -> list[Row]:
+    took_s, bare_s = _asked(line_program, folder, uvloop=uvloop)
+    what = f"saturated line, {'uvloop' if uvloop else 'asyncio'}"
     beyond_s = _at(took_s, 0.5) - _at(bare_s, 0.5)
     late_s = _at(took_s, 0.99) - _at(bare_s, 0.5)
     out, back = POLL_BYTES
@@ -32,18 +37,18 @@ def rows(line_program: Path, folder: Path) -> list[Row]:
     # what is left of an interval that is met at any instant: half of its mean square over its mean
     left_s = (mean_s**2 + CYCLE_S**2 / 12) / (2 * mean_s)
     return [
-        Row("saturated line: round trip of a command, median", _at(took_s, 0.5) * 1e6, "us"),
-        Row("saturated line: round trip of a bare query, median", _at(bare_s, 0.5) * 1e6, "us"),
-        Row("saturated line: round trip of a bare query, 99 %", _at(bare_s, 0.99) * 1e6, "us"),
+        Row(f"{what}: round trip of a command, median", _at(took_s, 0.5) * 1e6, "us"),
+        Row(f"{what}: round trip of a bare query, median", _at(bare_s, 0.5) * 1e6, "us"),
+        Row(f"{what}: round trip of a bare query, 99 %", _at(bare_s, 0.99) * 1e6, "us"),
         Row(
-            "saturated line: command beyond bare query / (rest of a poll + own exchange), median",
+            f"{what}: command beyond bare query / (rest of a poll + own exchange), median",
             beyond_s / (left_s + _own_s(CYCLE_S / 2)),
             "",
             1.15,
             at_most=True,
         ),
         Row(
-            "saturated line: the same, 99 %, / (longest poll + own exchange)",
+            f"{what}: the same, 99 %, / (longest poll + own exchange)",
             late_s / (longest_s + _own_s(CYCLE_S)),
             "",
             1.5,
@@ -52,10 +57,10 @@ def rows(line_program: Path, folder: Path) -> list[Row]:
     ]
 
 
-def _asked(line_program: Path, folder: Path) -> tuple[list[float], list[float]]:
+def _asked(line_program: Path, folder: Path, *, uvloop: bool) -> tuple[list[float], list[float]]:
     """Return the round trips to the daemon and to a bare queryable, in seconds, each sorted."""
     endpoint, bare_endpoint = free_endpoint(), free_endpoint()
-    config = folder / "saturated.toml"
+    config = folder / f"saturated-{uvloop}.toml"
     bare = (sys.executable, "-m", "tests.bench.bare_queryable", bare_endpoint)
     ask = (sys.executable, "-m", "tests.bench.asker", endpoint, bare_endpoint, str(COUNT))
     with (
@@ -63,7 +68,7 @@ def _asked(line_program: Path, folder: Path) -> tuple[list[float], list[float]]:
         process(bare, cpu=SUBJECT_CPU, nice=-10, pipe=True) as answering,
     ):
         items = ("position", "velocity", "adc")
-        config.write_text(config_text(line.terminal, modules=8, baud=BAUD, uvloop=True, hz=2000.0, items=items))
+        config.write_text(config_text(line.terminal, modules=8, baud=BAUD, uvloop=uvloop, hz=2000.0, items=items))
         assert heard(answering).strip() == "serving"
         with daemon(config, endpoint), process(ask, cpu=SUBJECT_CPU, nice=-10, pipe=True) as asking:
             try:
