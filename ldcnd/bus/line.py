@@ -13,7 +13,7 @@ import asyncio
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.fence import Fence
 from ldcnd.bus.line_phase import Phase
-from ldcnd.bus.pieces import CLOCK_TOLERANCE, Pieces, Whole
+from ldcnd.bus.pieces import Pieces, Whole
 from ldcnd.bus.resync import Probe, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
 from ldcnd.bus.statistics import BusStatistics
@@ -341,7 +341,7 @@ class Line:
         """Note a request that has just been written, and prepare for its reply."""
         exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
-        self._pieces.begin(now_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S, wire.byte_s)
+        self._pieces.begin(now_s if settings.paced else -NEVER_S, request_s, wire.byte_s)
         plain = exchange.reply_bytes and turn.plain and self._fence.in_step and not settings.echo
         self._missing = exchange.reply_bytes if plain else NOT_PLAIN
         self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)

@@ -39,10 +39,16 @@ class Pieces:
         self.early = False
         self._over_s = self._byte_s = 0.0
 
-    def begin(self, request_over_s: float, byte_s: float) -> None:
-        """Forget what came; wait for the reply to a request that is over at that instant."""
+    def begin(self, sent_at_s: float, request_s: float, byte_s: float) -> None:
+        """Forget what came; wait for the reply to a request.
+
+        Args:
+            sent_at_s: when that was handed over; minus infinity on a line where nothing can come too early.
+            request_s: how long it takes on the wire.
+            byte_s: how long each byte of the reply takes.
+        """
         self.held, self.early = b"", False
-        self._over_s, self._byte_s = request_over_s, CLOCK_TOLERANCE * byte_s
+        self._over_s, self._byte_s = sent_at_s + CLOCK_TOLERANCE * request_s, CLOCK_TOLERANCE * byte_s
 
     def earliest_s(self, count: int) -> float:
         """Return the earliest instant at which so many bytes can have come behind the request."""

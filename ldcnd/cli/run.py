@@ -12,10 +12,11 @@ from ldcnd.config import RigConfig, load_config, single_line
 from ldcnd.daemon.assembly import open_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.planning import require_plan
-from ldcnd.daemon.process import held_awake, last_words, loop_factory, senders_wait, settle_heap
+from ldcnd.daemon.process import held_awake, last_words, loop_factory, settle_heap
 from ldcnd.daemon.service import Service
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import configure_logging, get_logger
+from ldcnd.messaging.zenoh_threads import senders_wait
 
 log = get_logger("run")
 

@@ -1,7 +1,6 @@
-"""The daemon's process: its event loop, how awake its processor stays, which threads wait, what is not collected."""
+"""The daemon's process: its event loop, how awake its processor stays, what is not collected."""
 
 import asyncio
-import contextlib
 import gc
 import os
 import signal
@@ -17,10 +16,7 @@ log = get_logger("process")
 
 CPU_LATENCY = Path("/dev/cpu_dma_latency")
 """Linux: whoever holds it open with a number of microseconds in it bounds how long the processor takes to wake up."""
-THREADS = Path("/proc/self/task")
-SENDERS = "tx-"
-"""What the names of Zenoh's sending threads begin with; the first link makes them."""
-LOOK_S = 1.0
+
 LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 
 
@@ -48,31 +44,6 @@ def held_awake(*, wanted: bool, device: Path = CPU_LATENCY) -> Iterator[None]:
     finally:
         if descriptor is not None:
             os.close(descriptor)
-
-
-async def senders_wait() -> None:
-    """Have Zenoh's sending threads wait until the bus loop has nothing to do; return once that is arranged.
-
-    Each sample that is published wakes one, and as an equal it takes the processor at once, sends that sample alone and
-    sleeps again. As a batch thread it has its share of the processor, but interrupts nobody: what belongs to one poll
-    leaves together. Under a real-time policy threads do not interrupt each other anyway.
-    """
-    while True:
-        if _let_senders_wait():
-            return
-        await asyncio.sleep(LOOK_S)
-
-
-def _let_senders_wait() -> bool:
-    """Tell whether there were any."""
-    found = False
-    for thread in THREADS.iterdir():
-        with contextlib.suppress(OSError):  # it has ended, or may not be changed
-            if (thread / "comm").read_text().startswith(SENDERS):
-                found = True
-                if os.sched_getscheduler(int(thread.name)) == os.SCHED_OTHER:
-                    os.sched_setscheduler(int(thread.name), os.SCHED_BATCH, os.sched_param(0))
-    return found
 
 
 @contextmanager

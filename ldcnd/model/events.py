@@ -41,7 +41,7 @@ class CommandEvent(Frozen):
     """A command got further: published on `tele/<axis>/event`."""
 
     t: int
-    """When, UTC in ns since 1970."""
+    """When, UTC in ns since 1970; published up to 5 ms later."""
     seq: int = Field(ge=0)
     """Grows by one with every event of the axis."""
     run: str

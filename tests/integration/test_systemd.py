@@ -174,7 +174,7 @@ def test_journal_entries_can_be_found_by_their_fields(service: Machine):
     found = service.must("journalctl", "--no-pager", "--output=json", "EXTRA_AXIS=x", "EXTRA_VERB=power")
     (packages / "logging_journald.py").unlink()
     entries = [json.loads(line) for line in found.splitlines()]
-    entry = next(entry for entry in entries if entry["MESSAGE"].startswith("accepted axis=x verb=power"))
+    entry = next(entry for entry in entries if entry["MESSAGE"].startswith("command axis=x command_id="))
     assert entry["EXTRA_COMMAND_ID"]
     assert (entry["PRIORITY"], entry["SYSLOG_IDENTIFIER"], entry["_SYSTEMD_UNIT"]) == ("6", "ldcnd", UNIT)
 

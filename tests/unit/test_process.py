@@ -2,16 +2,11 @@
 
 import asyncio
 import gc
-import os
 import sys
-from pathlib import Path
 
 import pytest
 
-from ldcnd.daemon.process import held_awake, loop_factory, senders_wait, settle_heap
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from tests.support.session_pair import free_endpoint
+from ldcnd.daemon.process import held_awake, loop_factory, settle_heap
 
 
 @pytest.mark.real_time
@@ -71,22 +66,3 @@ def test_what_start_up_left_behind_is_not_collected_again():
     gc.unfreeze()
 
     assert frozen > 1000
-
-
-@pytest.mark.real_time
-async def test_sending_threads_interrupt_nobody_once_there_are_some():
-    endpoint = free_endpoint()
-    alone = open_zenoh_session(ZenohSettings(mode="peer", listen=(endpoint,), connect=()))
-    client = open_zenoh_session(ZenohSettings(mode="client", listen=(), connect=(endpoint,)))
-    async with asyncio.timeout(30), alone, client:
-        await senders_wait()
-
-    policies = {(thread / "comm").read_text().strip(): os.sched_getscheduler(int(thread.name)) for thread in threads()}
-    senders = [policy for name, policy in policies.items() if name.startswith("tx-")]
-    assert senders
-    assert set(senders) == {os.SCHED_BATCH}
-    assert {policy for name, policy in policies.items() if not name.startswith("tx-")} == {os.SCHED_OTHER}
-
-
-def threads() -> list[Path]:
-    return list(Path("/proc/self/task").iterdir())
