@@ -24,7 +24,7 @@ from ldcnd.sim.line import open_simulated_line
 
 SCHEDULES_PER_TEST = 250
 BATCHES = 8
-FAULTS_FROM_S = 2.5
+FAULTS_FROM_S = 1.5
 ATTEMPTS = 6
 CONFIG = {
     "rig": "sim",
