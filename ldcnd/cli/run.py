@@ -17,6 +17,7 @@ from ldcnd.daemon.service import Service
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.messaging.zenoh_threads import senders_wait
+from ldcnd.model.frozen import build_models
 
 log = get_logger("run")
 
@@ -70,6 +71,7 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
         loop = asyncio.get_running_loop()
         for number, handler in handlers.items():
             loop.add_signal_handler(number, handler)
+        build_models()
         settle_heap()
         try:
             with last_words(partial(write_captures, daemon)):
