@@ -258,15 +258,17 @@ class Bus:
 
     def take(self, now_s: float) -> Turn | None:
         """See `Users`."""
-        turn = self._queue.take(now_s)
-        if isinstance(turn, Poller):
-            wanted_at_s = turn.due_at_s
-            return PollTurn(turn, turn.next_exchange(now_s), wanted_at_s, self._order)
-        if turn is not None:
-            turn.attempts_left -= 1
-            if isinstance(turn, StopProbe):
-                self.statistics.stop_wait.add(now_s - turn.wanted_at_s)
-        return turn
+        job = self._queue.take_job(now_s)
+        if job is None:
+            poller = self._queue.take_poll(now_s)
+            if poller is None:
+                return None
+            wanted_at_s = poller.due_at_s
+            return PollTurn(poller, poller.next_exchange(now_s), wanted_at_s, self._order)
+        job.attempts_left -= 1
+        if isinstance(job, StopProbe):
+            self.statistics.stop_wait.add(now_s - job.wanted_at_s)
+        return job
 
     def sent(self, turn: Turn) -> None:
         """See `Users`; a poller that was asked has its next turn."""

@@ -19,7 +19,7 @@ class Lane(IntEnum):
     BACKGROUND = 3
 
 
-STOP, COMMAND, _, BACKGROUND = Lane  # `take` runs between two packets, and Lane.STOP is looked up slowly
+STOP, COMMAND, _, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
 
 
 class Queueable(Protocol):
@@ -103,8 +103,11 @@ class ExchangeQueue(Generic[JobT]):
         """Return when the next poller is due; infinity when there is none."""
         return self._polls.next_due_s()
 
-    def take(self, now_s: float) -> JobT | Poller[Any] | None:
-        """Remove and return what goes on the wire now, or None when nothing is due."""
+    def take_job(self, now_s: float) -> JobT | None:
+        """Remove and return the job that goes on the wire now, or None when it is a poll's turn or nothing is due."""
+        if self._probe is None and not any(self._jobs.values()):  # as nearly always, and this is between two packets
+            self._commands_in_a_row = 0
+            return None
         if stop := self._take_job(STOP):
             return stop
         probe, self._probe = self._probe, None
@@ -117,12 +120,13 @@ class ExchangeQueue(Generic[JobT]):
         self._commands_in_a_row = 0
         if not poll_due or self._polls_in_a_row >= POLLS_PER_BACKGROUND:
             self._polls_in_a_row = 0
-            if background := self._take_job(BACKGROUND):
-                return background
-        if not poll_due:
-            return None
+            return self._take_job(BACKGROUND)
         self._polls_in_a_row += 1
-        return self._polls.take(now_s)
+        return None
+
+    def take_poll(self, now_s: float) -> Poller[Any] | None:
+        """Remove and return the poller whose turn it is when no job goes, or None when none is due."""
+        return self._polls.take(now_s) if self._polls.is_due(now_s) else None
 
     def look_ahead(self, at_s: float) -> Poller[Any] | None:
         """Choose the next poll ahead, see `PollQueue`; jobs may still go before it."""

@@ -100,6 +100,8 @@ class PollQueue:
     def _is_overtaken(self, ahead: Poller[Any], now_s: float) -> bool:
         if self._later and self._later[0][0] <= now_s:
             self._rank_due(now_s)
+        if (only := self._only) is not None:
+            return only.deadline_s < ahead.deadline_at_s
         if self._behind:
             return False
         return any(rank.deadline_s < ahead.deadline_at_s for rank in self._ranks)

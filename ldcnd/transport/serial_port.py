@@ -38,7 +38,8 @@ PSEUDO_TERMINALS = range(136, 144)
 USB_TERMINALS = frozenset({166, 188})
 """Those of USB adapters (the same list)."""
 
-READ_BYTES = 4096
+READ_BYTES = 256
+"""More than most replies have: to make room for what never comes takes longer than to read twice now and then."""
 CONTROL_CHARACTERS = 6
 """Where `termios.tcgetattr` keeps VMIN and VTIME."""
 

@@ -38,7 +38,10 @@ int main(int count, char **argument)
     setitimer(ITIMER_REAL, &alarm, NULL);
     for (int address = 1;; address = address % modules + 1) {
         unsigned char request[5] = {0xAA, address, 0x13, items, (address + 0x13 + items) & 0xFF}, reply[32];
-        if (write(line, request, sizeof request) != sizeof request) return 1;
+        ssize_t put;
+        do put = write(line, request, sizeof request);
+        while (put < 0 && errno == EINTR); /* an alarm came first, nothing was written */
+        if (put != sizeof request) return 1;
         int have = 0;
         for (int alarms = 0; have < bytes && alarms < 2;) {
             ssize_t got = read(line, reply + have, bytes - have);

@@ -6,6 +6,7 @@ import pytest
 from ldcnd.bus.exchange_queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
 from ldcnd.bus.poller import Poller
 from ldcnd.errors import BusBusy
+from tests.support.queue_turns import take
 from tests.support.toy_family import ToyPoller
 
 
@@ -34,7 +35,7 @@ def order(queue: ExchangeQueue[Ticket], turns: int, now_s: float = 0.0) -> list[
     """Take so many turns; a poller is due again at once."""
     names = []
     for _ in range(turns):
-        taken = queue.take(now_s)
+        taken = take(queue, now_s)
         if isinstance(taken, Poller):
             names.append(f"poll{taken.node}")
             queue.schedule(taken, now_s)
@@ -112,7 +113,7 @@ def test_polls_go_in_the_order_of_their_due_times():
     for node, at_s in ((1, 3.0), (2, 1.0), (3, 2.0)):
         queue.schedule(ToyPoller(node, 1.0), at_s)
 
-    taken = [queue.take(10.0) for _ in range(3)]
+    taken = [take(queue, 10.0) for _ in range(3)]
 
     assert [poller.node for poller in taken if isinstance(poller, Poller)] == [2, 3, 1]
 
@@ -132,9 +133,9 @@ def test_scheduling_again_replaces_the_turn():
     queue.schedule(poller, 7.0)
 
     assert queue.next_due_s() == 7.0
-    assert queue.take(6.9) is None
-    assert queue.take(7.0) is poller
-    assert queue.take(8.0) is None
+    assert take(queue, 6.9) is None
+    assert take(queue, 7.0) is poller
+    assert take(queue, 8.0) is None
 
 
 def test_an_unscheduled_poller_is_forgotten():
@@ -145,7 +146,7 @@ def test_an_unscheduled_poller_is_forgotten():
     queue.unschedule(poller)
 
     assert queue.next_due_s() == float("inf")
-    assert queue.take(1.0) is None
+    assert take(queue, 1.0) is None
 
 
 def test_abandoned_jobs_are_passed_over():
@@ -193,7 +194,7 @@ def test_draining_returns_every_job_and_forgets_the_pollers():
     drained = queue.drain()
 
     assert [ticket.name for ticket in drained] == ["stop0", "command0", "command1", "background0"]
-    assert queue.take(10.0) is None
+    assert take(queue, 10.0) is None
     assert queue.next_due_s() == float("inf")
 
 
@@ -206,7 +207,7 @@ def chosen(now_s: float, deadlines_s: list[float], turns: int) -> list[int]:
         queue.schedule(poller, 0.0)
     nodes = []
     for _ in range(turns):
-        taken = queue.take(now_s)
+        taken = take(queue, now_s)
         assert isinstance(taken, Poller)
         nodes.append(taken.node)
         queue.schedule(taken, now_s)
@@ -241,7 +242,7 @@ def test_a_poll_that_was_unscheduled_is_not_chosen():
         queue.schedule(poller, 0.0)
     queue.unschedule(gone)
 
-    assert [queue.take(1.0), queue.take(1.0)] == [kept, None]
+    assert [take(queue, 1.0), take(queue, 1.0)] == [kept, None]
 
 
 def test_a_probe_of_the_stop_lane_goes_before_everything_but_stops():

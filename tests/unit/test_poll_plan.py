@@ -11,6 +11,7 @@ from ldcnd.bus.poll_plan import Poll, Urgent, largest, plan_line
 from ldcnd.bus.poll_rank import Choose
 from ldcnd.bus.poller import Poller, Priority
 from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
+from tests.support.queue_turns import take
 
 MS = 0.001
 URGENT = Urgent(command_s=2 * MS, stop_s=1 * MS, recovery_s=3 * MS, margin_s=5 * MS)
@@ -60,7 +61,7 @@ def observed_s(
         queue.schedule(each, each.due_at_s)
     now_s = 0.0
     while now_s < until_s:
-        taken = queue.take(now_s)
+        taken = take(queue, now_s)
         if taken is None:
             now_s = queue.next_due_s()
             continue
@@ -205,7 +206,7 @@ def test_the_earliest_deadline_goes_first_among_the_polls_that_are_due():
     for each in (slow, fast):
         queue.schedule(each, each.due_at_s)
 
-    assert [queue.take(0.02), queue.take(0.02), queue.take(0.02)] == [fast, slow, None]
+    assert [take(queue, 0.02), take(queue, 0.02), take(queue, 0.02)] == [fast, slow, None]
 
 
 def test_a_plan_counts_the_room_that_is_left_for_commands():
@@ -257,4 +258,4 @@ def test_deadlines_break_ties_by_due_time():
     queue.schedule(late, 0.2)
     queue.schedule(early, 0.1)
 
-    assert [queue.take(1.0), queue.take(1.0)] == [early, late]
+    assert [take(queue, 1.0), take(queue, 1.0)] == [early, late]
