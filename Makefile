@@ -43,7 +43,7 @@ soak: .venv/ready
 	$(PY) -m pytest -m soak -n 2 --timeout 3600
 
 bench: .venv/ready
-	$(PY) -m tests.bench
+	$(PY) -m tests.bench --json docs/explanation/timing.json
 
 # the pictures of the documentation; needs chromium
 screenshots: .venv/ready

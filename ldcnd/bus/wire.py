@@ -11,8 +11,9 @@ from ldcnd.errors import TransportLost
 from ldcnd.exchange import Timing
 from ldcnd.transport.transport import Receiver, Transport
 
-LONG_WORK_S = 120e-6
-"""What takes longer would hold up the request before it where the kernel has no other processor to carry it on."""
+LONG_WORK_S = 150e-6
+"""What takes longer would hold up the request before it where the kernel has no other processor to carry it on. Polls
+that nobody hears of take a third of that, those of a whole daemon at least twice as long."""
 WORK_WEIGHT = 0.1
 """Of the latest work behind a request in what is expected of the next."""
 
@@ -76,8 +77,9 @@ class Wire:
         return self._work_s > LONG_WORK_S
 
     def worked(self, since_s: float) -> None:
-        """Learn that all is done that was to be done behind a request."""
-        self._work_s += WORK_WEIGHT * (self._loop.time() - since_s - self._work_s)
+        """Learn that all is done that was to be done behind a request; being held up once says little about it."""
+        took_s = min(self._loop.time() - since_s, 2 * LONG_WORK_S)
+        self._work_s += WORK_WEIGHT * (took_s - self._work_s)
 
     def collect(self) -> None:
         """See `Transport`."""

@@ -23,6 +23,8 @@ from tests.bench.report import Row
 MODULES = 8
 BAUD = 115_200
 COUNT_S = 2
+TRIES = 3
+"""Being traced holds a program up, and one that is held up does more calls: the least of a few counts is its own."""
 START_S = 6.0
 REQUEST = '"\\252"'
 """How strace shows the header of a packet."""
@@ -70,7 +72,11 @@ def _daemon(line: PacedLine, folder: Path) -> Iterator[subprocess.Popen]:
 
 
 def _row(name: str, strace: str, running: subprocess.Popen, folder: Path, target: float | None = None) -> Row:
-    trace = folder / "calls.txt"
+    calls = min(_calls_of_a_poll(strace, running, folder / "calls.txt") for _ in range(TRIES))
+    return Row(name, calls, "", target, at_most=True)
+
+
+def _calls_of_a_poll(strace: str, running: subprocess.Popen, trace: Path) -> float:
     tracing = subprocess.Popen(  # noqa: S603
         (strace, "-s", "1", "-o", trace, "-p", str(running.pid)), stderr=subprocess.DEVNULL
     )
@@ -82,4 +88,4 @@ def _row(name: str, strace: str, running: subprocess.Popen, folder: Path, target
     waits = [call for call in calls if call.startswith("epoll_wait(")]
     timers = sum(1 for call in waits if call.rstrip().endswith("= 0"))
     others = sum(1 for call in calls if call.startswith(OF_THE_LINE))
-    return Row(name, (polls + len(waits) - timers + others) / polls, "", target, at_most=True)
+    return (polls + len(waits) - timers + others) / polls

@@ -399,8 +399,7 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     bench = Bench()
     story: list[str] = []
     bench.wire.push = lambda: story.append("push")  # type: ignore[method-assign]
-    loop = asyncio.get_running_loop()
-    bench.line.wire.worked(loop.time() - 1.0)  # a second for the one before
+    much_work(bench)  # for those before
 
     bench.add(1)
     second = bench.add(2)
@@ -411,10 +410,25 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     assert story == ["push", "push", "completed 2"]
 
 
+def much_work(bench: Bench) -> None:
+    """Let a line have had much to do behind each of its requests."""
+    for _ in range(20):
+        bench.line.wire.worked(asyncio.get_running_loop().time() - 1.0)
+
+
+async def test_a_line_that_was_held_up_once_is_not_laborious():
+    bench = Bench()
+    bench.line.wire.worked(asyncio.get_running_loop().time() - 1.0)
+    assert not bench.line.wire.is_laborious
+
+    much_work(bench)
+    assert bench.line.wire.is_laborious
+
+
 async def test_a_laborious_line_is_woken_for_the_byte_before_the_last_one():
     bench = Bench()
     bench.wire.bytewise = bench.wire.holds_back = True
-    bench.line.wire.worked(asyncio.get_running_loop().time() - 1.0)
+    much_work(bench)
 
     bench.add(1)
     bench.add(2)
