@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 
 import click
 
 from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import COMMANDS, cli
+from ldcnd.version import version
 
 EXIT_STATUS = (
     ("0", "Done."),
@@ -144,7 +144,7 @@ def _table(rows: tuple[tuple[str, str], ...]) -> str:
 
 
 def _head(page: str, summary: str) -> str:
-    title = f'.TH {page.upper()} 1 "" "ldcnd {version("ldcnd")}" "ldcnd"\n'
+    title = f'.TH {page.upper()} 1 "" "ldcnd {version()}" "ldcnd"\n'
     return f"{title}.SH NAME\n{_roff(page)} \\- {_roff(summary.rstrip('.'))}\n"
 
 

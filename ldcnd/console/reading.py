@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitors
 from ldcnd.errors import DriveFault, LdcndError, WrongState
 from ldcnd.fault_pages import page_text
+from ldcnd.version import version
 
 STATIC = Path(str(files("ldcnd.console") / "static"))
 SEND_TIME_S = 30.0
@@ -44,7 +44,7 @@ def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors) -> list[BaseRoute
 
     async def all_rigs(request: Request) -> Response:
         reply = RigsReply(
-            version=version("ldcnd"),
+            version=version(),
             client=request.state.visitor.client,
             endpoints=rigs.endpoints,
             rigs=await rigs.described(),

@@ -5,13 +5,13 @@ Source: AsyncAPI specification 3.0.0; payloads are the JSON Schemas of the model
 """
 
 import json
-from importlib.metadata import version
 
 from ldcnd.daemon.contract import Channel, Kind, channels
 from ldcnd.messaging.codec import Encoding
 from ldcnd.model.errors import ErrorReply
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.schemas import schema_name
+from ldcnd.version import version
 
 ASYNCAPI = "3.0.0"
 PUBLISHED = frozenset({Kind.TELEMETRY, Kind.NEWS, Kind.HEALTH})
@@ -39,7 +39,7 @@ def asyncapi_document() -> dict[str, object]:
         "asyncapi": ASYNCAPI,
         "info": {
             "title": "ldcnd",
-            "version": version("ldcnd"),
+            "version": version(),
             "description": "Servo drives on RS-485 lines, over Zenoh. Seen from the daemon: it sends telemetry and"
             " receives queries. Payloads are MessagePack or JSON of the same structure.",
             "license": {"name": "Apache-2.0"},

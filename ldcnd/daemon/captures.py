@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
 
 from ldcnd.bus.capture import Capture, CaptureHeader, capture_lines
 from ldcnd.bus.wire_log import WireEntry, WireRecord
@@ -11,6 +10,7 @@ from ldcnd.daemon.bus_service import BusService
 from ldcnd.daemon.clock import Clock
 from ldcnd.drivers.transcript import describer
 from ldcnd.errors import ConfigError
+from ldcnd.version import version
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def snapshot_of(line: BusService, clock: Clock) -> Snapshot:
 def capture_of(snapshot: Snapshot, config: RigConfig, run: Run, cause: str) -> Capture:
     """Return a snapshot as a capture; needs no event loop, and takes its time."""
     header = CaptureHeader(
-        version=version("ldcnd"),
+        version=version(),
         bus=snapshot.bus,
         family=snapshot.family,
         port=snapshot.port,

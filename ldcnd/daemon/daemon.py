@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 from functools import partial
-from importlib.metadata import version
 
 from ldcnd.bus.capture import Capture
 from ldcnd.config import RigConfig
@@ -29,6 +28,7 @@ from ldcnd.model.axes import LinkState
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.version import version
 
 log = get_logger("daemon")
 
@@ -210,7 +210,7 @@ class Daemon:
     def _info(self) -> DaemonInfo:
         return DaemonInfo(
             rig=self.rig.name,
-            version=version("ldcnd"),
+            version=version(),
             api=API,
             instance=self._run.instance,
             started=self._run.started_ns,
