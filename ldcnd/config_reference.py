@@ -10,6 +10,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from ldcnd.config import RigConfig
+from ldcnd.model.docstrings import attribute_docstrings
 
 PREFACE = """# Configuration
 
@@ -28,7 +29,8 @@ def _sections(model: type[BaseModel], path: str, seen: set[type[BaseModel]]) -> 
     """Describe a table and the tables within it, each model once."""
     title = f"`[{path}]`" if path else "Top level"
     what = (model.__doc__ or "").strip().splitlines()[0]
-    rows = "".join(_row(name, field) for name, field in model.model_fields.items())
+    said = attribute_docstrings(model)
+    rows = "".join(_row(name, field, said.get(name, "")) for name, field in model.model_fields.items())
     yield f"\n## {title}\n\n{what}\n\n| key | type | default | meaning |\n|---|---|---|---|\n{rows}"
     for name, field in model.model_fields.items():
         inner, many = _table(field.annotation)
@@ -38,9 +40,9 @@ def _sections(model: type[BaseModel], path: str, seen: set[type[BaseModel]]) -> 
             yield from _sections(inner, f"[{below}]" if many else below, seen)
 
 
-def _row(name: str, field: FieldInfo) -> str:
+def _row(name: str, field: FieldInfo, said: str) -> str:
     default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
-    meaning = " ".join((field.description or "").split())
+    meaning = " ".join(said.split())
     bounds = ", ".join(text for constraint in field.metadata if (text := _bound(constraint)))
     return f"| `{name}` | {_type(field.annotation)}{f', {bounds}' if bounds else ''} | {default} | {meaning} |\n"
 

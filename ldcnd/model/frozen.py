@@ -1,6 +1,10 @@
 """The base of everything that crosses the network or comes from a file: frozen, strict about names, finite."""
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from ldcnd.model.docstrings import attribute_docstrings
 
 
 class Frozen(BaseModel):
@@ -9,9 +13,17 @@ class Frozen(BaseModel):
     What validates and encodes a model is built when it is needed first: a program seldom needs more than a few of them.
     """
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True, defer_build=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the model's JSON Schema, in which its fields are described by the strings below them."""
+        schema = handler.resolve_ref_schema(handler(core_schema))
+        said = attribute_docstrings(cls)
+        for name, described in schema.get("properties", {}).items():
+            if name in said:
+                described["description"] = said[name]
+        return schema
 
 
 def build_models(model: type[Frozen] = Frozen) -> None:
