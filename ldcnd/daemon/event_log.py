@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.ledger import Entry
 from ldcnd.daemon.publishing import Publisher
-from ldcnd.errors import LdcndError
+from ldcnd.errors import LdcndError, SessionError
 from ldcnd.log import get_logger
 from ldcnd.model.events import CommandEvent, EventList, EventsRequest
 
@@ -49,7 +49,7 @@ class EventLog:
         self._loop = asyncio.get_running_loop()
         self._kept: deque[CommandEvent] = deque(maxlen=KEPT_EVENTS)
         self._sequence: dict[str, int] = {}
-        self._news: list[_News] = []
+        self._news: deque[_News] = deque()
 
     def changed(self, entry: Entry, error: LdcndError | None) -> None:
         """Take a change of the ledger."""
@@ -64,9 +64,8 @@ class EventLog:
 
     def tell(self) -> None:
         """Publish and log all that has happened so far."""
-        news, self._news = self._news, []
-        for each in news:
-            self._tell(each)
+        while self._news:
+            self._tell(self._news.popleft())
 
     def _tell(self, news: _News) -> None:
         entry, error = news.entry, news.error
@@ -85,7 +84,10 @@ class EventLog:
             code=error.code.value if error else None,
         )
         self._kept.append(event)
-        self._publisher.publish_event(event)
+        try:
+            self._publisher.publish_event(event)
+        except SessionError as error:  # who asks for events still finds it
+            log.warning("event not published", axis=entry.axis, command_id=entry.command_id, reason=error.message)
         log.info(
             "command",
             axis=entry.axis,

@@ -7,7 +7,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.event_log import TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
 from ldcnd.daemon.ledger import Entry
 from ldcnd.daemon.publishing import Publisher
-from ldcnd.errors import BusDown
+from ldcnd.errors import BusDown, SessionError
 from ldcnd.model.events import CommandStatus, EventsRequest
 from ldcnd.model.requests import PowerRequest, Verb
 
@@ -66,3 +66,15 @@ async def test_at_the_end_all_is_told():
     told.log.tell()
 
     assert len(told.published()) == 1
+
+
+async def test_what_the_network_does_not_take_keeps_nothing_else_back():
+    told = Told()
+    told.publisher.publish_event.side_effect = [SessionError("closed"), None]
+    told.happens()
+    told.happens(CommandStatus.DONE)
+
+    await asyncio.sleep(2 * TOLD_AFTER_S)
+
+    assert len(told.published()) == 2
+    assert [event.number for event in told.log.page(EventsRequest()).events] == [0, 1]
