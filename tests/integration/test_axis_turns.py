@@ -3,13 +3,20 @@
 import asyncio
 
 from ldcnd.client.events import follow_events, latest_events
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config import load_config
+from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.axis_service import QUEUED_COMMANDS
 from ldcnd.errors import StopLatched, TooManyRequests
+from ldcnd.messaging.codec import decode_received
+from ldcnd.messaging.keys import EVENT, Keys
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.messaging.session import Sample
 from ldcnd.model.axes import LinkState
-from ldcnd.model.events import CommandStatus
+from ldcnd.model.events import CommandEvent, CommandStatus
 from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import PowerRequest, Verb
-from tests.support.rig import EPOCH_NS, RunningRig, running_rig
+from ldcnd.model.requests import HaltRequest, PowerRequest, Verb
+from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 
 async def at_once(rig: RunningRig, count: int) -> list[CommandReply | BaseException]:
@@ -66,3 +73,25 @@ async def test_an_event_can_be_asked_for_at_once_and_is_published_a_moment_later
     assert told == listed
     assert [event.command_id for event in listed] == [reply.command_id] * 2
     assert asked_ns <= listed[0].t <= listed[1].t <= replied_ns
+
+
+async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
+    told: list[Sample] = []
+    loop = asyncio.get_running_loop()
+    broker = MemoryBroker()
+    async with broker.session() as session, broker.session() as client_session:
+        daemon = build_daemon(load_config(SIMULATED), session, lambda: EPOCH_NS + round(loop.time() * 1e9), "test")
+        running = loop.create_task(daemon.run(), name="daemon")
+        await daemon.wait_up()
+        await client_session.subscribe(Keys("sim").telemetry_pattern("*", EVENT), told.append)
+        client = RigClient(client_session, "sim")
+        while not (state := await client.state("x")) or state.link is not LinkState.UP:
+            await asyncio.sleep(0.05)
+        await client.command("x", Verb.HALT, HaltRequest())
+        assert told == []
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        await asyncio.sleep(0)
+
+    statuses = [decode_received(CommandEvent, sample.payload, sample.encoding).status for sample in told]
+    assert statuses == [CommandStatus.ACCEPTED, CommandStatus.DONE]
