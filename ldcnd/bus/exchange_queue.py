@@ -19,7 +19,7 @@ class Lane(IntEnum):
     BACKGROUND = 3
 
 
-STOP, COMMAND, _, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
+STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
 
 
 class Queueable(Protocol):

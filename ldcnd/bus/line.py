@@ -10,7 +10,7 @@ follow a request; after any loss the line is fenced and probed (`Fence`) before 
 
 import asyncio
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.exchange_queue import POLL
 from ldcnd.bus.fence import Fence
 from ldcnd.bus.line_phase import Phase
 from ldcnd.bus.pieces import Pieces, Whole
@@ -194,7 +194,7 @@ class Line:
         else:
             self._attend(following, AT_ONCE[following.lane], failure)
         turn.completed(reply, timing)
-        if self._turn and self._missing and turn.lane is Lane.POLL:  # who waits for an answer has it first
+        if self._turn and self._missing and turn.lane is POLL:  # who waits for an answer has it first
             self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * self.wire.byte_s)
         self.wire.worked(began_s)
 

@@ -39,7 +39,7 @@ USB_TERMINALS = frozenset({166, 188})
 """Those of USB adapters (the same list)."""
 
 READ_BYTES = 256
-"""More than most replies have: to make room for what never comes takes longer than to read twice now and then."""
+"""More than most replies have; to make room for 4096 takes a tenth longer, and replies are read one at a time."""
 CONTROL_CHARACTERS = 6
 """Where `termios.tcgetattr` keeps VMIN and VTIME."""
 
