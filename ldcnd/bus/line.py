@@ -179,10 +179,10 @@ class Line:
         following = self._users.take(now_s)
         if following and not following.at_baud:
             failure = self._put(following, self._loop.time())
-            self.wire.push()
+            if turn.laborious:
+                self.wire.push()
         else:
             self._turn, self.phase = None, Phase.IDLE
-        began_s = self._loop.time()
         self._statistics.bytes_in += len(arrived)
         self.wire.note(WireEvent.RECEIVED, now_s, arrived)
         timing = self.wire.replied(turn, reply, sent_at_s, now_s)
@@ -192,11 +192,10 @@ class Line:
         elif following.at_baud:
             self._send(following, now_s, AT_ONCE[following.lane])
         else:
-            self._attend(following, AT_ONCE[following.lane], failure)
+            self._attend(following, AT_ONCE[following.lane], failure, early=int(turn.laborious))
         turn.completed(reply, timing)
         if self._turn and self._missing and turn.lane is POLL:  # who waits for an answer has it first
             self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * self.wire.byte_s)
-        self.wire.worked(began_s)
 
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
@@ -316,12 +315,11 @@ class Line:
         if not (self._fence.in_step or self._users.stop_waits()):
             self._raise_fence(now_s)  # only a stop may use a line that is not proven to be in step
             return
-        turn = self._users.take(now_s)
-        if turn is None:
+        if turn := self._users.take(now_s):
+            self._send(turn, now_s, remarks[turn.lane])
+        else:
             self.wire.expect(ANY)
             self._watchdog.set(self._users.next_due_s())
-        else:
-            self._send(turn, now_s, remarks[turn.lane])
 
     def _send(self, turn: Turn, now_s: float, remark: str) -> None:
         if turn.at_baud:
@@ -337,16 +335,18 @@ class Line:
         self.phase = Phase.REPLY if turn.exchange.reply_bytes else Phase.QUIET
         return self.wire.write(turn.exchange.request)
 
-    def _attend(self, turn: Turn, remark: str, failure: str) -> None:
-        """Note a request that has just been written, and prepare for its reply."""
+    def _attend(self, turn: Turn, remark: str, failure: str, *, early: int = 0) -> None:
+        """Note a request that has just been written, and prepare for its reply.
+
+        With much to do behind it the line is woken `early` by so many bytes, to answer the last one with warm caches.
+        """
         exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
         self._pieces.begin(now_s if settings.paced else -NEVER_S, request_s, wire.byte_s)
         plain = exchange.reply_bytes and turn.plain and self._fence.in_step and not settings.echo
         self._missing = exchange.reply_bytes if plain else NOT_PLAIN
         self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)
-        # woken for the byte before the last, a program that had much to do is quicker to answer the last one
-        wire.expect(max(ANY, self._missing - int(wire.is_laborious)))
+        wire.expect(max(ANY, self._missing - early))
         answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else 0.0
         self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
         self._statistics.exchanges += 1

@@ -34,11 +34,15 @@ class PhaseTracker:
     """The cycle of one node: a straight line through the instants at which its replies began.
 
     Weights are those of a least-squares fit through all replies so far, until forgetting sets in.
+
+    Attributes:
+        locked: predictions are worth something.
     """
 
-    __slots__ = ("_count", "_cycle_s", "_period_s", "_scatter_s", "_tick_s")
+    __slots__ = ("_count", "_cycle_s", "_period_s", "_scatter_s", "_tick_s", "locked")
 
     def __init__(self, cycle_s: float) -> None:
+        self.locked = False
         self._cycle_s = cycle_s
         self._period_s = cycle_s
         self._tick_s = 0.0
@@ -50,16 +54,11 @@ class PhaseTracker:
         """The length of the cycle on the host's clock."""
         return self._period_s
 
-    @property
-    def locked(self) -> bool:
-        """Whether predictions are worth anything."""
-        return self._count >= ENOUGH and self._scatter_s < MOST_SCATTER * self._cycle_s
-
     def observe(self, tick_s: float) -> None:
         """Take the instant at which a reply began."""
         cycles = round((tick_s - self._tick_s) / self._period_s)
         if not self._count or tick_s - self._tick_s > LONGEST_GAP_S:
-            self._tick_s, self._count = tick_s, 1
+            self._tick_s, self._count, self.locked = tick_s, 1, False
             return
         if cycles < 1:
             return
@@ -73,6 +72,7 @@ class PhaseTracker:
         slack_s = MOST_DRIFT * self._cycle_s
         self._period_s = min(max(period_s, self._cycle_s - slack_s), self._cycle_s + slack_s)
         self._scatter_s += FORGETTING * (abs(error_s) - self._scatter_s)
+        self.locked = count >= ENOUGH and self._scatter_s < MOST_SCATTER * self._cycle_s
 
     def wait_s(self, from_s: float) -> float:
         """Return how long after an instant the next cycle ends."""

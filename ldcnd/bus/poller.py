@@ -33,12 +33,14 @@ class Poller(ABC, Generic[ReplyT]):
         due_at_s: when it wants its next slot, in loop time; read by the bus after each slot.
         deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
         priority: how it fares while the line cannot carry all polls; does not change while it waits for a turn.
+        laborious: much is done with each reply, so the request behind it is on its way first; see `Line`.
     """
 
     node: int
     due_at_s: float
     deadline_at_s: float = 0.0
     priority: Priority = Priority.NORMAL
+    laborious: bool = False
 
     def prepare(self, at_s: float) -> None:
         """Make ready what takes time: the next slot is likely to come at about that instant."""

@@ -43,6 +43,11 @@ class Turn(ABC):
         exchange = self.exchange
         return exchange.repeatable and not (exchange.total_bytes or self.then_baud or self.at_baud)
 
+    @property
+    def laborious(self) -> bool:
+        """Whether much is done with the reply."""
+        return False
+
     @abstractmethod
     def completed(self, reply: bytes, timing: Timing) -> None:
         """Take the intact reply (empty when none was due); the next request is on the wire already."""
@@ -67,6 +72,11 @@ class PollTurn(Turn):
         super().__init__(exchange, Lane.POLL, wanted_at_s)
         self.poller = poller
         self.order = order
+
+    @property
+    def laborious(self) -> bool:
+        """See `Turn`."""
+        return self.poller.laborious
 
     def completed(self, reply: bytes, timing: Timing) -> None:
         """See `Turn`."""

@@ -11,12 +11,6 @@ from ldcnd.errors import TransportLost
 from ldcnd.exchange import Timing
 from ldcnd.transport.transport import Receiver, Transport
 
-LONG_WORK_S = 150e-6
-"""What takes longer would hold up the request before it where the kernel has no other processor to carry it on. Polls
-that nobody hears of take a third of that (25 to 100 us measured)."""
-WORK_WEIGHT = 0.1
-"""Of the latest work behind a request in what is expected of the next."""
-
 
 class Wire:
     """What a line has at its end: counts, logs, and knows how long bytes take.
@@ -39,7 +33,6 @@ class Wire:
         self._log = wire_log
         self._loop = asyncio.get_running_loop()
         self._echo = Echo() if settings.echo else None
-        self._work_s = 0.0
 
     @property
     def lag_s(self) -> float:
@@ -67,19 +60,8 @@ class Wire:
         self._transport.expect(1 if self._echo is not None else reply_bytes)
 
     def push(self) -> None:
-        """See `Transport`; for a request with much to do behind it, to judge by the ones before."""
-        if self.is_laborious:
-            self._transport.push()
-
-    @property
-    def is_laborious(self) -> bool:
-        """Whether much is done behind each request; what answers replies is then out of the processor's caches."""
-        return self._work_s > LONG_WORK_S
-
-    def worked(self, since_s: float) -> None:
-        """Learn that all is done that was to be done behind a request; being held up once says little about it."""
-        took_s = min(self._loop.time() - since_s, 2 * LONG_WORK_S)
-        self._work_s += WORK_WEIGHT * (took_s - self._work_s)
+        """See `Transport`."""
+        self._transport.push()
 
     def collect(self) -> None:
         """See `Transport`."""

@@ -27,11 +27,11 @@ def wanted_rates_hz(rates: RatesConfig, *, adc: bool) -> Mapping[TelemetryItem, 
 
 @dataclass(frozen=True, slots=True)
 class _Turn:
-    """What to ask, and when the poll and each item are due next."""
+    """What to ask, and when the poll and each of the slower items are due next."""
 
     exchange: Exchange[AxisReading]
     due_at_s: float
-    items_due_s: dict[TelemetryItem, float]
+    slower_due_s: dict[TelemetryItem, float]
 
 
 class AxisPoller(Poller[AxisReading]):
@@ -45,6 +45,8 @@ class AxisPoller(Poller[AxisReading]):
         rates_hz: how often each item is asked for.
     """
 
+    laborious = True
+
     def __init__(
         self,
         driver: AxisDriver,
@@ -56,9 +58,8 @@ class AxisPoller(Poller[AxisReading]):
         self.node = driver.spec.address
         self.rates_hz = rates_hz
         self._driver = driver
-        self._periods_s = {item: 1.0 / rate for item, rate in rates_hz.items()}
-        self._period_s = min(self._periods_s.values())
-        self._due_s = dict.fromkeys(self._periods_s, start_at_s)
+        self._take_rates(rates_hz)
+        self._slower_due_s = dict.fromkeys(self._slower_s, start_at_s)
         self._deliver = deliver
         self._missed = missed
         self._prepared: _Turn | None = None
@@ -70,15 +71,21 @@ class AxisPoller(Poller[AxisReading]):
 
         What is asked for more often is due within its new period, what is asked for more seldom after its next turn.
         """
-        self.rates_hz = rates_hz
         self._prepared = None
-        self._periods_s = {item: 1.0 / rate for item, rate in rates_hz.items()}
-        self._period_s = min(self._periods_s.values())
-        for item, period_s in self._periods_s.items():
-            self._due_s[item] = min(self._due_s[item], now_s + period_s)
+        before_s = self._slower_due_s
+        self._take_rates(rates_hz)
+        self._slower_due_s = {
+            item: min(before_s.get(item, self.due_at_s), now_s + period_s) for item, period_s in self._slower_s.items()
+        }
         due_at_s, self.due_at_s = self.due_at_s, min(self.due_at_s, now_s + self._period_s)
         self.deadline_at_s = self.due_at_s + self._period_s
         return self.due_at_s < due_at_s
+
+    def _take_rates(self, rates_hz: Mapping[TelemetryItem, float]) -> None:
+        self.rates_hz = rates_hz
+        self._period_s = 1.0 / max(rates_hz.values())
+        self._slower_s = {item: 1.0 / rate for item, rate in rates_hz.items() if 1.0 / rate > self._period_s}
+        self._fastest = frozenset(rates_hz) - frozenset(self._slower_s)
 
     def prepare(self, at_s: float) -> None:
         """See `Poller`."""
@@ -89,18 +96,21 @@ class AxisPoller(Poller[AxisReading]):
         turn, self._prepared = self._prepared, None
         if turn is None or turn.due_at_s <= now_s:
             turn = self._turn_at(now_s)
-        self.due_at_s, self._due_s = turn.due_at_s, turn.items_due_s
+        self.due_at_s, self._slower_due_s = turn.due_at_s, turn.slower_due_s
         self.deadline_at_s = turn.due_at_s + self._period_s
         return turn.exchange
 
     def _turn_at(self, now_s: float) -> _Turn:
-        nearer_s = now_s + self._period_s / 2
-        items_due_s = dict(self._due_s)
-        asked = [item for item, due_s in items_due_s.items() if due_s <= nearer_s]
-        for item in asked:
-            items_due_s[item] = _next_on_grid(items_due_s[item], self._periods_s[item], now_s)
+        asked, slower_due_s = self._fastest, self._slower_due_s
+        if slower_due_s:
+            nearer_s = now_s + self._period_s / 2
+            due = [item for item, due_s in slower_due_s.items() if due_s <= nearer_s]
+            slower_due_s = slower_due_s | {
+                item: _next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
+            }
+            asked = asked.union(due)
         due_at_s = _next_on_grid(self.due_at_s, self._period_s, now_s)
-        return _Turn(self._driver.reading(frozenset(asked)), due_at_s, items_due_s)
+        return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
         """See `Poller`."""

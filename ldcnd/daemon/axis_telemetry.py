@@ -6,6 +6,7 @@ from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.frozen import unchecked
 from ldcnd.model.monitors import MonitorSample
 from ldcnd.model.samples import (
     AdcSample,
@@ -20,6 +21,13 @@ from ldcnd.model.samples import (
 
 StateKey = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, ActiveCommand | None, str | None]
 FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
+
+# five of each poll, of values that are checked when they come off the wire
+_position_sample = unchecked(PositionSample)
+_velocity_sample = unchecked(VelocitySample)
+_adc_sample = unchecked(AdcSample)
+_state_sample = unchecked(StateSample)
+_fault_sample = unchecked(FaultSample)
 
 
 class AxisTelemetry:
@@ -61,7 +69,7 @@ class AxisTelemetry:
             lag = reading.following_error_counts
             topic = self._position
             topic.publish(
-                PositionSample(
+                _position_sample(
                     t=t,
                     t_error_ns=t_error_ns,
                     seq=topic.seq,
@@ -75,7 +83,7 @@ class AxisTelemetry:
         if TelemetryItem.VELOCITY in asked:
             topic = self._velocity
             topic.publish(
-                VelocitySample(
+                _velocity_sample(
                     t=t,
                     t_error_ns=t_error_ns,
                     seq=topic.seq,
@@ -89,7 +97,7 @@ class AxisTelemetry:
             full_scale = self._adc_full_scale
             topic = self._adc
             topic.publish(
-                AdcSample(
+                _adc_sample(
                     t=t,
                     t_error_ns=t_error_ns,
                     seq=topic.seq,
@@ -107,12 +115,12 @@ class AxisTelemetry:
         state = _state_of(tracker)
         if due or state != self._last_state:
             self._last_state = state
-            self._state.publish(_state_sample(tracker, t, t_error_ns, self._state.seq))
+            self._state.publish(_sample_of_state(tracker, t, t_error_ns, self._state.seq))
         faults = (tracker.active_faults, tracker.first_fault)
         if due or faults != self._last_faults:
             self._last_faults = faults
             self._faults.publish(
-                FaultSample(
+                _fault_sample(
                     t=t,
                     t_error_ns=t_error_ns,
                     seq=self._faults.seq,
@@ -163,9 +171,9 @@ def _state_of(tracker: AxisTracker) -> StateKey:
     )
 
 
-def _state_sample(tracker: AxisTracker, t: int, t_error_ns: int, seq: int) -> StateSample:
+def _sample_of_state(tracker: AxisTracker, t: int, t_error_ns: int, seq: int) -> StateSample:
     command = tracker.command
-    return StateSample(
+    return _state_sample(
         t=t,
         t_error_ns=t_error_ns,
         seq=seq,

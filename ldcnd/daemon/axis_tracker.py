@@ -147,24 +147,26 @@ class AxisTracker:
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
         """Digest a reading; `now_ns` stamps the faults that it brings up."""
+        faults = reading.faults
         self._misses = 0
         self.link = LinkState.UP
-        self._faults(list(reading.faults), now_ns)
-        self.position_lost = any(fault.loses_position for fault in reading.faults)
+        if faults or self.active_faults:
+            self._faults(faults, now_ns)
+        self.position_lost = bool(faults) and any(fault.loses_position for fault in faults)
         if self.position_lost:
             self.referenced = False
         self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
         if not self.concerns(timing):
             return  # asked before the latest command took effect: says nothing about it
         self.enabled = reading.enabled
-        if any(fault.stops for fault in reading.faults):
+        if faults and any(fault.stops for fault in faults):
             self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")
         elif self.enabled:
             self._enabled_reading(reading)
         elif self.command and self.command.opens_loop:
             pass
         elif self.state not in (AxisState.DISABLED, AxisState.ERROR_STOP):
-            self._faults([*reading.faults, LOOP_OPENED], now_ns)
+            self._faults((*faults, LOOP_OPENED), now_ns)
             self._fail(LOOP_OPENED.text)
 
     def _enabled_reading(self, reading: AxisReading) -> None:
@@ -197,11 +199,11 @@ class AxisTracker:
         self.link = LinkState.DOWN
         self.referenced = False
         self._at_rest = False
-        self._faults([LINK_LOST], now_ns)
+        self._faults((LINK_LOST,), now_ns)
         if self.state is not AxisState.DISABLED:
             self._fail(LINK_LOST.text)
 
-    def _faults(self, faults: list[Fault], now_ns: int) -> None:
+    def _faults(self, faults: tuple[Fault, ...], now_ns: int) -> None:
         known = {entry.code: entry for entry in self.active_faults}
         self.active_faults = tuple(
             known.get(fault.code)

@@ -17,7 +17,7 @@ class ObservedTracker(AxisTracker):
         """Digest a reading."""
         self._misses = 0
         self.link = LinkState.UP
-        self._faults(list(reading.faults), now_ns)
+        self._faults(reading.faults, now_ns)
         if not self.active_faults:
             self.first_fault = None
         self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s

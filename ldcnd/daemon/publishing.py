@@ -1,6 +1,6 @@
 """Samples on their way out: numbers them, keeps the last of each, hands them to the session without waiting."""
 
-from ldcnd.messaging.codec import Encoding, encode
+from ldcnd.messaging.codec import Encoder, Encoding
 from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.session import Qos, Session
 from ldcnd.model.axes import Quality
@@ -35,9 +35,13 @@ class Topic:
         self._qos = qos
 
     def publish(self, sample: Sample) -> None:
-        """Publish a sample that has the number `seq`."""
+        """Publish a sample that has the number `seq`, and keep it as the last one of its key."""
         self.seq += 1
-        self._publisher.send(self._key, sample, self._qos)
+        key, publisher = self._key, self._publisher
+        publisher.published += 1
+        publisher.last[key] = sample
+        payload, encoding = publisher.encoder.encode(sample)
+        publisher.session.publish(key, payload, encoding=encoding, qos=self._qos, measured_at_ns=sample.t)
 
     def publish_again(self, quality: Quality) -> None:
         """Publish the last sample with what it is worth now; it keeps the instant at which it was true."""
@@ -52,14 +56,16 @@ class Publisher:
     Attributes:
         last: the newest sample of each key.
         published: samples and events handed to the network so far.
+        session: the network.
+        encoder: how payloads are encoded.
     """
 
     def __init__(self, session: Session, keys: Keys, encoding: Encoding) -> None:
         self.last: dict[str, Sample] = {}
         self.published = 0
-        self._session = session
+        self.session = session
+        self.encoder = Encoder(encoding)
         self._keys = keys
-        self._encoding = encoding
         self._topics: dict[str, Topic] = {}
 
     def item(self, axis: str, item: TelemetryItem) -> Topic:
@@ -70,29 +76,22 @@ class Publisher:
         """Return the topic of one monitor of a drive."""
         return self._topic(self._keys.monitor(axis, name), Qos.TELEMETRY)
 
-    def send(self, key: str, sample: Sample, qos: Qos) -> None:
-        """Hand a sample to the network and keep it as the last one of its key."""
-        self.published += 1
-        self.last[key] = sample
-        payload, encoding = encode(sample, self._encoding)
-        self._session.publish(key, payload, encoding=encoding, qos=qos, measured_at_ns=sample.t)
-
     def publish_event(self, event: CommandEvent) -> None:
         """Publish an event; events are history, not values, so no last one is kept here."""
         self.published += 1
-        payload, encoding = encode(event, self._encoding)
-        self._session.publish(
+        payload, encoding = self.encoder.encode(event)
+        self.session.publish(
             self._keys.telemetry(event.axis, EVENT), payload, encoding=encoding, qos=Qos.EVENT, measured_at_ns=event.t
         )
 
     def publish_report(self, key: str, report: Frozen, t: int) -> None:
         """Publish how something is doing, as of `t`, UTC in ns since 1970."""
-        payload, encoding = encode(report, self._encoding)
-        self._session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY, measured_at_ns=t)
+        payload, encoding = self.encoder.encode(report)
+        self.session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY, measured_at_ns=t)
 
     def withdraw_report(self, key: str) -> None:
         """Take a report off the network."""
-        self._session.delete(key)
+        self.session.delete(key)
 
     def publish_trace(self, axis: str, header: TraceHeader) -> None:
         """Publish how far a trace is."""
@@ -109,7 +108,7 @@ class Publisher:
         below = f"{self._keys.trace(axis)}/"
         for key in [key for key in self.last if key.startswith(below)]:
             del self.last[key]
-            self._session.delete(key)
+            self.session.delete(key)
 
     def withdraw(self, axis: str) -> None:
         """Take an axis off the network: its last values must not look alive."""
@@ -119,7 +118,7 @@ class Publisher:
         self.withdraw_trace_chunks(axis)
         for key in keys:
             if self.last.pop(key, None):
-                self._session.delete(key)
+                self.session.delete(key)
 
     def _topic(self, key: str, qos: Qos) -> Topic:
         topic = self._topics.get(key)

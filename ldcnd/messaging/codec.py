@@ -104,6 +104,22 @@ def encode(model: Frozen, encoding: Encoding) -> tuple[bytes, str]:
     return msgpack.packb(vars(model), default=_packable), _msgpack_name(type(model))
 
 
+class Encoder:
+    """Encodes models one after another, for one thread: `encode` makes a buffer for each, which takes longer."""
+
+    __slots__ = ("_encoding", "_pack")
+
+    def __init__(self, encoding: Encoding) -> None:
+        self._encoding = encoding
+        self._pack = msgpack.Packer(default=_packable).pack
+
+    def encode(self, model: Frozen) -> tuple[bytes, str]:
+        """See the function `encode`."""
+        if self._encoding is Encoding.JSON:
+            return encode(model, Encoding.JSON)
+        return self._pack(vars(model)), _msgpack_name(type(model))
+
+
 def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
     """Return the model that a request stands for, strictly; an empty payload has no fields.
 

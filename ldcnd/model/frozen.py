@@ -1,10 +1,16 @@
 """The base of everything that crosses the network or comes from a file: frozen, strict about names, finite."""
 
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar, cast
+
 from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ldcnd.model.docstrings import attribute_docstrings
+
+FieldsT = ParamSpec("FieldsT")
+ModelT = TypeVar("ModelT", bound="Frozen")
 
 
 class Frozen(BaseModel):
@@ -24,6 +30,25 @@ class Frozen(BaseModel):
             if name in said:
                 described["description"] = said[name]
         return schema
+
+
+def unchecked(model: Callable[FieldsT, ModelT]) -> Callable[FieldsT, ModelT]:
+    """Return what makes a model as its constructor does, without looking at the values.
+
+    For what is made so often that it shows, of values that are what the fields say. Every field has to be given, by
+    name, also one that has a default.
+    """
+    kind, put = cast("type[ModelT]", model), object.__setattr__
+
+    def make(*_: FieldsT.args, **fields: FieldsT.kwargs) -> ModelT:
+        made = kind.__new__(kind)
+        put(made, "__dict__", fields)
+        put(made, "__pydantic_fields_set__", set(fields))
+        put(made, "__pydantic_extra__", None)
+        put(made, "__pydantic_private__", None)
+        return made
+
+    return make
 
 
 def build_models(model: type[Frozen] = Frozen) -> None:

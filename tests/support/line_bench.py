@@ -29,8 +29,13 @@ class RecordingTurn(Turn):
         super().__init__(exchange, lane, 0.0)
         self.story = story
         self.send_again = False
+        self.works_long = False
         self.timing: Timing | None = None
         self.error: BusError | None = None
+
+    @property
+    def laborious(self) -> bool:
+        return self.works_long
 
     def completed(self, reply: bytes, timing: Timing) -> None:
         self.timing = timing
@@ -116,11 +121,13 @@ class Bench:
         reply_bytes: int = toy.REPLY_BYTES,
         response_s: float = toy.RESPONSE_S,
         repeatable: bool = True,
+        laborious: bool = False,
     ) -> RecordingTurn:
         """Queue an exchange of that number."""
         exchange = toy.exchange(number, reply_bytes=reply_bytes, response_s=response_s, repeatable=repeatable)
         turn = RecordingTurn(exchange, self.users.story, lane)
         turn.then_baud, turn.at_baud = then_baud, at_baud
+        turn.works_long = laborious
         self.users.waiting.append(turn)
         self.line.kick()
         return turn

@@ -399,47 +399,33 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     bench = Bench()
     story: list[str] = []
     bench.wire.push = lambda: story.append("push")  # type: ignore[method-assign]
-    much_work(bench)  # for those before
 
     bench.add(1)
-    second = bench.add(2)
+    second = bench.add(2, laborious=True)
     second.completed = lambda _reply, _timing: story.append("completed 2")  # type: ignore[method-assign]
     bench.add(3)
     await settle()
 
-    assert story == ["push", "push", "completed 2"]
+    assert story == ["push", "completed 2"]
 
 
-def much_work(bench: Bench) -> None:
-    """Let a line have had much to do behind each of its requests."""
-    for _ in range(20):
-        bench.line.wire.worked(asyncio.get_running_loop().time() - 1.0)
-
-
-async def test_a_line_that_was_held_up_once_is_not_laborious():
-    bench = Bench()
-    bench.line.wire.worked(asyncio.get_running_loop().time() - 1.0)
-    assert not bench.line.wire.is_laborious
-
-    much_work(bench)
-    assert bench.line.wire.is_laborious
-
-
-async def test_a_laborious_line_is_woken_for_the_byte_before_the_last_one():
+async def test_behind_much_work_the_line_is_woken_for_the_byte_before_the_last_one():
     bench = Bench()
     bench.wire.bytewise = bench.wire.holds_back = True
-    much_work(bench)
 
-    bench.add(1)
+    bench.add(1, laborious=True)
     bench.add(2)
+    assert bench.wire.expected == toy.REPLY_BYTES  # nothing is done meanwhile
+    reply_s = REQUEST_S + 0.0001 + REPLY_S
+    await settle(reply_s + toy.RESPONSE_S / 100)
     assert bench.wire.expected == toy.REPLY_BYTES - 1
-    await settle(REQUEST_S + 0.0001 + REPLY_S - REPLY_S / toy.REPLY_BYTES / 2)
+    await settle(reply_s - REPLY_S / toy.REPLY_BYTES / 2)
     assert bench.wire.expected == 1
     await settle()
 
     assert bench.story == ["completed 1", "completed 2"]
     events = [record.event for record in bench.log.records()]
-    assert events == 2 * [WireEvent.SENT, WireEvent.PART, WireEvent.RECEIVED]
+    assert events == [WireEvent.SENT, WireEvent.RECEIVED, WireEvent.SENT, WireEvent.PART, WireEvent.RECEIVED]
     assert bench.statistics.bytes_in == 2 * toy.REPLY_BYTES
 
 

@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn.fields import GROUP_ADDRESS
 from ldcnd.drivers.ldcn.packet import MOST_ADDRESS
 from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusItem, check_status, decode_status, status_bytes
+from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusItem, check_status, status_bytes, status_decoder
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.exchange import Exchange, ReplyVerdict
 
@@ -74,7 +74,7 @@ class Node(Destination[Status]):
             request=request,
             reply_bytes=reply_bytes,
             check=check_status,
-            decode=partial(decode_status, self.profile, asked),
+            decode=status_decoder(self.profile, asked),
             response_s=SERVO_CYCLE_S,
             repeatable=repeatable,
             total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),

@@ -37,7 +37,7 @@ from ldcnd.drivers.ldcn.limit_pins import INPUTS, blocks_homing, with_modes
 from ldcnd.drivers.ldcn.motions import quantised, trajectory_of
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.drivers.ldcn.register_book import LIMIT_PINS, RegisterBook, gain_values, trajectory_values
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, decode_status
+from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
 from ldcnd.exchange import Exchange
@@ -121,9 +121,10 @@ class LdcnAxis(AxisDriver):
 
     def _prepare_reading(self, mask: StatusItem, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
         exchange = commands.read_status(self._node, mask)
+        status_of = status_decoder(self.profile, mask)
 
         def decode(data: bytes) -> AxisReading:
-            return self.state.reading(decode_status(self.profile, mask, data), items)
+            return self.state.reading(status_of(data), items)
 
         return Exchange(
             node=exchange.node,

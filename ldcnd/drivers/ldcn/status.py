@@ -6,6 +6,7 @@ Sources: LS-182AP manual, "Define Status", "Status byte and auxiliary status byt
 and 5.3.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntFlag
 
@@ -152,12 +153,24 @@ def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
     Raises:
         BadReply: the length does not fit the mask, or the checksum is wrong.
     """
-    mask = int(items)
-    expected = status_bytes(profile, items)
-    if len(data) != expected:
-        raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
-    if sum(data[:-1]) & 0xFF != data[-1]:
-        raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
+    return status_decoder(profile, items)(data)
+
+
+def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Status]:
+    """Return `decode_status` for many packets of one kind."""
+    mask, expected = int(items), status_bytes(profile, items)
+
+    def decode(data: bytes) -> Status:
+        if len(data) != expected:
+            raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
+        if sum(data[:-1]) & 0xFF != data[-1]:
+            raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
+        return _decode_items(profile, mask, data)
+
+    return decode
+
+
+def _decode_items(profile: Profile, mask: int, data: bytes) -> Status:
     position = adc = velocity = aux = home = device_id = version = position_error = bit7 = None
     at = 1
     if mask & _POSITION:
