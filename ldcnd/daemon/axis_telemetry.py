@@ -115,7 +115,7 @@ class AxisTelemetry:
         state = _state_of(tracker)
         if due or state != self._last_state:
             self._last_state = state
-            self._state.publish(_sample_of_state(tracker, t, t_error_ns, self._state.seq))
+            self._state.publish(_sample_of_state(state, t, t_error_ns, self._state.seq))
         faults = (tracker.active_faults, tracker.first_fault)
         if due or faults != self._last_faults:
             self._last_faults = faults
@@ -124,7 +124,7 @@ class AxisTelemetry:
                     t=t,
                     t_error_ns=t_error_ns,
                     seq=self._faults.seq,
-                    quality=tracker.quality,
+                    quality=state[0],
                     active=tracker.active_faults,
                     first=tracker.first_fault,
                 )
@@ -171,21 +171,21 @@ def _state_of(tracker: AxisTracker) -> StateKey:
     )
 
 
-def _sample_of_state(tracker: AxisTracker, t: int, t_error_ns: int, seq: int) -> StateSample:
-    command = tracker.command
+def _sample_of_state(known: StateKey, t: int, t_error_ns: int, seq: int) -> StateSample:
+    quality, state, enabled, referenced, moving, link, stop_latched, command, last_error = known
     return _state_sample(
         t=t,
         t_error_ns=t_error_ns,
         seq=seq,
-        quality=tracker.quality,
-        state=tracker.state,
-        enabled=tracker.enabled,
-        referenced=tracker.referenced,
-        moving=tracker.moving,
-        link=tracker.link,
-        stop_latched=tracker.stop_latched,
+        quality=quality,
+        state=state,
+        enabled=enabled,
+        referenced=referenced,
+        moving=moving,
+        link=link,
+        stop_latched=stop_latched,
         command=command and _current(command),
-        last_error=tracker.last_error,
+        last_error=last_error,
     )
 
 
