@@ -11,21 +11,28 @@ from pathlib import Path
 import structlog
 
 from tests.bench import bus_efficiency, console, round_trip, saturated_command, scaling, system_calls, virtual_time
-from tests.bench.bus_efficiency import FLOOR, Result
+from tests.bench.bus_efficiency import FLOOR, Conditions, Result
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
 from tests.bench.sources import NoCompiler
 
 BUSY, BUSY_US = f"{FLOOR}: turn-around, 99 %", 1000
-RATES = (115_200, 19_200)
-CORE = {115_200: 0.15}
-"""Share of one processor that a saturated line may take."""
+FAST, SLOW = Conditions(115_200), Conditions(19_200)
+MORE = (
+    Conditions(115_200, in_one_piece=True),
+    Conditions(115_200, awake=True),
+    Conditions(115_200, in_one_piece=True, awake=True),
+)
 EFFICIENCY = {
-    (115_200, "uvloop"): 0.985,
-    (115_200, "asyncio"): 0.97,
-    (19_200, "uvloop"): 0.99,
-    (19_200, "asyncio"): 0.99,
+    (FAST, "uvloop"): 0.985,
+    (FAST, "asyncio"): 0.97,
+    (SLOW, "uvloop"): 0.99,
+    (SLOW, "asyncio"): 0.99,
 }
+CPU_RATIO = {FAST: 5.0, SLOW: 5.0}
+"""Processor time of an exchange, to that of the floor."""
+CORE = dict.fromkeys((FAST, *MORE), 0.15)
+"""Share of one processor that a saturated line may take."""
 CONSOLE_S, CONSOLE_ROUNDS = 5.0, 3
 
 
@@ -61,8 +68,8 @@ def _processes(rounds: int) -> list[Row]:
             print(f"skipped: {error}")
             return []
         rows = console.rows(folder, CONSOLE_S, CONSOLE_ROUNDS)
-        for baud in RATES:
-            for result in bus_efficiency.measure(programs, folder, baud, rounds):
+        for conditions in (FAST, SLOW, *MORE):
+            for result in bus_efficiency.measure(programs, folder, conditions, rounds):
                 rows += _efficiency_rows(result)
         rows += system_calls.rows(programs[0], folder)
         rows += saturated_command.rows(programs[0], folder)
@@ -70,7 +77,8 @@ def _processes(rounds: int) -> list[Row]:
 
 
 def _efficiency_rows(result: Result) -> list[Row]:
-    what = f"{result.baud} baud, {result.subject}"
+    conditions = result.conditions
+    what = f"{conditions}, {result.subject}"
     rows = [
         Row(f"{what}: turn-around, median", result.turnaround_p50_us, "us"),
         Row(f"{what}: turn-around, 99 %", result.turnaround_p99_us, "us"),
@@ -81,16 +89,10 @@ def _efficiency_rows(result: Result) -> list[Row]:
     loop = result.subject.rpartition(" ")[2]
     return [
         *rows,
-        Row(f"{what}: bus efficiency / floor", result.efficiency_ratio, "", EFFICIENCY[result.baud, loop]),
+        Row(f"{what}: bus efficiency / floor", result.efficiency_ratio, "", EFFICIENCY.get((conditions, loop))),
         Row(f"{what}: the same by the wall clock", result.wall_ratio),
-        Row(f"{what}: processor time / floor", result.cpu_ratio, "", 5.0, at_most=True),
-        Row(
-            f"{what}: share of one processor",
-            result.core,
-            "",
-            CORE.get(result.baud),
-            at_most=True,
-        ),
+        Row(f"{what}: processor time / floor", result.cpu_ratio, "", CPU_RATIO.get(conditions), at_most=True),
+        Row(f"{what}: share of one processor", result.core, "", CORE.get(conditions), at_most=True),
         Row(f"{what}: processor time for each sample", result.cpu_us_per_sample, "us"),
     ]
 

@@ -3,9 +3,11 @@
 import random
 import statistics
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from ldcnd.daemon.process import held_awake
 from tests.bench.processes import (
     PIC_SERVO,
     SUBJECT_CPU,
@@ -32,6 +34,25 @@ TRIES = 3
 
 
 @dataclass(frozen=True, slots=True)
+class Conditions:
+    """Under which all subjects are measured.
+
+    Attributes:
+        baud: of the lines.
+        in_one_piece: a reply arrives at its end, as from an adapter on USB, and not byte by byte.
+        awake: the processor is kept out of idle states that take long to leave.
+    """
+
+    baud: int
+    in_one_piece: bool = False
+    awake: bool = False
+
+    def __str__(self) -> str:
+        in_one_piece = ", replies in one piece" if self.in_one_piece else ""
+        return f"{self.baud} baud{in_one_piece}{', processor held awake' if self.awake else ''}"
+
+
+@dataclass(frozen=True, slots=True)
 class Round:
     """One subject in one round."""
 
@@ -54,7 +75,7 @@ class Round:
 class Result:
     """Medians over all rounds; ratios are medians of the ratios within a round."""
 
-    baud: int
+    conditions: Conditions
     subject: str
     exchanges_per_s: float
     efficiency: float
@@ -69,18 +90,23 @@ class Result:
     line_late_p99_us: float
 
 
-def measure(programs: tuple[Path, Path], folder: Path, baud: int, rounds: int) -> list[Result]:
+def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, rounds: int) -> list[Result]:
     """Run floor, daemon on asyncio and daemon on uvloop side by side."""
     line_program, floor_program = programs
+    baud = conditions.baud
+    new_line = partial(
+        paced_line, line_program, modules=MODULES, burst=conditions.in_one_piece, drive=PIC_SERVO, ready_baud=0
+    )
     with ExitStack() as stack:
-        line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=baud, drive=PIC_SERVO))
+        stack.enter_context(held_awake(wanted=conditions.awake))
+        line = stack.enter_context(new_line(ready_baud=baud))
         command = (floor_program, line.terminal, str(baud), str(MODULES), str(STATUS_ITEMS), str(REPLY_BYTES))
         running = stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10))
         subjects = [Subject(FLOOR, running, line)]
         listeners = {}
         subjects[0].stop()
         for name, uvloop in (("ldcnd, asyncio", False), ("ldcnd, uvloop", True)):
-            line = stack.enter_context(paced_line(line_program, modules=MODULES, ready_baud=0, drive=PIC_SERVO))
+            line = stack.enter_context(new_line())
             config = folder / f"bench-{baud}-{uvloop}.toml"
             rig = {"modules": MODULES, "baud": baud, "hz": 2000.0, "items": ITEMS, "drive": PIC_SERVO}
             config.write_text(config_text(line.terminal, uvloop=uvloop, **rig))
@@ -89,7 +115,7 @@ def measure(programs: tuple[Path, Path], folder: Path, baud: int, rounds: int) -
             listeners[name] = stack.enter_context(subscriber(endpoint))
             subjects.append(Subject(name, running, line))
             subjects[-1].stop()
-        return _summary(baud, _rounds(subjects, listeners, rounds))
+        return _summary(conditions, _rounds(subjects, listeners, rounds))
 
 
 def _rounds(subjects, listeners, rounds) -> list[dict[str, Round]]:
@@ -136,7 +162,7 @@ def _received(listener) -> int:
     return int(told(listener))
 
 
-def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
+def _summary(conditions: Conditions, rounds: list[dict[str, Round]]) -> list[Result]:
     results = []
     for name in rounds[0]:
         own = [each[name] for each in rounds]
@@ -144,7 +170,7 @@ def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
         pairs = list(zip(own, floor, strict=True))
         results.append(
             Result(
-                baud=baud,
+                conditions=conditions,
                 subject=name,
                 exchanges_per_s=_median(each.exchanges_per_s for each in own),
                 efficiency=_median(each.efficiency for each in own),
@@ -164,8 +190,3 @@ def _summary(baud: int, rounds: list[dict[str, Round]]) -> list[Result]:
 
 def _median(values) -> float:
     return statistics.median(values)
-
-
-def as_rows(results: list[Result]) -> list[dict[str, float | str]]:
-    """Return results as plain data."""
-    return [asdict(result) for result in results]
