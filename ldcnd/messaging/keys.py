@@ -10,6 +10,7 @@ starts with `@` is matched by itself only.
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from ldcnd.errors import MalformedRequest, ValueOutOfRange, WildcardRefused
 
@@ -219,7 +220,7 @@ class Keys:
                 value=key,
                 remedy="send one command for each axis",
             )
-        axis, verb = self._parse(key, f"{self._root}/@cmd", "<axis>/<verb>")
+        axis, verb = _chunks_below(key, f"{self._root}/@cmd", "<axis>/<verb>")
         return CommandAddress(axis, verb)
 
     def parse_stop(self, key: str) -> str | None:
@@ -243,7 +244,7 @@ class Keys:
         Raises:
             MalformedRequest: the key is no telemetry key of this rig.
         """
-        axis, item = self._parse(key, f"{self._root}/tele", "<axis>/<item>")
+        axis, item = _chunks_below(key, f"{self._root}/tele", "<axis>/<item>")
         return TelemetryAddress(axis, item)
 
     def parse_alive(self, key: str) -> AliveAddress:
@@ -254,9 +255,9 @@ class Keys:
         """
         base = f"{self._root}/alive"
         if "/axis/" not in key:
-            (instance,) = self._parse(key, base, "<instance>")
+            (instance,) = _chunks_below(key, base, "<instance>")
             return AliveAddress(instance, None)
-        instance, _, axis = self._parse(key, base, "<instance>/axis/<axis>")
+        instance, _, axis = _chunks_below(key, base, "<instance>/axis/<axis>")
         return AliveAddress(instance, axis)
 
     @classmethod
@@ -272,19 +273,21 @@ class Keys:
             raise MalformedRequest(f"{key} is not {ROOT}/<rig>/...", value=key)
         return cls(rig)
 
-    def _parse(self, key: str, base: str, form: str) -> tuple[str, ...]:
-        """Return the chunks below `base`, as many as `form` has."""
-        prefix, below, rest = key.partition(f"{base}/")
-        chunks = tuple(rest.split("/"))
-        if prefix or not below or len(chunks) != form.count("/") + 1 or not all(map(_CHUNK.fullmatch, chunks)):
-            raise MalformedRequest(
-                f"{key} is not {base}/{form}; names are lower-case letters, digits and underscores", value=key
-            )
-        return chunks
-
     @property
     def _root(self) -> str:
         return f"{ROOT}/{self.rig}"
+
+
+@lru_cache(maxsize=1024)
+def _chunks_below(key: str, base: str, form: str) -> tuple[str, ...]:
+    """Return the chunks of a key below `base`, as many as `form` has."""
+    prefix, below, rest = key.partition(f"{base}/")
+    chunks = tuple(rest.split("/"))
+    if prefix or not below or len(chunks) != form.count("/") + 1 or not all(map(_CHUNK.fullmatch, chunks)):
+        raise MalformedRequest(
+            f"{key} is not {base}/{form}; names are lower-case letters, digits and underscores", value=key
+        )
+    return chunks
 
 
 def matches(left: str, right: str) -> bool:

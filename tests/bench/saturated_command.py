@@ -5,6 +5,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ldcnd.drivers.ldcn import commands
@@ -19,12 +20,20 @@ CYCLE_S = 0.000_512
 POLL_BYTES = 5, 13
 """Out and in, of a poll for position, velocity and A/D converter."""
 COUNT = 300
+REPEATS = 5
 PATIENCE_S = 120.0
 
 
 def rows(line_program: Path, folder: Path) -> list[Row]:
-    """Compare with what the line itself costs: the rest of the exchange under way, then the command's own."""
-    return [row for uvloop in (False, True) for row in _rows(line_program, folder, uvloop=uvloop)]
+    """Compare with what the line itself costs: the rest of the exchange under way, then the command's own.
+
+    Both loops in turn, several times; each figure is the median of its repeats.
+    """
+    runs = [
+        [row for uvloop in (False, True) for row in _rows(line_program, folder, uvloop=uvloop)] for _ in range(REPEATS)
+    ]
+    repeated = zip(*runs, strict=True)
+    return [replace(row[0], value=statistics.median(each.value for each in row)) for row in repeated]
 
 
 def _rows(line_program: Path, folder: Path, *, uvloop: bool) -> list[Row]:

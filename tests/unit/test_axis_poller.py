@@ -132,3 +132,19 @@ def test_other_rates_forget_what_was_prepared():
     axis.next_exchange(0.1)
 
     assert axis.due_at_s == pytest.approx(0.6)
+
+
+def test_the_poll_of_an_axis_counts_as_much_work():
+    assert poller({POSITION: 1.0}).laborious
+
+
+def test_an_item_that_was_the_fastest_and_is_not_any_more_keeps_to_its_new_rate():
+    axis = poller({POSITION: 20.0, STATE: 5.0, VELOCITY: 20.0})
+    polls(axis, 1.0)
+
+    axis.retime({POSITION: 2.0, STATE: 5.0, VELOCITY: 20.0}, 1.0)
+
+    asked = Counter(item for _, items in polls(axis, 11.0) for item in items)
+    assert asked[VELOCITY] == pytest.approx(200, abs=1)
+    assert asked[STATE] == pytest.approx(50, abs=1)
+    assert asked[POSITION] == pytest.approx(20, abs=1)

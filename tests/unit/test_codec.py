@@ -4,6 +4,7 @@ import json
 import math
 
 import msgpack
+import pydantic_core
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from ldcnd.errors import ErrorCode, LdcndError, MalformedRequest, PayloadTooLarg
 from ldcnd.messaging.codec import (
     MAX_PAYLOAD_BYTES,
     MAX_RECEIVED_BYTES,
+    Encoder,
     Encoding,
     decode,
     decode_error,
@@ -47,6 +49,18 @@ def test_a_sample_survives_either_encoding(encoding: Encoding) -> None:
     payload, name = encode(STATE, encoding)
 
     assert decode(StateSample, payload, name) == STATE
+
+
+@pytest.mark.parametrize("encoding", list(Encoding))
+def test_an_encoder_says_the_same_as_encode_also_after_something_that_it_refused(encoding: Encoding) -> None:
+    encoder = Encoder(encoding)
+    unreadable = STATE.model_copy(update={"command": object()})
+
+    with pytest.raises(pydantic_core.PydanticSerializationError):
+        encoder.encode(unreadable)
+
+    for sample in (STATE, STATE.model_copy(update={"seq": 4, "last_error": "it did not"})):
+        assert encoder.encode(sample) == encode(sample, encoding)
 
 
 def test_encodings_are_named_as_stock_tools_expect() -> None:
