@@ -6,11 +6,8 @@ queued, and whatever a command does next finds that the epoch has moved on.
 """
 
 import asyncio
-import contextlib
 import math
-from collections import deque
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
@@ -19,6 +16,7 @@ from ldcnd.daemon.axis_commands import AxisCommands
 from ldcnd.daemon.axis_motion import AxisMotion
 from ldcnd.daemon.axis_telemetry import AxisTelemetry
 from ldcnd.daemon.axis_tracker import AxisTracker, Ended
+from ldcnd.daemon.axis_turns import AxisTurns
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.host_tracer import HostTracer, host_channels
 from ldcnd.daemon.observed_tracker import ObservedTracker
@@ -30,7 +28,7 @@ from ldcnd.daemon.trace_recorder import TRACE_VERBS, TraceRecorder
 from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import BusError, LdcndError, NotSupported, RequestRefused, ShuttingDown, StopLatched, TooManyRequests
+from ldcnd.errors import BusError, LdcndError, NotSupported, ShuttingDown, StopLatched
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.axes import Moving
@@ -41,18 +39,8 @@ from ldcnd.model.samples import TelemetryItem
 
 log = get_logger("axis")
 
-QUEUED_COMMANDS = 8
 STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Pending:
-    """A command on its way to the drive and the caller who waits."""
-
-    turn: Turn
-    request: Request
-    future: "asyncio.Future[CommandReply]"
 
 
 class AxisService:
@@ -86,9 +74,7 @@ class AxisService:
         self._next_command_id = next_command_id
         self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
         self._commands = AxisCommands(self._motion)
-        self._waiting: deque[_Pending] = deque()
-        self._woken = asyncio.Event()
-        self._working = asyncio.Lock()  # by whoever carries out a command or a step
+        self._turns = AxisTurns(config.name)
         self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
         tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
@@ -102,23 +88,24 @@ class AxisService:
 
     async def run(self) -> None:
         """Carry out commands, one after another, until cancelled; then every caller has its answer."""
-        pending = None
+        waiting = None
         try:
             while True:
-                await self._wake_up()
-                async with self._working:
-                    pending = self._waiting.popleft() if self._waiting else None
-                    if pending is None:
+                if not self._commands.step_due:
+                    await self._turns.woken(self._commands.deadline_s)
+                async with self._turns.at_work:
+                    waiting = self._turns.take()
+                    if waiting:
+                        await waiting.carry_out(self._obey)
+                    else:
                         await self._step()
-                    elif not pending.future.done():
-                        await self._carry_out(pending)
         finally:
             self._closed = True
             self._epoch += 1
             self._changed.set()
-            if pending and not pending.future.done():
-                pending.future.set_exception(self._ending())
-            self._refuse_queued(self._ending())
+            if waiting:
+                waiting.refuse(self._ending())
+            self._turns.refuse(self._ending())
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
@@ -146,7 +133,7 @@ class AxisService:
         self._changed.set()
         self._commands.observed(reading, timing)
         if self._commands.step_due:
-            self._woken.set()
+            self._turns.wake()
         t, t_error_ns = self._clock.stamp(timing)
         self.telemetry.reading(reading, asked, t, t_error_ns)
 
@@ -193,14 +180,14 @@ class AxisService:
         if self._closed:
             raise self._ending()
         turn = self._turn(command_id, verb)
-        if self._waiting or self._working.locked():
-            return await self._enqueue(turn, request)
+        if not self._turns.free:
+            return await self._turns.wait(turn, request)
         try:
-            async with self._working:
+            async with self._turns.at_work:
                 return await self._obey(turn, request)
         finally:
             if not math.isinf(self._commands.deadline_s):
-                self._woken.set()  # for the steps of what has begun
+                self._turns.wake()  # for the steps of what has begun
 
     async def in_turn(self, mode: BufferMode, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
@@ -243,7 +230,7 @@ class AxisService:
         self._epoch += 1
         self._changed.set()
         overtaken = self._overtaken("a queued command")
-        self._refuse_queued(overtaken)
+        self._turns.refuse(overtaken)
         self._bus.withdraw(self.driver.spec.address, overtaken)
         if not self.tracker.energised:
             mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
@@ -268,19 +255,6 @@ class AxisService:
             return True
         return False
 
-    async def _enqueue(self, turn: Turn, request: Request) -> CommandReply:
-        if len(self._waiting) >= QUEUED_COMMANDS:
-            raise TooManyRequests(
-                f"axis {self.config.name}: {QUEUED_COMMANDS} commands wait already",
-                axis=self.config.name,
-                limit=QUEUED_COMMANDS,
-                remedy="wait for a reply before sending the next command",
-            )
-        future: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
-        self._waiting.append(_Pending(turn, request, future))
-        self._woken.set()
-        return await future
-
     def _turn(self, command_id: str, verb: Verb) -> Turn:
         epoch = self._epoch
 
@@ -291,16 +265,6 @@ class AxisService:
                 raise self._overtaken(verb)
 
         return Turn(command_id, verb, still_wanted)
-
-    async def _carry_out(self, pending: _Pending) -> None:
-        try:
-            reply = await self._obey(pending.turn, pending.request)
-        except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
-            if not pending.future.done():
-                pending.future.set_exception(error)
-            return
-        if not pending.future.done():
-            pending.future.set_result(reply)
 
     async def _obey(self, turn: Turn, request: Request) -> CommandReply:
         turn.still_wanted()
@@ -317,16 +281,6 @@ class AxisService:
         """Read the drive's state out of turn."""
         return await self._bus.execute(self.driver.reading(frozenset()))
 
-    async def _wake_up(self) -> None:
-        """Return when a command waits or a step of the procedure under way may be due."""
-        if self._waiting or self._commands.step_due:
-            return
-        self._woken.clear()
-        deadline_s = self._commands.deadline_s
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
-                await self._woken.wait()
-
     async def _step(self) -> None:
         """Let the procedure under way take its step, if one is due."""
         if not self._commands.step_due and self._clock.now_s() < self._commands.deadline_s:
@@ -335,12 +289,6 @@ class AxisService:
             await self._commands.step(self._turn(self._next_command_id(), Verb.HALT))
         except LdcndError as error:
             log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
-
-    def _refuse_queued(self, error: RequestRefused) -> None:
-        while self._waiting:
-            pending = self._waiting.popleft()
-            if not pending.future.done():
-                pending.future.set_exception(error)
 
     def _ending(self) -> ShuttingDown:
         return ShuttingDown(f"axis {self.config.name}: the daemon is stopping", axis=self.config.name)
