@@ -39,11 +39,12 @@ def unchecked(model: Callable[FieldsT, ModelT]) -> Callable[FieldsT, ModelT]:
     name, also one that has a default.
     """
     kind, put = cast("type[ModelT]", model), object.__setattr__
+    given = set(kind.model_fields)
 
     def make(*_: FieldsT.args, **fields: FieldsT.kwargs) -> ModelT:
         made = kind.__new__(kind)
         put(made, "__dict__", fields)
-        put(made, "__pydantic_fields_set__", set(fields))
+        put(made, "__pydantic_fields_set__", given)
         put(made, "__pydantic_extra__", None)
         put(made, "__pydantic_private__", None)
         return made
