@@ -4,6 +4,7 @@ import argparse
 import json
 import logging
 import platform
+import sysconfig
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
@@ -55,7 +56,11 @@ def main() -> None:
     if any(row.name.endswith(BUSY) and row.value > BUSY_US for row in rows):
         print(f"{BUSY} is above {BUSY_US} us: others used this machine, and what depends on time says little")
     if options.json:
-        machine = {"python": platform.python_version(), "system": platform.platform()}
+        optimised = "--enable-optimizations" in (sysconfig.get_config_var("CONFIG_ARGS") or "")
+        machine = {
+            "python": platform.python_version() + (", optimised build" if optimised else ", plain build"),
+            "system": platform.platform(),
+        }
         options.json.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=2))
 
 
