@@ -29,8 +29,6 @@ from ldcnd.transport.transport import Transport
 NOT_PLAIN = 0
 """No reply has so few bytes."""
 ANY = 1  # byte to expect where each would be news
-LONG_BYTE_S = 0.00025
-"""Where a byte takes longer the program has slept for long before the last one, and is woken for the one before it."""
 LATE_S = 1.0
 """A line that is so far behind what it had planned next does not turn."""
 _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
@@ -194,8 +192,7 @@ class Line:
         elif following.at_baud:
             self._send(following, now_s, AT_ONCE[following.lane])
         else:
-            early = int(turn.laborious and self.wire.byte_s > LONG_BYTE_S)
-            self._attend(following, AT_ONCE[following.lane], failure, early=early)
+            self._attend(following, AT_ONCE[following.lane], failure, early=int(turn.laborious))
         turn.completed(reply, timing)
         if self._turn and self._missing and turn.lane is POLL:  # who waits for an answer has it first
             self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * self.wire.byte_s)
@@ -339,7 +336,10 @@ class Line:
         return self.wire.write(turn.exchange.request)
 
     def _attend(self, turn: Turn, remark: str, failure: str, *, early: int = 0) -> None:
-        """Note a request that has just been written, and prepare for its reply; be woken `early` by so many bytes."""
+        """Note a request that has just been written, and prepare for its reply.
+
+        With much to do behind it the line is woken `early` by so many bytes, to answer the last one with warm caches.
+        """
         exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
         self._pieces.begin(now_s if settings.paced else -NEVER_S, request_s, wire.byte_s)

@@ -409,7 +409,7 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     assert story == ["push", "completed 2"]
 
 
-async def test_behind_much_work_a_slow_line_is_woken_for_the_byte_before_the_last_one():
+async def test_behind_much_work_the_line_is_woken_for_the_byte_before_the_last_one():
     baud = 19_200
     byte_s = 10 / baud
     reply_over_s = (toy.REQUEST_BYTES + toy.REPLY_BYTES) * byte_s + 0.0001
@@ -430,20 +430,6 @@ async def test_behind_much_work_a_slow_line_is_woken_for_the_byte_before_the_las
     events = [record.event for record in bench.log.records()]
     assert events == [WireEvent.SENT, WireEvent.RECEIVED, WireEvent.SENT, WireEvent.PART, WireEvent.RECEIVED]
     assert bench.statistics.bytes_in == 2 * toy.REPLY_BYTES
-
-
-async def test_behind_much_work_a_fast_line_is_woken_once():
-    bench = Bench()
-    bench.wire.bytewise = bench.wire.holds_back = True
-
-    bench.add(1, laborious=True)
-    bench.add(2)
-    await settle(REQUEST_S + REPLY_S + 0.0002)
-    assert bench.wire.expected == toy.REPLY_BYTES
-    await settle()
-
-    assert bench.story == ["completed 1", "completed 2"]
-    assert WireEvent.PART not in [record.event for record in bench.log.records()]
 
 
 async def test_the_next_request_is_written_first_also_behind_a_reply_in_pieces():
