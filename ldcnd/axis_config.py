@@ -136,8 +136,9 @@ class AxisConfig(Frozen):
     """Node address from 1 on; the unit number of a SmartStep, 0 to 15."""
     unit: str = "count"
     """Unit of everything that concerns this axis."""
-    counts_per_unit: float | None = Field(default=None, gt=0)
-    """Encoder counts per unit. There is no default: without it the axis works in counts and says so."""
+    counts_per_unit: float | None = Field(default=None, ge=1e-9, le=1e12)
+    """Encoder counts per unit, 1e-9 to 1e12: every count is a finite position then. There is no default: without it
+    the axis works in counts and says so."""
     direction: Literal["forward", "reverse"] = "forward"
     """reverse: forward in axis units is backward in encoder counts."""
     velocity: float = Field(gt=0)
