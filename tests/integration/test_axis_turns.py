@@ -1,6 +1,7 @@
 """Commands of one axis take turns: at once when it is free, in order when it is not, and a stop overtakes them all."""
 
 import asyncio
+from typing import Any
 
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
@@ -97,7 +98,7 @@ async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
     assert statuses == [CommandStatus.ACCEPTED, CommandStatus.DONE]
 
 
-async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_the_wire():
+async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_the_wire(monkeypatch):
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
         await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
@@ -108,16 +109,17 @@ async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_t
         sent_when_told: list[int] = []
         begin, publish = axis.tracker.begin, axis.telemetry.state
 
-        def note_begin(*args: object) -> None:
+        def note_begin(*args: Any) -> None:
             sent_when_begun.append(bus.statistics.exchanges)
-            begin(*args)  # type: ignore[arg-type]
+            begin(*args)
 
         def note_state(*args: int, due: bool = False) -> None:
             if axis.tracker.state is AxisState.CONTINUOUS_MOTION:
                 sent_when_told.append(bus.statistics.exchanges)
             publish(*args, due=due)
 
-        axis.tracker.begin, axis.telemetry.state = note_begin, note_state  # type: ignore[method-assign]
+        monkeypatch.setattr(axis.tracker, "begin", note_begin)
+        monkeypatch.setattr(axis.telemetry, "state", note_state)
         await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=1.0))
 
     assert sent_when_told[0] == sent_when_begun[0] + 1

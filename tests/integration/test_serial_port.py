@@ -329,6 +329,21 @@ async def test_an_adapter_on_usb_is_not_told_what_to_expect(far: FarSide, port: 
     assert termios.tcgetattr(port._descriptor)[6][termios.VMIN] == 1
 
 
+async def test_a_number_of_bytes_that_was_expected_before_is_told_again_at_the_rate_of_now(port: Transport):
+    told = []
+    for expected in (9, 1, 9):
+        port.expect(expected)
+        told.append(termios.tcgetattr(port._descriptor)[6][termios.VMIN])
+    port.set_baud(19_200)
+    for expected in (1, 9):
+        port.expect(expected)
+        attributes = termios.tcgetattr(port._descriptor)
+        told.append(attributes[6][termios.VMIN])
+        assert attributes[4:6] == [termios.B19200] * 2
+
+    assert [number if isinstance(number, int) else number[0] for number in told] == [9, 1, 9, 1, 9]
+
+
 def _fill(port: Transport) -> None:
     for _ in range(1000):
         port.write(bytes(1024))

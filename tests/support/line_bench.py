@@ -102,13 +102,13 @@ class PlainUsers:
 class Bench:
     """A line between plain users and a scripted far end."""
 
-    def __init__(self, *, echo: bool = False, paced: bool = True, resync: Resync = toy.RESYNC, baud: int = 115_200):
+    def __init__(self, *, echo: bool = False, paced: bool = True, resync: Resync = toy.RESYNC):
         self.users = PlainUsers()
         self.wire = ScriptedLine(toy.answer)
         self.wire.echo = echo
         self.statistics = BusStatistics()
         self.log = WireLog()
-        settings = BusSettings("toy", baud, margin_s=MARGIN_S, echo=echo, paced=paced)
+        settings = BusSettings("toy", 115_200, margin_s=MARGIN_S, echo=echo, paced=paced)
         self.line = Line(settings, self.wire, self.users, resync, self.statistics, self.log)
 
     def add(

@@ -410,12 +410,10 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
 
 
 async def test_behind_much_work_the_line_is_woken_for_the_byte_before_the_last_one():
-    baud = 19_200
-    byte_s = 10 / baud
-    reply_over_s = (toy.REQUEST_BYTES + toy.REPLY_BYTES) * byte_s + 0.0001
-    bench = Bench(baud=baud)
+    byte_s = REPLY_S / toy.REPLY_BYTES
+    reply_over_s = REQUEST_S + 0.0001 + REPLY_S
+    bench = Bench()
     bench.wire.bytewise = bench.wire.holds_back = True
-    bench.wire.set_baud(baud)
 
     bench.add(1, laborious=True)
     bench.add(2)
