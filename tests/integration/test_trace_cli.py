@@ -27,7 +27,7 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
         await rig.command("x", Verb.POWER, PowerRequest(on=True))
         channels = ("-c", "position", "-c", "velocity")
-        trigger = ("--trigger", "velocity:rising:1", "--pre", "10", "--samples", "100")
+        trigger = ("--trigger", "velocity:rising:5", "--pre", "10", "--samples", "100")
         async with asyncio.TaskGroup() as group:
             taking = group.create_task(
                 ldcnd("trace", "take", "x", "-e", endpoint, *channels, *trigger, "--out", str(file))
@@ -46,8 +46,8 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
     assert (code, shown[0], drawn[0], last[0]) == (0, 0, 0, 0)
     assert "as fast as the line allows" in errors
     assert printed == shown[1] == last[1]
-    assert "trigger at sample 10: velocity rising 1" in printed
-    assert trace.values[1][9] < 1.0 <= trace.values[1][10]
+    assert "trigger at sample 10: velocity rising 5" in printed
+    assert trace.values[1][9] < 5.0 <= trace.values[1][10]
     assert len(trace.offsets_ns) == 100
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert refused[0] == 1
