@@ -62,6 +62,10 @@ class Authority:
         """Return the lease on an axis."""
         return next((lease for lease in self._leases.values() if axis in lease.axes), None)
 
+    def next_end_s(self) -> float:
+        """Return when the next lease ends unless it is renewed; infinity when there is none."""
+        return min((lease.ends_at_s for lease in self._leases.values()), default=float("inf"))
+
     def acquire(
         self, client: str, axes: Iterable[str], duration_s: float, now_s: float, *, force: bool
     ) -> tuple[Lease, list[Lease]]:

@@ -9,12 +9,10 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.rig import Rig
 from ldcnd.drivers.driver import StopMode
 from ldcnd.log import get_logger
+from ldcnd.model.authority import SHORTEST_LEASE_S
 from ldcnd.model.axes import Moving
 
 log = get_logger("loss")
-
-EXPIRY_PERIOD_S = 0.05
-"""A lease that ends is acted upon within this time, besides at every command."""
 
 STOP_MODES = {
     LossPolicy.HALT: StopMode.SMOOTH,
@@ -33,10 +31,11 @@ class LeaseWatch:
         self._group = group
 
     async def run(self) -> None:
-        """Watch until cancelled."""
+        """Act upon each end when it comes, until cancelled: no lease ends before it has been seen here."""
         while True:
             self.expire()
-            await asyncio.sleep(EXPIRY_PERIOD_S)
+            left_s = self._authority.next_end_s() - self._clock.now_s()
+            await asyncio.sleep(min(left_s, SHORTEST_LEASE_S))
 
     def expire(self) -> None:
         """End what was not renewed in time; called before any command that waited is looked at."""

@@ -4,6 +4,9 @@ from pydantic import Field
 
 from ldcnd.model.frozen import Frozen
 
+SHORTEST_LEASE_S = 0.2
+"""Seconds that a lease lasts at least."""
+
 
 class AcquireRequest(Frozen):
     """Take control of axes, or of the whole rig."""
@@ -12,7 +15,7 @@ class AcquireRequest(Frozen):
     """Who asks: a name for people, shown to others and in the log."""
     axes: tuple[str, ...] = ()
     """Which axes, or groups of them; none means all."""
-    lease_s: float = Field(default=1.0, ge=0.2, le=60)
+    lease_s: float = Field(default=1.0, ge=SHORTEST_LEASE_S, le=60)
     """For how long, in seconds; it must be renewed before."""
     force: bool = False
     """Take control away from whoever has it; that is logged."""

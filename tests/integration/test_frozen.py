@@ -23,7 +23,7 @@ pytestmark = pytest.mark.real_time
 RIG = ROOT / "config" / "simulated.toml"
 LEASE_S = 1.0
 ACTED_WITHIN_S = 0.5
-"""After the lease has ended: leases are looked at every 50 ms; the rest is for a busy machine."""
+"""After the lease has ended, at which instant it is acted upon; this is for a busy machine."""
 FROZEN_S = 3.0
 
 JOGGER = """

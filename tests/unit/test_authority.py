@@ -42,6 +42,18 @@ def test_a_lease_that_names_nothing_covers_the_rig(leased):
     assert lease.axes == {"x", "y"}
 
 
+def test_the_next_end_is_the_earliest_one(leased):
+    assert leased.next_end_s() == float("inf")
+    leased.acquire("ann", ["x"], 5.0, 0.0, force=False)
+    sooner, _ = leased.acquire("ben", ["y"], 1.0, 0.0, force=False)
+
+    assert leased.next_end_s() == 1.0
+    leased.renew(sooner.token, 0.5)
+    assert leased.next_end_s() == 1.5
+    leased.release(sooner.token, 0.6)
+    assert leased.next_end_s() == 5.0
+
+
 def test_a_renewed_lease_lives_on_and_an_old_one_is_stale(leased):
     lease, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
     leased.renew(lease.token, 0.8)
