@@ -15,7 +15,7 @@ from tests.bench.processes import (
     config_text,
     daemon,
     free_endpoint,
-    paced_line,
+    paced_lines,
     process,
     settle,
     subscriber,
@@ -95,12 +95,12 @@ def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, r
     line_program, floor_program = programs
     baud = conditions.baud
     new_line = partial(
-        paced_line, line_program, modules=MODULES, burst=conditions.in_one_piece, drive=PIC_SERVO, ready_baud=0
+        paced_lines, line_program, modules=MODULES, burst=conditions.in_one_piece, drive=PIC_SERVO, ready_baud=0
     )
     with ExitStack() as stack:
         stack.enter_context(held_awake(wanted=conditions.awake))
         line = stack.enter_context(new_line(ready_baud=baud))
-        command = (floor_program, line.terminal, str(baud), str(MODULES), str(STATUS_ITEMS), str(REPLY_BYTES))
+        command = (floor_program, *line.terminals, str(baud), str(MODULES), str(STATUS_ITEMS), str(REPLY_BYTES))
         running = stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10))
         subjects = [Subject(FLOOR, running, line)]
         listeners = {}
@@ -109,7 +109,7 @@ def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, r
             line = stack.enter_context(new_line())
             config = folder / f"bench-{baud}-{uvloop}.toml"
             rig = {"modules": MODULES, "baud": baud, "hz": 2000.0, "items": ITEMS, "drive": PIC_SERVO}
-            config.write_text(config_text(line.terminal, uvloop=uvloop, **rig))
+            config.write_text(config_text(*line.terminals, uvloop=uvloop, **rig))
             endpoint = free_endpoint()
             running = stack.enter_context(daemon(config, endpoint))
             listeners[name] = stack.enter_context(subscriber(endpoint))
@@ -134,9 +134,9 @@ def _round(subject: Subject, listener) -> Round:
         settle(SETTLE_S)
         before = _received(listener)
         cpu_s = subject.cpu_s()
-        subject.line.figures()
+        subject.lines.figures()
         settle(ROUND_S)
-        figures = subject.line.figures()
+        (figures,) = subject.lines.figures()
         cpu_s = subject.cpu_s() - cpu_s
         if figures.exchanges:
             break

@@ -95,16 +95,20 @@ def heard(running: subprocess.Popen) -> str:
     return running.stdout.readline()
 
 
-class PacedLine:
-    """A running paced line."""
+class PacedLines:
+    """Lines that one running program paces.
+
+    Attributes:
+        terminals: where their hosts find them.
+    """
 
     def __init__(self, running: subprocess.Popen) -> None:
         self._running = running
-        self.terminal = json.loads(heard(running))["terminal"]
+        self.terminals = tuple(json.loads(heard(running)))
 
-    def figures(self) -> LineFigures:
-        """Return what was counted since the call before."""
-        return LineFigures(**json.loads(told(self._running)))
+    def figures(self) -> tuple[LineFigures, ...]:
+        """Return what was counted since the call before, line by line."""
+        return tuple(LineFigures(**line) for line in json.loads(told(self._running)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,28 +125,23 @@ PIC_SERVO = Drive("pic-servo-v4", 0, 4)
 
 
 @contextmanager
-def paced_line(
-    program: Path, *, modules: int, ready_baud: int, burst: bool = False, drive: Drive = LS_182AP
-) -> Iterator[PacedLine]:
-    """Run a paced line; its modules have addresses and a rate already, or are as after power-up (rate 0)."""
-    command = (program, str(modules), "1", str(ready_baud), str(int(burst)), str(drive.device), str(drive.version))
-    with process(command, cpu=LINE_CPU, nice=-20, pipe=True) as running:
-        yield PacedLine(running)
+def paced_lines(
+    program: Path, *, modules: int, ready_baud: int, lines: int = 1, burst: bool = False, drive: Drive = LS_182AP
+) -> Iterator[PacedLines]:
+    """Run paced lines; their modules have addresses and a rate already, or are as after power-up (rate 0)."""
+    settings = (lines, modules, 1, ready_baud, int(burst), drive.device, drive.version)
+    with process((program, *map(str, settings)), cpu=LINE_CPU, nice=-20, pipe=True) as running:
+        yield PacedLines(running)
 
 
 class Subject:
     """A host under measurement, with its lines; stopped between its rounds."""
 
-    def __init__(self, name: str, running: subprocess.Popen, *lines: PacedLine) -> None:
+    def __init__(self, name: str, running: subprocess.Popen, lines: PacedLines) -> None:
         self.name = name
         self.pid = running.pid
         self.lines = lines
         self._running = running
-
-    @property
-    def line(self) -> PacedLine:
-        """Its first line."""
-        return self.lines[0]
 
     def stop(self) -> None:
         """Freeze it."""
@@ -213,5 +212,5 @@ def settle(seconds: float) -> None:
 
 
 def build_programs(folder: Path) -> tuple[Path, Path]:
-    """Build the paced line and the floor."""
-    return build("paced_line", folder), build("reference_master", folder)
+    """Build the paced lines and the floor."""
+    return build("paced_lines", folder), build("reference_master", folder)

@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from tests.bench.processes import SUBJECT_CPU, config_text, daemon, free_endpoint, heard, paced_line, process
+from tests.bench.processes import SUBJECT_CPU, config_text, daemon, free_endpoint, heard, paced_lines, process
 from tests.bench.report import Row
 
 BAUD, DRIVE_BAUD = 115_200, 113_636
@@ -73,11 +73,11 @@ def _asked(line_program: Path, folder: Path, *, uvloop: bool) -> tuple[list[floa
     bare = (sys.executable, "-m", "tests.bench.bare_queryable", bare_endpoint)
     ask = (sys.executable, "-m", "tests.bench.asker", endpoint, bare_endpoint, str(COUNT))
     with (
-        paced_line(line_program, modules=8, ready_baud=0) as line,
+        paced_lines(line_program, modules=8, ready_baud=0) as line,
         process(bare, cpu=SUBJECT_CPU, nice=-10, pipe=True) as answering,
     ):
         items = ("position", "velocity", "adc")
-        config.write_text(config_text(line.terminal, modules=8, baud=BAUD, uvloop=uvloop, hz=2000.0, items=items))
+        config.write_text(config_text(*line.terminals, modules=8, baud=BAUD, uvloop=uvloop, hz=2000.0, items=items))
         assert heard(answering).strip() == "serving"
         with daemon(config, endpoint), process(ask, cpu=SUBJECT_CPU, nice=-10, pipe=True) as asking:
             try:

@@ -11,7 +11,7 @@ from tests.bench.processes import (
     config_text,
     daemon,
     free_endpoint,
-    paced_line,
+    paced_lines,
     settle,
     subscriber,
 )
@@ -35,23 +35,30 @@ class Load:
     efficiency: float
     cpu_us: float
     core: float
+    late_us: float
 
 
 def rows(line_program: Path, folder: Path, rounds: int) -> list[Row]:
     """Measure one line with more and more drives, then more and more lines of 8 drives."""
     shapes = [(1, axes) for axes in AXES]
-    loads = _measure(line_program, folder, shapes, rounds)
+    loads = _measure(line_program, folder, shapes, rounds, in_one_piece=True)
     found = [
         Row(f"1 line, {axes} drive(s): processor time of a poll", _median(load.cpu_us for load in loads[1, axes]), "us")
         for _, axes in shapes
     ]
+    for in_one_piece in (False, True):
+        found += _line_rows(line_program, folder, rounds, in_one_piece=in_one_piece)
+    return found
+
+
+def _line_rows(line_program: Path, folder: Path, rounds: int, *, in_one_piece: bool) -> list[Row]:
     shapes = [(lines, AXES_OF_A_LINE) for lines in LINES]
-    loads = _measure(line_program, folder, shapes, rounds)
-    one = loads[shapes[0]]
+    loads = _measure(line_program, folder, shapes, rounds, in_one_piece=in_one_piece)
+    found, one = [], loads[shapes[0]]
     for lines, axes in shapes:
         own = loads[lines, axes]
         targets = (0.97, 0.75) if lines == LINES[-1] else (None, None)
-        what = f"{lines} line(s) of {axes} drives"
+        what = f"{lines} line(s) of {axes} drives, replies {'in one piece' if in_one_piece else 'byte by byte'}"
         efficiency = _median(load.efficiency / base.efficiency for load, base in zip(own, one, strict=True))
         cost = _median(load.cpu_us / base.cpu_us for load, base in zip(own, one, strict=True))
         found += [
@@ -59,30 +66,30 @@ def rows(line_program: Path, folder: Path, rounds: int) -> list[Row]:
             Row(f"{what}: share of one processor", _median(load.core for load in own)),
             Row(f"{what}: efficiency / that of 1 line", efficiency, "", targets[0]),
             Row(f"{what}: processor time of a poll / that of 1 line", cost, "", targets[1], at_most=True),
+            Row(f"{what}: lateness of the far end, 99 %", _median(load.late_us for load in own), "us"),
         ]
     return found
 
 
 def _measure(
-    line_program: Path, folder: Path, shapes: list[tuple[int, int]], rounds: int
+    line_program: Path, folder: Path, shapes: list[tuple[int, int]], rounds: int, *, in_one_piece: bool
 ) -> dict[tuple[int, int], list[Load]]:
-    """Run one daemon for each shape (lines, drives on each) in turn; a reply arrives in one piece."""
+    """Run one daemon for each shape (lines, drives on each) in turn."""
     dice = random.Random(1)
     loads: dict[tuple[int, int], list[Load]] = {shape: [] for shape in shapes}
     with ExitStack() as stack:
         subjects = {}
         for shape in shapes:
             lines, axes = shape
-            paced = [
-                stack.enter_context(paced_line(line_program, modules=axes, ready_baud=0, burst=True))
-                for _ in range(lines)
-            ]
+            paced = stack.enter_context(
+                paced_lines(line_program, lines=lines, modules=axes, ready_baud=0, burst=in_one_piece)
+            )
             config, endpoint = folder / f"scaling-{lines}-{axes}.toml", free_endpoint()
-            terminals = [line.terminal for line in paced]
-            config.write_text(config_text(*terminals, modules=axes, baud=BAUD, uvloop=True, hz=2000.0, items=ITEMS))
+            settings = {"modules": axes, "baud": BAUD, "hz": 2000.0, "items": ITEMS}
+            config.write_text(config_text(*paced.terminals, uvloop=True, **settings))
             running = stack.enter_context(daemon(config, endpoint))
             stack.enter_context(subscriber(endpoint))
-            subjects[shape] = Subject(f"{lines} x {axes}", running, *paced)
+            subjects[shape] = Subject(f"{lines} x {axes}", running, paced)
             _until_polled(subjects[shape])
             subjects[shape].stop()
         for _ in range(rounds):
@@ -94,10 +101,9 @@ def _measure(
 def _until_polled(subject: Subject) -> None:
     """Wait until every line is up, 31 drives take a while; bounded."""
     for _ in range(60):
-        for line in subject.lines:
-            line.figures()
+        subject.lines.figures()
         settle(0.5)
-        if all(line.figures().exchanges > LEAST_EXCHANGES for line in subject.lines):
+        if all(line.exchanges > LEAST_EXCHANGES for line in subject.lines.figures()):
             return
     raise RuntimeError(f"{subject.name}: not every line came up")
 
@@ -106,10 +112,9 @@ def _round(subject: Subject) -> Load:
     subject.resume()
     settle(SETTLE_S)
     cpu_s = subject.cpu_s()
-    for line in subject.lines:
-        line.figures()
+    subject.lines.figures()
     settle(ROUND_S)
-    figures = [line.figures() for line in subject.lines]
+    figures = subject.lines.figures()
     cpu_s = subject.cpu_s() - cpu_s
     subject.stop()
     if not all(each.exchanges for each in figures):
@@ -118,6 +123,7 @@ def _round(subject: Subject) -> Load:
         efficiency=statistics.fmean(each.efficiency for each in figures),
         cpu_us=cpu_s / sum(each.exchanges for each in figures) * 1e6,
         core=cpu_s / max(each.elapsed_s for each in figures),
+        late_us=max(each.late_p99_us for each in figures),
     )
 
 

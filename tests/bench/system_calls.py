@@ -9,12 +9,12 @@ from pathlib import Path
 
 from tests.bench.processes import (
     SUBJECT_CPU,
-    PacedLine,
+    PacedLines,
     config_text,
     daemon,
     free_endpoint,
     heard,
-    paced_line,
+    paced_lines,
     process,
     settle,
 )
@@ -41,10 +41,10 @@ def rows(line_program: Path, folder: Path) -> list[Row]:
     found = []
     for burst in (True, False):
         how = "in one piece" if burst else "byte by byte"
-        with paced_line(line_program, modules=MODULES, ready_baud=BAUD, burst=burst) as line, _bare_bus(line) as it:
+        with paced_lines(line_program, modules=MODULES, ready_baud=BAUD, burst=burst) as line, _bare_bus(line) as it:
             found.append(_row(f"system calls of a poll, nothing published, replies {how}", strace, it, folder, 3.1))
         with (
-            paced_line(line_program, modules=MODULES, ready_baud=0, burst=burst) as line,
+            paced_lines(line_program, modules=MODULES, ready_baud=0, burst=burst) as line,
             _daemon(line, folder) as it,
         ):
             found.append(_row(f"system calls of a poll, whole daemon, replies {how}", strace, it, folder))
@@ -52,8 +52,8 @@ def rows(line_program: Path, folder: Path) -> list[Row]:
 
 
 @contextmanager
-def _bare_bus(line: PacedLine) -> Iterator[subprocess.Popen]:
-    command = (sys.executable, "-m", "tests.bench.bare_bus", line.terminal, str(MODULES))
+def _bare_bus(line: PacedLines) -> Iterator[subprocess.Popen]:
+    command = (sys.executable, "-m", "tests.bench.bare_bus", *line.terminals, str(MODULES))
     with process(command, cpu=SUBJECT_CPU, nice=-10, pipe=True) as running:
         assert heard(running).strip() == "polling"
         settle(1.0)
@@ -61,10 +61,10 @@ def _bare_bus(line: PacedLine) -> Iterator[subprocess.Popen]:
 
 
 @contextmanager
-def _daemon(line: PacedLine, folder: Path) -> Iterator[subprocess.Popen]:
+def _daemon(line: PacedLines, folder: Path) -> Iterator[subprocess.Popen]:
     config = folder / "calls.toml"
     config.write_text(
-        config_text(line.terminal, modules=MODULES, baud=BAUD, uvloop=False, hz=2000.0, items=("velocity",))
+        config_text(*line.terminals, modules=MODULES, baud=BAUD, uvloop=False, hz=2000.0, items=("velocity",))
     )
     with daemon(config, free_endpoint()) as running:
         settle(START_S)
