@@ -1,5 +1,6 @@
 """How any command moves one axis: plan, load, ask whether it is still wanted, start, bring to rest."""
 
+import asyncio
 from collections.abc import Awaitable, Callable
 
 from ldcnd.axis_config import AxisConfig
@@ -55,6 +56,7 @@ class AxisMotion:
         self.planner = MotionPlanner(config, driver, scale)
         self.reading: AxisReading | None = None
         self.target_counts: int | None = None
+        self._loop = asyncio.get_running_loop()
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Plan with other limits and speeds from now on."""
@@ -144,7 +146,10 @@ class AxisMotion:
             self.tracker.started(self.clock.now_s())
 
     def publish_state(self) -> None:
-        """Publish the state if it changed: whoever has the answer to a command finds the state that came of it."""
+        """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""
+        self._loop.call_soon(self._tell_state)
+
+    def _tell_state(self) -> None:
         self.telemetry.state(self.clock.now_ns())
 
     def reply(self, turn: Turn) -> CommandReply:

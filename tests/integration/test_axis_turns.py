@@ -1,6 +1,7 @@
 """Commands of one axis take turns: at once when it is free, in order when it is not, and a stop overtakes them all."""
 
 import asyncio
+from typing import Any
 
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
@@ -12,10 +13,10 @@ from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
-from ldcnd.model.axes import LinkState
+from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.events import CommandEvent, CommandStatus
 from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import HaltRequest, PowerRequest, Verb
+from ldcnd.model.requests import HaltRequest, MoveVelocityRequest, PowerRequest, Verb
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 
@@ -95,3 +96,41 @@ async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
 
     statuses = [decode_received(CommandEvent, sample.payload, sample.encoding).status for sample in told]
     assert statuses == [CommandStatus.ACCEPTED, CommandStatus.DONE]
+
+
+async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_the_wire(monkeypatch):
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        axis = rig.daemon.rig.axis("x")
+        bus = rig.daemon.rig.buses[0].bus
+        sent_when_begun: list[int] = []
+        sent_when_told: list[int] = []
+        begin, publish = axis.tracker.begin, axis.telemetry.state
+
+        def note_begin(*args: Any) -> None:
+            sent_when_begun.append(bus.statistics.exchanges)
+            begin(*args)
+
+        def note_state(*args: int, due: bool = False) -> None:
+            if axis.tracker.state is AxisState.CONTINUOUS_MOTION:
+                sent_when_told.append(bus.statistics.exchanges)
+            publish(*args, due=due)
+
+        monkeypatch.setattr(axis.tracker, "begin", note_begin)
+        monkeypatch.setattr(axis.telemetry, "state", note_state)
+        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=1.0))
+
+    assert sent_when_told[0] == sent_when_begun[0] + 1
+
+
+async def test_who_has_the_answer_finds_the_state_that_came_of_the_command():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        for on in (True, False, True):
+            await rig.client.command("x", Verb.POWER, PowerRequest(on=on))
+            state = await rig.client.state("x")
+
+            assert state is not None
+            assert state.enabled is on
