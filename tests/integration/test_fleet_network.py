@@ -12,10 +12,11 @@ import datetime as dt
 import json
 import subprocess
 from asyncio.subprocess import PIPE, STDOUT
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypeVar
 
 import pytest
@@ -49,6 +50,7 @@ WITHIN_S = 60.0
 MOVES = 8
 STEP = 0.5
 ALL_AXES = ["x", "y", "z", "c"]
+NOTHING: Mapping[str, object] = MappingProxyType({})
 
 AnswerT = TypeVar("AnswerT")
 Process = subprocess.Popen[bytes]
@@ -143,19 +145,19 @@ async def console(site: SiteNetwork) -> AsyncIterator[Session]:
         yield session
 
 
-async def until(ready: Callable[[], Awaitable[bool]], site: SiteNetwork) -> None:
-    """Look again until it is so; says what all programs have said when it never is."""
+async def until(ready: Callable[[], Awaitable[bool]], site: SiteNetwork, seen: Mapping[str, object] = NOTHING) -> None:
+    """Look again until it is so; says what was seen, and what all programs have said, when it never is."""
     try:
         async with asyncio.timeout(WITHIN_S):
             while not await ready():
                 await asyncio.sleep(0.1)  # nobody tells what other hosts have come to know
     except TimeoutError:
         said = "\n".join(f"{log.name}: {log.read_text()[-1500:]}" for log in site.folder.glob("*.log"))
-        pytest.fail(f"not within {WITHIN_S} s\n{said}")
+        pytest.fail(f"not within {WITHIN_S} s: {dict(seen)}\n{said}")
 
 
 async def well(session: Session, site: SiteNetwork, *rigs: str) -> dict[str, RigReport]:
-    """Wait until exactly these rigs are seen, with nothing wrong."""
+    """Wait until exactly these rigs are seen, with nothing wrong and a report of how they are."""
     found: dict[str, RigReport] = {}
 
     async def ready() -> bool:
@@ -163,9 +165,10 @@ async def well(session: Session, site: SiteNetwork, *rigs: str) -> dict[str, Rig
         found.clear()
         found.update({view.rig: view for view in views})
         complete = all([axis.info.axis for axis in view.axes if axis.state] == ALL_AXES for view in views)
+        complete = complete and all(view.health for view in views)
         return [view.rig for view in views] == sorted(rigs) and complete and not any(view.problems for view in views)
 
-    await until(ready, site)
+    await until(ready, site, found)
     return found
 
 
