@@ -10,13 +10,12 @@ from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
-from ldcnd.client.traces import Trace, arm_trace, fetch_trace, wait_for_trace
+from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
 from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
 from ldcnd.model.traces import LONGEST_WAIT_S, MOST_SAMPLES, TraceChannel, TraceReply, TraceTrigger, TriggerKind
 
 UPLOAD_S = 600.0
 """A drive's memory over a busy line takes minutes at worst."""
-ABORT_S = 10.0
 FASTEST = "fastest"
 
 
@@ -81,7 +80,7 @@ def take(
     timeout: float,
     out: Path | None,
 ) -> None:
-    """Record channels of AXIS; what it has is in `ldcnd axis list --json`."""
+    """Record channels of AXIS; what it has is in `ldcnd axis list --json`. Ctrl-C ends the trace."""
     request = TraceRequest(
         channels=channels,
         interval_s=FASTEST if isinstance(interval, str) else interval,
@@ -92,11 +91,11 @@ def take(
     )
 
     async def work(client: RigClient) -> Trace:
-        reply = await arm_trace(client, axis, request)
-        print(_granted(reply), file=sys.stderr)
-        within_s = timeout + 2 * reply.interval_s * reply.samples + UPLOAD_S
-        await wait_for_trace(client, axis, reply.trace_id, within_s)
-        return await fetch_trace(client, axis, reply.trace_id)
+        async with armed_trace(client, axis, request) as reply:
+            print(_granted(reply), file=sys.stderr)
+            within_s = timeout + 2 * reply.interval_s * reply.samples + UPLOAD_S
+            await wait_for_trace(client, axis, reply.trace_id, within_s)
+            return await fetch_trace(client, axis, reply.trace_id)
 
     _deliver(target, target.run(work), out)
 
@@ -115,7 +114,7 @@ def last(target: Target, axis: str, out: Path | None) -> None:
 @with_target
 def abort(target: Target, axis: str) -> None:
     """End the trace of AXIS that is under way, or one that was left armed in its drive."""
-    reply = target.run(lambda client: client.command(axis, Verb.TRACE_ABORT, TraceAbortRequest(), ABORT_S))
+    reply = target.run(lambda client: client.command(axis, Verb.TRACE_ABORT, TraceAbortRequest(), ENDING_S))
     target.show(reply, f"{axis}: trace ended")
 
 

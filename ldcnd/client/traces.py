@@ -1,16 +1,19 @@
 """Taking a trace and fetching it whole."""
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import DriveFault, InternalError, OutcomeUnknown, WrongState
-from ldcnd.model.requests import TraceRequest, Verb
+from ldcnd.errors import DriveFault, InternalError, LdcndError, OutcomeUnknown, WrongState
+from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
 from ldcnd.model.traces import TraceChunk, TraceHeader, TracePhase, TraceReply
 
 LOOK_S = 0.1
 ARMING_S = 30.0
 """A slow drive is told and asked some twenty words before its trace begins."""
+ENDING_S = 10.0
 UNDER_WAY = frozenset({TracePhase.FILLING, TracePhase.WAITING, TracePhase.RECORDING, TracePhase.UPLOADING})
 
 
@@ -32,7 +35,7 @@ class Trace:
 
 
 async def take_trace(client: RigClient, axis: str, request: TraceRequest, within_s: float) -> Trace:
-    """Arm a trace, wait for its end, and return it.
+    """Arm a trace, wait for its end, and return it; when cancelled meanwhile, end it.
 
     Args:
         client: of the rig.
@@ -45,9 +48,9 @@ async def take_trace(client: RigClient, axis: str, request: TraceRequest, within
         DriveFault: it did not complete; says why.
         OutcomeUnknown: it did not end in time, or gave way to another one; it may still be under way.
     """
-    reply = await arm_trace(client, axis, request)
-    await wait_for_trace(client, axis, reply.trace_id, within_s)
-    return await fetch_trace(client, axis, reply.trace_id)
+    async with armed_trace(client, axis, request) as reply:
+        await wait_for_trace(client, axis, reply.trace_id, within_s)
+        return await fetch_trace(client, axis, reply.trace_id)
 
 
 async def arm_trace(client: RigClient, axis: str, request: TraceRequest) -> TraceReply:
@@ -56,6 +59,29 @@ async def arm_trace(client: RigClient, axis: str, request: TraceRequest) -> Trac
     if not isinstance(reply, TraceReply):
         raise InternalError(f"trace was answered with {type(reply).__name__}")
     return reply
+
+
+@asynccontextmanager
+async def armed_trace(client: RigClient, axis: str, request: TraceRequest) -> AsyncIterator[TraceReply]:
+    """Arm a trace that is ended when the context is cancelled; yields what it will be.
+
+    Raises:
+        LdcndError: the daemon refused it.
+    """
+    reply = await arm_trace(client, axis, request)
+    try:
+        yield reply
+    except asyncio.CancelledError:
+        with suppress(LdcndError):  # out of reach: it ends by itself
+            await _end(client, axis, reply.trace_id)
+        raise
+
+
+async def _end(client: RigClient, axis: str, trace_id: str) -> None:
+    """End a trace, unless it has ended or given way to another one."""
+    header = await client.trace_header(axis)
+    if header and header.trace_id == trace_id and header.phase in UNDER_WAY:
+        await client.command(axis, Verb.TRACE_ABORT, TraceAbortRequest(), ENDING_S)
 
 
 async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: float) -> TraceHeader:
@@ -81,11 +107,18 @@ async def fetch_trace(client: RigClient, axis: str, trace_id: str | None = None)
     """Return a complete trace: the last one, which must be this one if an id is given.
 
     Raises:
-        WrongState: there is none.
+        WrongState: there is none, or it is under way.
         DriveFault: it did not complete; says why.
         OutcomeUnknown: it gave way to another one.
     """
     header = await _header(client, axis, trace_id)
+    if header.phase in UNDER_WAY:
+        raise WrongState(
+            f"axis {axis}: trace {header.trace_id} is {header.phase.value}: it is not complete yet",
+            axis=axis,
+            value=header.phase.value,
+            remedy="wait for its end, or send trace_abort",
+        )
     if header.phase is not TracePhase.COMPLETE:
         raise DriveFault(
             f"axis {axis}: trace {header.trace_id} is {header.phase.value}: {header.problem or 'it has no samples'}",

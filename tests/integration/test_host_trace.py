@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.client.traces import arm_trace, fetch_trace, take_trace, wait_for_trace
+from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, wait_for_trace
 from ldcnd.config import load_config
 from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
@@ -159,6 +159,26 @@ async def test_second_trace_is_refused_until_the_first_is_aborted():
 
     assert (aborted.trace_id, header.phase) == (first.trace_id, TracePhase.ABORTED)
     assert again.trace_id != first.trace_id
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
+    async with running_rig() as rig:
+        await ready(rig)
+        request = TraceRequest(channels=("velocity",), trigger=rising(40.0))
+
+        async def wait() -> None:
+            async with armed_trace(rig.client, "x", request):
+                if replaced:
+                    await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+                    await arm_trace(rig.client, "x", request)
+                await asyncio.Event().wait()
+
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(wait(), 3)
+        header = await rig.client.trace_header("x")
+
+    assert header.phase is (TracePhase.WAITING if replaced else TracePhase.ABORTED)
 
 
 @pytest.mark.parametrize(

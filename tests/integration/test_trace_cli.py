@@ -1,6 +1,7 @@
 """`ldcnd trace` against a daemon in its own process over loopback TCP."""
 
 import asyncio
+import signal
 from asyncio.subprocess import PIPE
 
 import pytest
@@ -19,6 +20,25 @@ async def ldcnd(*arguments):
     async with asyncio.timeout(45):
         printed, errors = await running.communicate()
     return running.returncode, printed.decode(), errors.decode()
+
+
+async def test_ctrl_c_ends_the_trace_that_waits():
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
+        words = ("trace", "take", "x", "-e", endpoint, "-c", "position", "--trigger", "position:rising:5")
+        taking = await asyncio.create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE)
+        async with asyncio.timeout(30):
+            while (header := await rig.trace_header("x")) is None or header.phase is not TracePhase.WAITING:
+                await asyncio.sleep(0.1)
+            early = await ldcnd("trace", "last", "x", "-e", endpoint)
+            taking.send_signal(signal.SIGINT)
+            await taking.communicate()
+        header = await rig.trace_header("x")
+
+    assert taking.returncode == 130
+    assert early[0] == 1
+    assert "is waiting: it is not complete yet" in early[2]
+    assert header is not None
+    assert header.phase is TracePhase.ABORTED
 
 
 async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
