@@ -10,6 +10,7 @@ import json
 
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.daemon.rig import Rig
+from ldcnd.messaging.codec import to_json
 from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model.frozen import Frozen
 
@@ -28,20 +29,21 @@ class Journal:
         """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
         token = lease or getattr(request, "lease", None)
         if token is None:
-            payload = request.model_dump_json(exclude_defaults=True)
+            payload = to_json(request, exclude_defaults=True)
         else:
             fields = request.model_dump(mode="json", exclude_defaults=True)
-            payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":"))
-        self._note(axis, f"{axis}/{verb} {payload}")
+            payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":")).encode()
+        self._note(axis, f"{axis}/{verb} ".encode() + payload)
 
     def stopped(self, axis: str | None) -> None:
         """Note a stop of an axis, or of the rig."""
-        self._note(axis or RIG_ITSELF, f"{STOP}/{axis} {{}}" if axis else f"{STOP} {{}}")
+        what = f"{STOP}/{axis}" if axis else STOP
+        self._note(axis or RIG_ITSELF, f"{what} {{}}".encode())
 
-    def _note(self, axis: str, text: str) -> None:
+    def _note(self, axis: str, line: bytes) -> None:
         now_s = asyncio.get_running_loop().time()
         for log in self._logs[axis]:
-            log.add(now_s, WireEvent.COMMAND, text.encode())
+            log.add(now_s, WireEvent.COMMAND, line)
 
 
 def fingerprint(token: str) -> str:

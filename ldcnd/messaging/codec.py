@@ -97,10 +97,15 @@ _ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
 )
 
 
+def to_json(model: Frozen, *, exclude_defaults: bool = False) -> bytes:
+    """Return what `model_dump_json` makes, in bytes: a command waits for it twice, and it takes half of the time."""
+    return model.__pydantic_serializer__.to_json(model, exclude_defaults=exclude_defaults)
+
+
 def encode(model: Frozen, encoding: Encoding) -> tuple[bytes, str]:
     """Return a model's payload and the name of its encoding on the wire."""
     if encoding is Encoding.JSON:
-        return model.model_dump_json().encode(), encoding.value
+        return to_json(model), encoding.value
     return msgpack.packb(vars(model), default=_packable), _msgpack_name(type(model))
 
 

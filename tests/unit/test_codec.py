@@ -22,9 +22,11 @@ from ldcnd.messaging.codec import (
     error_reply,
     rebuild_error,
     reply_encoding,
+    to_json,
 )
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.errors import ErrorReply
+from ldcnd.model.frozen import Frozen
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.requests import REQUEST_MODELS, HomeRequest, MoveAbsoluteRequest, PowerRequest, ResetRequest
 from ldcnd.model.samples import CurrentCommand, FaultEntry, FaultSample, StateSample
@@ -295,3 +297,22 @@ def test_an_error_code_that_the_client_knows_is_its_class() -> None:
     error = decode_error(*encode(error_reply(PositionLimit("x: too far", axis="x")), Encoding.JSON))
 
     assert (type(error), error.message) == (PositionLimit, "x: too far")
+
+
+class _NotBuiltYet(Frozen):
+    """A model that nobody has used before."""
+
+    name: str
+    count: int = 3
+
+
+@given(moves)
+def test_json_is_that_of_pydantic(move):
+    for without in (False, True):
+        assert to_json(move, exclude_defaults=without) == move.model_dump_json(exclude_defaults=without).encode()
+
+
+def test_json_of_a_model_that_was_never_validated_is_that_of_pydantic():
+    made = _NotBuiltYet.model_construct(name="x", count=3)
+
+    assert to_json(made, exclude_defaults=True) == b'{"name":"x"}'
