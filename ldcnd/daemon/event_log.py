@@ -10,6 +10,7 @@ from ldcnd.daemon.ledger import Entry
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.errors import LdcndError, SessionError
 from ldcnd.log import get_logger
+from ldcnd.messaging.codec import to_json
 from ldcnd.model.events import CommandEvent, EventList, EventsRequest
 
 log = get_logger("events")
@@ -123,7 +124,7 @@ def _fitting(events: Iterable[CommandEvent]) -> list[CommandEvent]:
     fitting: list[CommandEvent] = []
     room = PAGE_BYTES
     for event in events:
-        room -= len(event.model_dump_json()) + 1
+        room -= len(to_json(event)) + 1
         if fitting and room < 0:
             break
         fitting.append(event)

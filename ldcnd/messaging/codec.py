@@ -98,7 +98,7 @@ _ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
 
 
 def to_json(model: Frozen, *, exclude_defaults: bool = False) -> bytes:
-    """Return what `model_dump_json` makes, in bytes: a command waits for it twice, and it takes half of the time."""
+    """Return what `model_dump_json` makes, in bytes and in half of the time: a command waits for it twice."""
     return model.__pydantic_serializer__.to_json(model, exclude_defaults=exclude_defaults)
 
 

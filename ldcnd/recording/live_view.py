@@ -11,6 +11,7 @@ from typing import Self
 from foxglove import Channel, Context, Schema, start_server
 
 from ldcnd.errors import ConfigError, LdcndError
+from ldcnd.messaging.codec import to_json
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.frozen import Frozen
 from ldcnd.recording.messages import message_of, schema_of
@@ -65,7 +66,7 @@ class LiveView:
         if channel is None:
             channel = self._channels[sample.key] = self._channel(sample.key, type(message))
         if channel.has_sinks():
-            channel.log(message.model_dump_json().encode(), log_time=value.t)
+            channel.log(to_json(message), log_time=value.t)
 
     def _channel(self, key: str, message: type[Frozen]) -> Channel:
         name, text = schema_of(message)

@@ -12,6 +12,7 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from ldcnd.errors import ConfigError
+from ldcnd.messaging.codec import to_json
 from ldcnd.model.frozen import Frozen
 from ldcnd.recording.messages import message_of, schema_of
 from ldcnd.recording.topics import Published
@@ -54,7 +55,7 @@ class McapFile:
         channel = self._channels.get(key)
         if channel is None:
             channel = self._channels[key] = self._writer.register_channel(f"/{key}", "json", self._schema(message))
-        data = message.model_dump_json().encode()
+        data = to_json(message)
         self._writer.add_message(channel, now_ns, data, publish_time=value.t, sequence=value.seq & 0xFFFFFFFF)
 
     def flush(self) -> None:
