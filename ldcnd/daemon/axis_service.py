@@ -237,7 +237,7 @@ class AxisService:
         try:
             return await self._confirmed_stop(mode, verb)
         finally:
-            self._publish_state()
+            self.telemetry.state(self._clock.now_ns())
 
     async def _confirmed_stop(self, mode: StopMode, verb: Verb) -> bool:
         for _ in range(STOP_ROUNDS):
@@ -297,6 +297,3 @@ class AxisService:
         return StopLatched(
             f"axis {self.config.name}: {what} was overtaken by a stop", axis=self.config.name, remedy="send reset"
         )
-
-    def _publish_state(self) -> None:
-        self.telemetry.state(self._clock.now_ns())
