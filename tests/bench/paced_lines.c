@@ -146,17 +146,17 @@ static void obey(struct line *l, double over)
     l->request_over = over;
 }
 
-/* Read what the host has written until `at`; false when there is nothing. */
-static int take(struct line *l, int64_t at)
+/* Read what the host has written until `at`. */
+static void take(struct line *l, int64_t at)
 {
     unsigned char data[256];
     ssize_t count = read(l->master, data, sizeof data);
-    if (count <= 0) return 0;
+    if (count <= 0) return;
     double byte = 1e10 / host_baud(l->master), module_baud = CLOCK_HZ / (l->divisor + 1);
     double ratio = 1e10 / byte / module_baud;
     if (l->reply_over && at - l->reply_over < LONGEST_GAP_NS && l->gap_count < RECORDS)
         l->gap_us[l->gap_count++] = (at - l->reply_over) * 1e-3;
-    if (ratio < 0.955 || ratio > 1.045) { l->have = 0; return 1; }
+    if (ratio < 0.955 || ratio > 1.045) { l->have = 0; return; }
     for (ssize_t i = 0; i < count; i++) {
         if (l->have == 0 && data[i] != 0xAA) continue;
         l->packet[l->have++] = data[i];
@@ -173,7 +173,6 @@ static int take(struct line *l, int64_t at)
             l->exchange_count++;
         }
     }
-    return 1;
 }
 
 static int is_answering(const struct line *l) { return l->sent < l->reply_bytes; }

@@ -66,7 +66,7 @@ def _line_rows(line_program: Path, folder: Path, rounds: int, *, in_one_piece: b
             Row(f"{what}: share of one processor", _median(load.core for load in own)),
             Row(f"{what}: efficiency / that of 1 line", efficiency, "", targets[0]),
             Row(f"{what}: processor time of a poll / that of 1 line", cost, "", targets[1], at_most=True),
-            Row(f"{what}: lateness of the far end, 99 %", _median(load.late_us for load in own), "us"),
+            Row(f"{what}: the lines' own lateness, 99 %", _median(load.late_us for load in own), "us"),
         ]
     return found
 
