@@ -4,10 +4,11 @@ import asyncio
 from unittest.mock import Mock
 
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.event_log import TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
+from ldcnd.daemon.event_log import PAGE_BYTES, TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
 from ldcnd.daemon.ledger import Entry
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.errors import BusDown, SessionError
+from ldcnd.messaging.codec import to_json
 from ldcnd.model.events import CommandStatus, EventsRequest
 from ldcnd.model.requests import PowerRequest, Verb
 
@@ -20,8 +21,10 @@ class Told:
         ticks = iter(range(10**9, 2 * 10**9))
         self.log = EventLog(self.publisher, Clock(lambda: next(ticks)), "run-1")
 
-    def happens(self, status: CommandStatus = CommandStatus.ACCEPTED, error: BusDown | None = None) -> None:
-        entry = Entry("c1", "x", Verb.POWER, PowerRequest(on=False), client=None, status=status)
+    def happens(
+        self, status: CommandStatus = CommandStatus.ACCEPTED, error: BusDown | None = None, client: str | None = None
+    ) -> None:
+        entry = Entry("c1", "x", Verb.POWER, PowerRequest(on=False), client=client, status=status)
         self.log.changed(entry, error)
 
     def published(self) -> list[tuple[int, int, int, str, str | None]]:
@@ -78,3 +81,14 @@ async def test_what_the_network_does_not_take_keeps_nothing_else_back():
 
     assert len(told.published()) == 2
     assert [event.number for event in told.log.page(EventsRequest()).events] == [0, 1]
+
+
+async def test_a_page_of_events_fits_in_bytes_whatever_their_clients_are_called():
+    told = Told()
+    for _ in range(200):
+        told.happens(client="ü" * 64)
+
+    page = told.log.page(EventsRequest(count=200))
+
+    assert 10 < len(page.events) < 200
+    assert sum(len(to_json(event)) + 1 for event in page.events) <= PAGE_BYTES
