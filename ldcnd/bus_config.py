@@ -87,6 +87,9 @@ refuse, and skip for smartstep, where the drives' speed only shows on site."""
     stop_probe_hz: float = Field(default=0.5, ge=0, le=20)
     """How often it is measured how long a stop would wait, by a question in its place; ldcn only, 0 for never. \
 None where polls would miss their turns for it."""
+    pre_empt_polls: bool = False
+    """A stop does not wait for the reply to a poll, which the drive takes back: of use on slow lines of PIC-SERVO \
+drives."""
     order: Literal["deadline", "phase"] = "phase"
     """Between polls that are equally urgent: who is due longest, or whose servo cycle ends first, so that more fit."""
     start: StartPolicy = StartPolicy.RESET
@@ -110,6 +113,12 @@ None where polls would miss their turns for it."""
     def skips(self) -> bool:
         """Whether rates that the line may not be able to keep are let pass."""
         return self.overload == "skip" or (self.overload is None and self.family == "smartstep")
+
+    @property
+    def _models(self) -> dict[int, str]:
+        """What is on the line, by address."""
+        models = {axis.address: axis.model for axis in self.axis}
+        return models | {module.address: module.model for module in self.module}
 
     @model_validator(mode="after")
     def _unique_addresses(self) -> Self:
@@ -135,12 +144,21 @@ None where polls would miss their turns for it."""
 
     @model_validator(mode="after")
     def _reachable_rate(self) -> Self:
-        models = {axis.address: axis.model for axis in self.axis}
-        models.update({module.address: module.model for module in self.module})
-        for address, model in models.items():
+        for address, model in self._models.items():
             profile = PROFILES.get(model)
             if profile and self.baud > profile.top_baud:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {profile.top_baud} at most")
+        return self
+
+    @model_validator(mode="after")
+    def _obliging_drives(self) -> Self:
+        obliging = [name for name, profile in PROFILES.items() if profile.takes_back]
+        for address, model in self._models.items():
+            if self.pre_empt_polls and model not in obliging:
+                raise ValueError(
+                    f"pre_empt_polls: nothing says that a {model} (address {address}) takes its reply back when it"
+                    f" hears the host; {', '.join(obliging)} do"
+                )
         return self
 
     @model_validator(mode="after")

@@ -9,6 +9,7 @@ from ldcnd.bus.line_phase import Phase
 from ldcnd.bus.mute_nodes import MuteNodes
 from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poller import Poller
+from ldcnd.bus.pre_empting_line import PreEmptingLine
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
@@ -243,7 +244,8 @@ class Bus:
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
         self._mute.forget()
-        self._line = line = Line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
+        make_line = PreEmptingLine if self.settings.pre_empts_polls else Line
+        self._line = line = make_line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
         self._closed.clear()
         self._opened.set()
         log.info("line open", bus=self.settings.name, baud=self.settings.baud)
@@ -290,6 +292,10 @@ class Bus:
     def stop_waits(self) -> bool:
         """See `Users`."""
         return self._queue.stop_waits()
+
+    def stops(self) -> list[Job]:
+        """See `Users`."""
+        return [job for job in self._queue.waiting(Lane.STOP) if not job.abandoned]
 
     def failing(self) -> set[int]:
         """See `Users`."""

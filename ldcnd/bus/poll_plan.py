@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from ldcnd.bus.cost import Cost
 from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
+from ldcnd.bus.settings import HOST_LATE_S, WORTH_S
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
@@ -56,6 +57,7 @@ class Urgent:
         margin_s: by which a reply's deadline exceeds its longest time.
         search_s: longest question to a drive that has been lost; it is asked while one is missing only.
         probe: of the stop lane; None for none.
+        pre_empts_polls: stops do not wait for the replies to polls; see `PreEmptingLine`.
     """
 
     command_s: float
@@ -64,6 +66,7 @@ class Urgent:
     margin_s: float
     search_s: float = 0.0
     probe: PeriodicTask | None = None
+    pre_empts_polls: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +79,8 @@ class LinePlan:
         load: share of the line that polls take at worst, `mean_load` on average.
         commands_per_s: so many evenly spaced commands fit in before a poll misses its turn in the worst case.
         stop_wait_s: from queueing a stop to its first bit at the latest, on a line that is in step.
-        stop_s: the same to the end of its reply.
+        stop_ahead_s: the same behind a poll where it does not wait for the reply; None where it does.
+        stop_s: to the end of its reply.
         stop_after_loss_s: to the end of its reply when the exchange on the wire is lost.
     """
 
@@ -86,6 +90,7 @@ class LinePlan:
     mean_load: float
     commands_per_s: float
     stop_wait_s: float
+    stop_ahead_s: float | None
     stop_s: float
     stop_after_loss_s: float
 
@@ -116,6 +121,9 @@ def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True
     probes = [urgent.probe] if urgent.probe else []
     longest_s = max([urgent.command_s, *(task.cost_s for task in tasks)])
     stop_s = longest_s + urgent.stop_s
+    ahead_s = _stop_ahead_s(polls) if urgent.pre_empts_polls else None
+    if ahead_s is not None:
+        stop_s = max(stop_s, ahead_s + HOST_LATE_S + 2 * urgent.stop_s + urgent.margin_s + urgent.recovery_s)
     return LinePlan(
         polls=tuple(polls),
         responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else _in_turns_s(polls, probes)),
@@ -123,9 +131,16 @@ def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True
         mean_load=math.fsum(poll.rate_hz * poll.mean_s for poll in polls) + load_of(probes),
         commands_per_s=_most_commands_per_s(polls, probes, urgent.command_s, by_deadline=by_deadline),
         stop_wait_s=longest_s,
+        stop_ahead_s=ahead_s,
         stop_s=stop_s,
         stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
     )
+
+
+def _stop_ahead_s(polls: Sequence[Poll]) -> float:
+    """Return how long a stop waits at most that comes while a poll is on the wire and does not wait for its reply."""
+    costs = [poll.cost for poll in polls]
+    return max(cost.longest_s - max(0.0, cost.reply_s - HOST_LATE_S - WORTH_S) for cost in costs)
 
 
 def in_time(polls: Sequence[Poll], urgent: Sequence[PeriodicTask], *, by_deadline: bool) -> bool:

@@ -1,5 +1,6 @@
 """The contract between a line and the bus that it serves."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from ldcnd.bus.turn import Turn
@@ -27,6 +28,9 @@ class Users(Protocol):
 
     def stop_waits(self) -> bool:
         """Tell whether a stop is queued."""
+
+    def stops(self) -> Sequence[Turn]:
+        """Return the stops that are queued, first to go first."""
 
     def failing(self) -> set[int]:
         """Return the nodes that left their last exchange unanswered."""

@@ -131,6 +131,7 @@ def _build_bus(
             settings.name,
             opening_baud,
             margin_s=settings.margin_ms / 1000,
+            pre_empts_polls=settings.pre_empt_polls,
             cycle=_cycle(settings) if settings.order == "phase" else None,
             recorded_s=settings.recorder.seconds,
             recorded_bytes=settings.recorder.memory_mb * 1_000_000,

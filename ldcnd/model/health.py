@@ -102,6 +102,8 @@ class BusHealth(Frozen):
     """How often the line was fenced."""
     stray_bytes: int = Field(ge=0)
     """Bytes that nobody had asked for."""
+    taken_back: int = Field(default=0, ge=0)
+    """Replies to polls for which a stop did not wait (`pre_empt_polls` in the configuration)."""
     losses: int = Field(ge=0)
     """How often the port was lost."""
     lanes: tuple[LaneHealth, ...]

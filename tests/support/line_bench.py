@@ -47,6 +47,9 @@ class RecordingTurn(Turn):
         again, self.send_again = self.send_again, False
         return again
 
+    def taken_back(self) -> None:
+        self.story.append(f"taken back {toy.number_of(self.exchange.request)}")
+
     def rejected(self) -> bool:
         self.story.append(f"rejected {toy.number_of(self.exchange.request)}")
         again, self.send_again = self.send_again, False
@@ -82,6 +85,9 @@ class PlainUsers:
     def stop_waits(self) -> bool:
         return any(turn.lane is Lane.STOP for turn in self.waiting)
 
+    def stops(self) -> list[Turn]:
+        return [turn for turn in self.waiting if turn.lane is Lane.STOP]
+
     def failing(self) -> set[int]:
         return self.mute
 
@@ -102,6 +108,8 @@ class PlainUsers:
 class Bench:
     """A line between plain users and a scripted far end."""
 
+    make_line: type[Line] = Line
+
     def __init__(self, *, echo: bool = False, paced: bool = True, resync: Resync = toy.RESYNC):
         self.users = PlainUsers()
         self.wire = ScriptedLine(toy.answer)
@@ -109,7 +117,7 @@ class Bench:
         self.statistics = BusStatistics()
         self.log = WireLog()
         settings = BusSettings("toy", 115_200, margin_s=MARGIN_S, echo=echo, paced=paced)
-        self.line = Line(settings, self.wire, self.users, resync, self.statistics, self.log)
+        self.line = self.make_line(settings, self.wire, self.users, resync, self.statistics, self.log)
 
     def add(
         self,

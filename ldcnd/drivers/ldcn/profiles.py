@@ -51,6 +51,8 @@ class Profile:
         current_limit: Set Gain's CL byte works.
         top_baud: the highest rate of Set Baud Rate.
         sc_extensions: Reset Position with data, output modes in command 0x8, path points and Hard Reset with data.
+        takes_back: what it sends ends as soon as it hears the host (PIC-SERVO manual, 4.1; the LS-182AP manual does not
+            say so).
         motion_lock_from: from this version on, Stop Motor bit 7 unlocks motion and aux bit 7 says that it is locked
             (after homing on a limit); None on devices without the lock.
     """
@@ -83,10 +85,19 @@ class Profile:
     current_limit: bool = True
     top_baud: int = 115_200
     sc_extensions: bool = False
+    takes_back: bool = False
     motion_lock_from: int | None = None
 
 
-PIC_SERVO_V4 = Profile("pic-servo-v4", "PIC-SERVO version 4", 0, range(4, 5), Support.FULL, limit_outputs=True)
+PIC_SERVO_V4 = Profile(
+    "pic-servo-v4",
+    "PIC-SERVO version 4",
+    0,
+    range(4, 5),
+    Support.FULL,
+    limit_outputs=True,
+    takes_back=True,
+)
 PIC_SERVO_V3 = replace(
     PIC_SERVO_V4,
     name="pic-servo-v3",
