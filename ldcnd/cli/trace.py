@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
@@ -80,7 +81,7 @@ def take(
     timeout: float,
     out: Path | None,
 ) -> None:
-    """Record channels of AXIS; what it has is in `ldcnd axis list --json`. Ctrl-C ends the trace."""
+    """Record channels of AXIS; what it has is in `ldcnd axis list --json`. Ctrl-C and SIGTERM end the trace."""
     request = TraceRequest(
         channels=channels,
         interval_s=FASTEST if isinstance(interval, str) else interval,
@@ -97,6 +98,7 @@ def take(
             await wait_for_trace(client, axis, reply.trace_id, within_s)
             return await fetch_trace(client, axis, reply.trace_id)
 
+    end_as_interrupted()
     _deliver(target, target.run(work), out)
 
 

@@ -22,7 +22,8 @@ async def ldcnd(*arguments):
     return running.returncode, printed.decode(), errors.decode()
 
 
-async def test_ctrl_c_ends_the_trace_that_waits():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_ctrl_c_and_sigterm_end_the_trace_that_waits(number):
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
         words = ("trace", "take", "x", "-e", endpoint, "-c", "position", "--trigger", "position:rising:5")
         taking = await asyncio.create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE)
@@ -30,7 +31,7 @@ async def test_ctrl_c_ends_the_trace_that_waits():
             while (header := await rig.trace_header("x")) is None or header.phase is not TracePhase.WAITING:
                 await asyncio.sleep(0.1)
             early = await ldcnd("trace", "last", "x", "-e", endpoint)
-            taking.send_signal(signal.SIGINT)
+            taking.send_signal(number)
             await taking.communicate()
         header = await rig.trace_header("x")
 
