@@ -9,6 +9,7 @@ class Row:
 
     Attributes:
         at_most: the target is an upper limit; otherwise a lower one.
+        doubt: why the figure says little of the daemon in this run; it is not judged then.
     """
 
     name: str
@@ -16,12 +17,15 @@ class Row:
     unit: str = ""
     target: float | None = None
     at_most: bool = False
+    doubt: str = ""
 
     @property
     def verdict(self) -> str:
         """Say whether the target is met."""
         if self.target is None:
             return ""
+        if self.doubt:
+            return f"not judged: {self.doubt}"
         met = self.value <= self.target if self.at_most else self.value >= self.target
         return "met" if met else "MISSED"
 

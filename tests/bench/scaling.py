@@ -1,4 +1,4 @@
-"""What a poll costs the processor with more drives on a line, and with more lines in a process."""
+"""What a poll costs the processor with more items, with more drives on a line, and with more lines in a process."""
 
 import random
 import statistics
@@ -21,11 +21,23 @@ AXES = (1, 4, 16, 31)
 LINES = (1, 2, 4, 8)
 AXES_OF_A_LINE = 8
 BAUD = 115_200
-ITEMS = ("position", "velocity", "adc")
+ALL_ITEMS = ("position", "velocity", "adc", "state")
+ITEMS = ALL_ITEMS[:3]
 SETTLE_S = 0.5
 LEAST_EXCHANGES = 10
 """A line that is polled has more in half a second, however busy the machine is."""
 ROUND_S = 1.0
+LATE_US = 100.0
+"""Lines that are later than this in one of a hundred bytes measure themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What one daemon has to do."""
+
+    lines: int = 1
+    axes: int = AXES_OF_A_LINE
+    items: tuple[str, ...] = ITEMS
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,57 +51,81 @@ class Load:
 
 
 def rows(line_program: Path, folder: Path, rounds: int) -> list[Row]:
-    """Measure one line with more and more drives, then more and more lines of 8 drives."""
-    shapes = [(1, axes) for axes in AXES]
-    loads = _measure(line_program, folder, shapes, rounds, in_one_piece=True)
-    found = [
-        Row(f"1 line, {axes} drive(s): processor time of a poll", _median(load.cpu_us for load in loads[1, axes]), "us")
-        for _, axes in shapes
-    ]
+    """Measure one line with more and more items, then drives, then more and more lines of 8 drives."""
+    found = _item_rows(line_program, folder, rounds) + _axis_rows(line_program, folder, rounds)
     for in_one_piece in (False, True):
         found += _line_rows(line_program, folder, rounds, in_one_piece=in_one_piece)
     return found
 
 
+def _item_rows(line_program: Path, folder: Path, rounds: int) -> list[Row]:
+    shapes = [Shape(items=ALL_ITEMS[:count]) for count in range(1, len(ALL_ITEMS) + 1)]
+    loads = _measure(line_program, folder, shapes, rounds, in_one_piece=True)
+    found, one = [], loads[shapes[0]]
+    for shape in shapes:
+        own, count = loads[shape], len(shape.items)
+        what = f"1 line of 8 drives, {count} item(s) a poll"
+        found.append(Row(f"{what}: processor time of a poll", _median(load.cpu_us for load in own), "us"))
+        if count > 1:
+            share = _median(load.cpu_us / count / base.cpu_us for load, base in zip(own, one, strict=True))
+            found.append(Row(f"{what}: processor time for each item / with one", share, "", 1.0, at_most=True))
+    return found
+
+
+def _axis_rows(line_program: Path, folder: Path, rounds: int) -> list[Row]:
+    shapes = [Shape(axes=axes) for axes in AXES]
+    loads = _measure(line_program, folder, shapes, rounds, in_one_piece=True)
+    return [
+        Row(
+            f"1 line, {shape.axes} drive(s): processor time of a poll",
+            _median(load.cpu_us for load in loads[shape]),
+            "us",
+        )
+        for shape in shapes
+    ]
+
+
 def _line_rows(line_program: Path, folder: Path, rounds: int, *, in_one_piece: bool) -> list[Row]:
-    shapes = [(lines, AXES_OF_A_LINE) for lines in LINES]
+    shapes = [Shape(lines) for lines in LINES]
     loads = _measure(line_program, folder, shapes, rounds, in_one_piece=in_one_piece)
     found, one = [], loads[shapes[0]]
-    for lines, axes in shapes:
-        own = loads[lines, axes]
-        targets = (0.97, 0.75) if lines == LINES[-1] else (None, None)
-        what = f"{lines} line(s) of {axes} drives, replies {'in one piece' if in_one_piece else 'byte by byte'}"
+    for shape in shapes:
+        own = loads[shape]
+        targets = (0.97, 0.75) if shape is shapes[-1] else (None, None)
+        delivery = "in one piece" if in_one_piece else "byte by byte"
+        what = f"{shape.lines} line(s) of {shape.axes} drives, replies {delivery}"
         efficiency = _median(load.efficiency / base.efficiency for load, base in zip(own, one, strict=True))
         cost = _median(load.cpu_us / base.cpu_us for load, base in zip(own, one, strict=True))
+        late_us = _median(load.late_us for load in own)
+        doubt = f"the lines themselves were late by {late_us:.0f} us" if late_us > LATE_US else ""
         found += [
             Row(f"{what}: processor time of a poll", _median(load.cpu_us for load in own), "us"),
             Row(f"{what}: share of one processor", _median(load.core for load in own)),
-            Row(f"{what}: efficiency / that of 1 line", efficiency, "", targets[0]),
+            Row(f"{what}: efficiency / that of 1 line", efficiency, "", targets[0], doubt=doubt),
             Row(f"{what}: processor time of a poll / that of 1 line", cost, "", targets[1], at_most=True),
-            Row(f"{what}: the lines' own lateness, 99 %", _median(load.late_us for load in own), "us"),
+            Row(f"{what}: the lines' own lateness, 99 %", late_us, "us"),
         ]
     return found
 
 
 def _measure(
-    line_program: Path, folder: Path, shapes: list[tuple[int, int]], rounds: int, *, in_one_piece: bool
-) -> dict[tuple[int, int], list[Load]]:
-    """Run one daemon for each shape (lines, drives on each) in turn."""
+    line_program: Path, folder: Path, shapes: list[Shape], rounds: int, *, in_one_piece: bool
+) -> dict[Shape, list[Load]]:
+    """Run one daemon for each shape in turn."""
     dice = random.Random(1)
-    loads: dict[tuple[int, int], list[Load]] = {shape: [] for shape in shapes}
+    loads: dict[Shape, list[Load]] = {shape: [] for shape in shapes}
     with ExitStack() as stack:
         subjects = {}
         for shape in shapes:
-            lines, axes = shape
             paced = stack.enter_context(
-                paced_lines(line_program, lines=lines, modules=axes, ready_baud=0, burst=in_one_piece)
+                paced_lines(line_program, lines=shape.lines, modules=shape.axes, ready_baud=0, burst=in_one_piece)
             )
-            config, endpoint = folder / f"scaling-{lines}-{axes}.toml", free_endpoint()
-            settings = {"modules": axes, "baud": BAUD, "hz": 2000.0, "items": ITEMS}
+            config, endpoint = folder / f"scaling-{len(subjects)}.toml", free_endpoint()
+            settings = {"modules": shape.axes, "baud": BAUD, "hz": 2000.0, "items": shape.items}
             config.write_text(config_text(*paced.terminals, uvloop=True, **settings))
             running = stack.enter_context(daemon(config, endpoint))
             stack.enter_context(subscriber(endpoint))
-            subjects[shape] = Subject(f"{lines} x {axes}", running, paced)
+            subjects[shape] = Subject(str(shape), running, paced)
             _until_polled(subjects[shape])
             subjects[shape].stop()
         for _ in range(rounds):

@@ -1,0 +1,83 @@
+"""What a poll costs the daemon, counted in calls of its own functions: exact where times scatter."""
+
+import asyncio
+import sys
+from itertools import pairwise
+from pathlib import Path
+from types import CodeType, FrameType
+
+import ldcnd
+from ldcnd.bus.poll_rank import CHOICE
+from ldcnd.config import RigConfig
+from tests.support.rig import running_rig
+
+PACKAGE = str(Path(ldcnd.__file__).parent)
+ITEMS = ("position", "velocity", "adc", "state")
+AXES = (1, 4, 16, 31)
+HZ = 1000.0
+"""More than the line carries."""
+COUNTED_S = 2.0
+CALLS_OF_A_CHOICE = 4
+
+
+def config(*, axes: int, items: tuple[str, ...], order: str) -> RigConfig:
+    rates = dict.fromkeys(ITEMS, 0.0) | {"state": 1.0} | dict.fromkeys(items, HZ)
+    drives = [
+        {"name": f"a{n}", "address": n, "model": "ls-182ap", "velocity": 1, "acceleration": 1, "rates": rates}
+        for n in range(1, axes + 1)
+    ]
+    bus = {"name": "line0", "port": "sim:line0", "baud": 115_200, "overload": "skip", "order": order, "axis": drives}
+    return RigConfig.model_validate(
+        {"rig": "sim", "bus": [bus], "sim": [{"name": "line0", "module": [{"model": "ls182ap"}] * axes}]}
+    )
+
+
+def is_daemons(code: CodeType) -> bool:
+    """Tell whether code is the daemon's own; what simulates the line is not."""
+    file = code.co_filename
+    simulates = "/sim/" in file or "simulat" in file or code.co_qualname.startswith("PacketReader.")
+    return file.startswith(PACKAGE) and not simulates
+
+
+async def calls_of_a_poll(*, axes: int = 8, items: tuple[str, ...] = ITEMS, order: str = "deadline") -> float:
+    """Poll a line as often as it can be, and return how many functions a poll calls on average."""
+    calls = 0
+
+    def count(frame: FrameType, event: str, _argument: object) -> None:
+        nonlocal calls
+        calls += event == "call" and is_daemons(frame.f_code)
+
+    async with running_rig(config(axes=axes, items=items, order=order)) as rig:
+        statistics = rig.daemon.rig.buses[0].bus.statistics
+        await asyncio.sleep(1.0)
+        before = statistics.replies
+        sys.setprofile(count)
+        try:
+            await asyncio.sleep(COUNTED_S)
+        finally:
+            sys.setprofile(None)
+        return calls / (statistics.replies - before)
+
+
+async def test_a_further_item_adds_an_eighth_of_the_first_at_most_whatever_else_is_read():
+    calls = [await calls_of_a_poll(items=ITEMS[:count]) for count in range(1, len(ITEMS) + 1)]
+    steps = [more - fewer for fewer, more in pairwise(calls)]
+    print(f"calls with 1 to {len(ITEMS)} items: {[round(each, 1) for each in calls]}")
+
+    assert all(0.0 < step < calls[0] / 8 for step in steps)
+
+
+async def test_a_poll_costs_the_same_with_any_number_of_axes():
+    calls = [await calls_of_a_poll(axes=axes) for axes in AXES]
+    print(f"calls with {AXES} axes: {[round(each, 1) for each in calls]}")
+
+    assert max(calls) < 1.05 * min(calls)
+
+
+async def test_to_choose_by_phase_costs_a_call_for_each_candidate_and_no_more():
+    by_deadline = [await calls_of_a_poll(axes=axes) for axes in AXES]
+    by_phase = [await calls_of_a_poll(axes=axes, order="phase") for axes in AXES]
+    more = [phase - deadline for phase, deadline in zip(by_phase, by_deadline, strict=True)]
+    print(f"calls more with {AXES} axes: {[round(each, 1) for each in more]}")
+
+    assert max(more) < CALLS_OF_A_CHOICE + CHOICE
