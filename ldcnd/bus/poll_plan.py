@@ -6,11 +6,12 @@ a lost reply costs is told apart: no schedule can promise deadlines on a line th
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ldcnd.bus.cost import Cost
+from ldcnd.bus.rehearsal import Drive, mean_lengths_s
 from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
-from ldcnd.bus.settings import HOST_LATE_S, WORTH_S
+from ldcnd.bus.settings import HOST_LATE_S, WORTH_S, ServoCycle
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
@@ -39,6 +40,11 @@ class Poll:
     request_bytes: int = 0
     reply_bytes: int = 0
     exchanges: int = 1
+
+    @property
+    def mean_cost(self) -> Cost:
+        """As `cost`, with a reply that is as long as it is on average."""
+        return replace(self.cost, reply_s=self.cost.reply_s - (self.cost.mean_s - self.mean_s))
 
     @property
     def task(self) -> PeriodicTask:
@@ -109,13 +115,16 @@ class LinePlan:
         return not self.late
 
 
-def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True) -> LinePlan:
+def plan_line(
+    polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True, cycle: ServoCycle | None = None
+) -> LinePlan:
     """Work out what a line promises.
 
     Args:
         polls: what is asked of it.
         urgent: what goes before them.
         by_deadline: the earliest deadline goes first; otherwise axes take turns, exchange by exchange.
+        cycle: of the drives, where polls with the same deadline are ordered by it.
     """
     tasks = [poll.task for poll in polls]
     probes = [urgent.probe] if urgent.probe else []
@@ -128,13 +137,20 @@ def plan_line(polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True
         polls=tuple(polls),
         responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else _in_turns_s(polls, probes)),
         load=load_of([*tasks, *probes]),
-        mean_load=math.fsum(poll.rate_hz * poll.mean_s for poll in polls) + load_of(probes),
+        mean_load=_mean_load(polls, cycle) + load_of(probes),
         commands_per_s=_most_commands_per_s(polls, probes, urgent.command_s, by_deadline=by_deadline),
         stop_wait_s=longest_s,
         stop_ahead_s=ahead_s,
         stop_s=stop_s,
         stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
     )
+
+
+def _mean_load(polls: Sequence[Poll], cycle: ServoCycle | None) -> float:
+    lengths_s: Sequence[float] = [poll.mean_s for poll in polls]
+    if cycle and len(polls) > 1:
+        lengths_s = mean_lengths_s(tuple(Drive(poll.rate_hz, poll.mean_cost) for poll in polls), cycle)
+    return math.fsum(poll.rate_hz * length_s for poll, length_s in zip(polls, lengths_s, strict=True))
 
 
 def _stop_ahead_s(polls: Sequence[Poll]) -> float:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings, ServoCycle
+from ldcnd.bus.settings import BusSettings
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, SimulatedLineConfig
 from ldcnd.daemon.authority import random_token
@@ -22,13 +22,12 @@ from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.demand import Demand
 from ldcnd.daemon.event_log import EventLog
 from ldcnd.daemon.ledger import Ledger
-from ldcnd.daemon.planning import with_probes_that_fit
+from ldcnd.daemon.planning import servo_cycle, with_probes_that_fit
 from ldcnd.daemon.publishing import Publisher
 from ldcnd.daemon.rig import Rig
 from ldcnd.daemon.smartstep_line import build_line, open_ledger
 from ldcnd.drivers.driver import AxisDriver, AxisSpec, Gains
 from ldcnd.drivers.ldcn.network import RESET_BAUD
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
 from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.drivers.line import GroupSpec, LineSpec, ModuleEntry
 from ldcnd.drivers.registry import FAMILIES
@@ -132,7 +131,7 @@ def _build_bus(
             opening_baud,
             margin_s=settings.margin_ms / 1000,
             pre_empts_polls=settings.pre_empt_polls,
-            cycle=_cycle(settings) if settings.order == "phase" else None,
+            cycle=servo_cycle(settings),
             recorded_s=settings.recorder.seconds,
             recorded_bytes=settings.recorder.memory_mb * 1_000_000,
         ),
@@ -151,11 +150,6 @@ def _build_bus(
         demands=demands,
         stop_probe_hz=with_probes_that_fit(settings).stop_probe_hz,
     )
-
-
-def _cycle(settings: BusConfig) -> ServoCycle:
-    node_baud = actual_baud(baud_divisor(settings.baud, BaudCodes(settings.divisors)))
-    return ServoCycle(SERVO_CYCLE_S, settings.baud / node_baud)
 
 
 def _spec(axis: AxisConfig) -> AxisSpec:

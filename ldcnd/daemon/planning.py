@@ -13,13 +13,14 @@ from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.cost import LineTiming, cost_of
 from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, in_time, largest, plan_line
 from ldcnd.bus.response_times import PeriodicTask
+from ldcnd.bus.settings import ServoCycle
 from ldcnd.bus_config import BAUDS, BusConfig
 from ldcnd.config import RigConfig
 from ldcnd.daemon import smartstep_plan
 from ldcnd.daemon.axis_poller import wanted_rates_hz
 from ldcnd.drivers.ldcn.costs import price_list
 from ldcnd.drivers.ldcn.network import RESET_BAUD
-from ldcnd.drivers.ldcn.registers import BaudCodes
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.errors import ConfigError, ValueOutOfRange
 from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigPlan
@@ -52,7 +53,7 @@ def plan_bus(bus: BusConfig) -> BusPlan:
     bus = with_probes_that_fit(bus)
     line = _line(bus)
     by_deadline = bus.family == "ldcn"
-    plan = plan_line(line.polls, line.urgent, by_deadline=by_deadline)
+    plan = plan_line(line.polls, line.urgent, by_deadline=by_deadline, cycle=servo_cycle(bus))
     return BusPlan(
         bus=bus.name,
         family=bus.family,
@@ -73,6 +74,13 @@ def plan_bus(bus: BusConfig) -> BusPlan:
         remedies=() if plan.holds else tuple(_remedies(_without_probes(bus))),
         polls=tuple(_described(bus, plan)),
     )
+
+
+def servo_cycle(bus: BusConfig) -> ServoCycle | None:
+    """Return the cycle that polls of the line are ordered by; None where they are not."""
+    if bus.family != "ldcn" or bus.order != "phase":
+        return None
+    return ServoCycle(SERVO_CYCLE_S, bus.baud / actual_baud(baud_divisor(bus.baud, BaudCodes(bus.divisors))))
 
 
 def with_probes_that_fit(bus: BusConfig) -> BusConfig:

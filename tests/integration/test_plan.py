@@ -231,7 +231,9 @@ def test_a_smartstep_line_is_let_pass_unless_it_is_told_to_refuse():
 
 
 async def test_the_load_on_average_is_what_the_wire_shows():
-    rig_config = config(axes=4, position=60.0, velocity=60.0, adc=20.0, state=5.0)
+    document = config(axes=4, position=60.0, velocity=60.0, adc=20.0, state=5.0).model_dump()
+    document["bus"][0]["order"] = "deadline"  # drives are waited for half a cycle then
+    rig_config = RigConfig.model_validate(document)
     (planned,) = require_plan(rig_config).buses
 
     async with running_rig(rig_config) as rig:

@@ -1,0 +1,48 @@
+import pytest
+
+from ldcnd.bus.cost import Cost
+from ldcnd.bus.rehearsal import Drive, mean_lengths_s
+from ldcnd.bus.settings import ServoCycle
+
+CYCLE = ServoCycle(0.000_512, 1.0138)
+COST = Cost(request_s=0.000_434, wait_s=CYCLE.length_s, reply_s=0.000_792, overhead_s=0.000_06)
+
+
+def wait_s(drives: int, rate_hz: float, seed: int = 1) -> float:
+    """Return how long drives with equal rates make the line wait on average."""
+    lengths_s = mean_lengths_s((Drive(rate_hz, COST),) * drives, CYCLE, seed)
+    return sum(lengths_s) / drives - COST.wire_s - COST.overhead_s
+
+
+def test_a_drive_by_itself_is_waited_for_half_a_cycle():
+    assert wait_s(1, 37.0) == pytest.approx(CYCLE.length_s / 2, rel=0.05)
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 1000.0])
+def test_the_more_drives_there_are_to_choose_from_the_less_they_are_waited_for(rate_hz: float):
+    waits_s = [wait_s(drives, rate_hz) for drives in (1, 4, 31)]
+
+    assert waits_s == sorted(waits_s, reverse=True)
+    assert waits_s[-1] < 0.5 * waits_s[0]
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 1000.0])
+def test_where_the_cycles_lie_matters_little(rate_hz: float):
+    lengths_s = [COST.wire_s + wait_s(31, rate_hz, seed) for seed in range(8)]
+
+    assert max(lengths_s) < 1.06 * min(lengths_s)
+
+
+def test_a_line_that_polls_all_the_time_is_as_quick_as_one_that_was_simulated_byte_by_byte():
+    """See docs/explanation/timing.md: 756 polls a second by phase, 674 by deadline."""
+    cost = Cost(request_s=COST.request_s, wait_s=COST.wait_s, reply_s=0.000_792, overhead_s=0.0)
+    length_s = sum(mean_lengths_s((Drive(1000.0, cost),) * 31, CYCLE)) / 31
+
+    assert cost.mean_s / length_s == pytest.approx(756 / 674, rel=0.02)
+
+
+def test_a_drive_that_has_no_turn_is_reckoned_with_as_without_an_order():
+    seldom = Drive(0.0001, Cost(0.001, 0.002, 0.003, 0.004))
+    lengths_s = mean_lengths_s((Drive(10_000.0, COST), seldom), CYCLE)
+
+    assert lengths_s[1] == seldom.cost.mean_s
