@@ -152,9 +152,13 @@ drives."""
 
     @model_validator(mode="after")
     def _obliging_drives(self) -> Self:
+        if not self.pre_empt_polls:
+            return self
+        if self.port.startswith("socket://"):
+            raise ValueError(f"pre_empt_polls: nobody knows when a packet leaves behind the network ({self.port})")
         obliging = [name for name, profile in PROFILES.items() if profile.takes_back]
         for address, model in self._models.items():
-            if self.pre_empt_polls and model not in obliging:
+            if model not in obliging:
                 raise ValueError(
                     f"pre_empt_polls: nothing says that a {model} (address {address}) takes its reply back when it"
                     f" hears the host; {', '.join(obliging)} do"

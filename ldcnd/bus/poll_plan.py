@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from ldcnd.bus.cost import Cost
 from ldcnd.bus.rehearsal import Drive, mean_lengths_s
 from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
-from ldcnd.bus.settings import HOST_LATE_S, WORTH_S, ServoCycle
+from ldcnd.bus.settings import HOST_LATE_S, LONGEST_REST_S, ServoCycle
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
@@ -131,7 +131,7 @@ def plan_line(
     longest_s = max([urgent.command_s, *(task.cost_s for task in tasks)])
     stop_s = longest_s + urgent.stop_s
     ahead_s = _stop_ahead_s(polls) if urgent.pre_empts_polls else None
-    if ahead_s is not None:
+    if ahead_s is not None and any(poll.cost.reply_s > LONGEST_REST_S for poll in polls):
         stop_s = max(stop_s, ahead_s + HOST_LATE_S + 2 * urgent.stop_s + urgent.margin_s + urgent.recovery_s)
     return LinePlan(
         polls=tuple(polls),
@@ -156,7 +156,7 @@ def _mean_load(polls: Sequence[Poll], cycle: ServoCycle | None) -> float:
 def _stop_ahead_s(polls: Sequence[Poll]) -> float:
     """Return how long a stop waits at most that comes while a poll is on the wire and does not wait for its reply."""
     costs = [poll.cost for poll in polls]
-    return max(cost.longest_s - max(0.0, cost.reply_s - HOST_LATE_S - WORTH_S) for cost in costs)
+    return max(cost.longest_s - max(0.0, cost.reply_s - LONGEST_REST_S) for cost in costs)
 
 
 def in_time(polls: Sequence[Poll], urgent: Sequence[PeriodicTask], *, by_deadline: bool) -> bool:

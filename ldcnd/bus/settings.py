@@ -12,6 +12,8 @@ HOST_LATE_S = 0.001
 """By so much later than it should have a packet has left the host at most, also through an adapter on USB."""
 WORTH_S = 0.002
 """A stop waits for a poll's reply of which less is left; the timers of an event loop are late by up to half of that."""
+LONGEST_REST_S = HOST_LATE_S + WORTH_S
+"""A reply that takes no longer than this is always waited for."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,10 +91,15 @@ class Daemon:
         """
         return capture_of(snapshot_of(self.rig.line(bus), self._run.clock), self._config, self._run, cause)
 
-    def reconfigure(self, config: RigConfig) -> None:
-        """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`."""
+    def reconfigure(self, config: RigConfig, plan: RigPlan) -> None:
+        """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`.
+
+        Args:
+            config: the rig.
+            plan: of its lines; to work it out takes longer than lines should be held up.
+        """
         self._config = config
-        self._describing.plan = plan = plan_rig(config)
+        self._describing.plan = plan
         self._health.stop_bounds_s = _stop_bounds_s(plan)
         axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
         for bus in self.rig.buses:

@@ -18,6 +18,7 @@ from ldcnd.daemon.systemd import Notifier
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.model.axes import LinkState
+from ldcnd.model.plan import RigPlan
 
 log = get_logger("service")
 
@@ -127,25 +128,24 @@ class Service:
         """Take what can be taken; return what the status must say about the rest."""
         try:
             async with asyncio.timeout(RELOAD_TIME_S):
-                reload = await asyncio.to_thread(self._prepare, self._daemon.config)
+                reload, plan = await asyncio.to_thread(self._prepare, self._daemon.config)
         except TimeoutError:
             log.error("configuration not reloaded", reason=f"not read within {RELOAD_TIME_S:g} s")
             return "configuration not reloaded: it cannot be read"
         except ConfigError as error:
             log.error("configuration not reloaded", reason=error.message, code=error.code.value)
             return f"configuration not reloaded: {error.message.splitlines()[0]}"
-        self._daemon.reconfigure(reload.config)
+        self._daemon.reconfigure(reload.config, plan)
         log.info("configuration reloaded", changed=reload.changed)
         if not reload.refused:
             return ""
         log.warning("changes need a restart", keys=reload.refused)
         return f"restart needed for {', '.join(reload.refused)}"
 
-    def _prepare(self, running: RigConfig) -> Reload:
+    def _prepare(self, running: RigConfig) -> tuple[Reload, RigPlan]:
         """Read and judge the file, beside the loop: lines go on meanwhile."""
         reload = plan_reload(running, self._load())
-        require_plan(reload.config)
-        return reload
+        return reload, require_plan(reload.config)
 
 
 def describe(rig: Rig) -> str:

@@ -8,6 +8,7 @@ import pytest
 from ldcnd.config import RigConfig, TelemetryConfig, load_config
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.demand import LINGER_S
+from ldcnd.daemon.planning import plan_rig
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.zenoh_session import open_zenoh_session
@@ -137,7 +138,8 @@ async def test_changed_rates_count_at_once_for_what_is_taken_and_what_is_not():
             axis.model_copy(update={"rates": axis.rates.model_copy(update={"position": 10.0, "idle": 0.5})})
             for axis in bus.axis
         )
-        rig.daemon.reconfigure(config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)}))
+        changed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+        rig.daemon.reconfigure(changed, plan_rig(changed))
         async with rig.client.samples("x", "position"):
             await asyncio.sleep(1.2)
             asked, _ = await rates(rig)

@@ -4,10 +4,12 @@ import asyncio
 import random
 
 import pytest
+from click.testing import CliRunner
 from pydantic import ValidationError
 
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.pre_empting_line import AHEAD
+from ldcnd.cli.main import cli
 from ldcnd.config import RigConfig
 from ldcnd.daemon.planning import plan_rig, require_plan
 from ldcnd.drivers.ldcn import commands
@@ -18,6 +20,7 @@ from ldcnd.messaging.codec import decode
 from ldcnd.model.axes import AxisState, LinkState, Moving
 from ldcnd.model.health import BusHealth
 from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, ResetRequest, Verb
+from tests.support.captures import FOLDER
 from tests.support.rig import RunningRig, running_rig
 
 STOP = commands.stop_motor(Node(1, PROFILES["pic-servo-v4"]), StopControl.MOTOR_OFF)
@@ -134,12 +137,28 @@ def test_only_drives_that_take_their_replies_back_may_be_pre_empted():
         config(model="ls-182ap")
 
 
-def test_the_plan_says_what_the_option_brings(tmp_path):
+def test_no_stop_goes_ahead_on_a_port_behind_a_network():
+    behind_it = document()
+    behind_it["bus"][0]["port"] = "socket://127.0.0.1:9"
+    with pytest.raises(ValidationError, match="nobody knows when a packet leaves behind the network"):
+        RigConfig.model_validate(behind_it)
+
+
+def test_the_plan_says_what_the_option_brings():
     (without,) = plan_rig(config(pre_empt_polls=False)).buses
     (with_it,) = plan_rig(config()).buses
     (fast,) = plan_rig(config(baud=115_200)).buses
+    (fast_without,) = plan_rig(config(baud=115_200, pre_empt_polls=False)).buses
 
     assert without.stop_ahead_s is None
     assert with_it.stop_ahead_s < without.stop_wait_s == with_it.stop_wait_s
     assert with_it.stop_s > without.stop_s
     assert fast.stop_ahead_s == max(poll.longest_s for poll in fast.polls)
+    assert fast.stop_s == fast_without.stop_s
+
+
+def test_the_table_of_the_plan_shows_it_where_it_is_switched_on():
+    tables = [CliRunner().invoke(cli, ["plan", str(FOLDER / f"{name}.toml")]) for name in ("stop_ahead", "clean_start")]
+
+    assert [table.exit_code for table in tables] == [0, 0]
+    assert ["ms to its first bit ahead of the reply to a poll" in table.output for table in tables] == [True, False]

@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from ldcnd.cli.main import cli
 from ldcnd.client.traces import arm_trace
 from ldcnd.config import RigConfig
+from ldcnd.daemon.planning import plan_rig
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
@@ -141,7 +142,8 @@ async def test_a_reload_changes_priorities():
         axis["priority"] = "high" if axis["name"] == "normal2" else "normal"
 
     async with running_rig(config) as rig:
-        rig.daemon.reconfigure(RigConfig.model_validate(document))
+        changed = RigConfig.model_validate(document)
+        rig.daemon.reconfigure(changed, plan_rig(changed))
         await asyncio.sleep(2.0)
         seen = await granted(rig, 5)
 
