@@ -70,9 +70,8 @@ def _rehearse(
     now_s = 0.0
     learning = LEARNING * len(drives)
     for number in range(learning + max(FEWEST, COUNTED * len(drives))):
-        if not queue.is_due(now_s):
+        while not queue.is_due(now_s):
             now_s = queue.next_due_s()
-            queue.is_due(now_s)
         poller = pollers[queue.take(now_s).node]
         poller.next_exchange(now_s)
         queue.schedule(poller, poller.due_at_s)
