@@ -161,7 +161,7 @@ drives."""
             if model not in obliging:
                 raise ValueError(
                     f"pre_empt_polls: nothing says that a {model} (address {address}) takes its reply back when it"
-                    f" hears the host; {', '.join(obliging)} do"
+                    f" hears the host; it is known of {', '.join(obliging)}"
                 )
         return self
 

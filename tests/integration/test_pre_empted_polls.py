@@ -132,9 +132,10 @@ async def test_a_move_is_stopped_by_the_packet_that_went_ahead():
     assert running.moving is Moving.YES
 
 
-def test_only_drives_that_take_their_replies_back_may_be_pre_empted():
-    with pytest.raises(ValidationError, match=r"nothing says that a ls-182ap \(address 1\) takes"):
-        config(model="ls-182ap")
+@pytest.mark.parametrize("model", ["ls-182ap", "pic-servo-v3", "pic-servo-sc"])
+def test_only_drives_that_are_known_to_take_their_replies_back_may_be_pre_empted(model):
+    with pytest.raises(ValidationError, match=rf"nothing says that a {model} \(address 1\) takes"):
+        config(model=model)
 
 
 def test_no_stop_goes_ahead_on_a_port_behind_a_network():

@@ -104,7 +104,8 @@ PIC_SERVO_V3 = replace(
     title="PIC-SERVO version 3",
     versions=range(3, 4),
     gain_bytes=13,
-    limit_outputs=False,  # the manual describes version 4; for older ones nobody vouches for it
+    limit_outputs=False,  # the manual describes version 4; for older ones nobody vouches for it, nor for the next
+    takes_back=False,
 )
 PIC_SERVO_V2 = replace(
     PIC_SERVO_V3,
