@@ -9,13 +9,16 @@ from pydantic import ValidationError
 
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.pre_empting_line import AHEAD
+from ldcnd.bus.wire_log import WireEvent
 from ldcnd.cli.main import cli
 from ldcnd.config import RigConfig
 from ldcnd.daemon.planning import plan_rig, require_plan
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.packet import Command, Packet
 from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.messaging.codec import decode
 from ldcnd.model.axes import AxisState, LinkState, Moving
 from ldcnd.model.health import BusHealth
@@ -108,8 +111,18 @@ async def test_without_the_option_stops_among_polls_wait_longer_and_nothing_is_t
     assert sum(hurried_s) < 0.8 * sum(patient_s)
 
 
-async def test_a_move_is_stopped_by_the_packet_that_went_ahead():
-    async with running_rig(config()) as rig:
+async def test_a_move_is_stopped_by_the_packet_that_went_ahead(monkeypatch):
+    chain = build_chain(ChainSpec((ModuleSpec("picservo-v4"),) * 2))
+    drive, loop, stopped_s = chain.modules[0], asyncio.get_running_loop(), []
+
+    def execute(packet: Packet) -> None:
+        if packet.command == Command.STOP_MOTOR:
+            stopped_s.append(loop.time())
+        obey(packet)
+
+    obey = drive.execute
+    monkeypatch.setattr(drive, "execute", execute)
+    async with running_rig(config(), {"line0": chain}) as rig:
         bus = rig.daemon.rig.buses[0].bus
         for axis in ("a1", "a2"):
             await rig.until(axis, lambda state: state.link is LinkState.UP)
@@ -127,7 +140,12 @@ async def test_a_move_is_stopped_by_the_packet_that_went_ahead():
         stopped = await rig.client.state("a1")
         running = await rig.client.state("a2")
 
-    assert bus.statistics.taken_back > 3
+    sent = [record for record in bus.wire_log.records() if record.event is WireEvent.SENT]
+    ahead = [number for number, record in enumerate(sent) if record.note == AHEAD]
+    assert len(ahead) == bus.statistics.taken_back > 3
+    for number in ahead:
+        again_s = next(later.at_s for later in sent[number + 1 :] if later.data == sent[number].data)
+        assert any(sent[number].at_s < at_s < again_s for at_s in stopped_s)
     assert stopped.state is AxisState.STANDSTILL
     assert running.moving is Moving.YES
 
