@@ -155,13 +155,15 @@ drives."""
         if not self.pre_empt_polls:
             return self
         if self.port.startswith("socket://"):
-            raise ValueError(f"pre_empt_polls: nobody knows when a packet leaves behind the network ({self.port})")
+            raise ValueError(
+                f"pre_empt_polls: nobody knows when a packet leaves behind the network ({self.port}); leave it out"
+            )
         obliging = [name for name, profile in PROFILES.items() if profile.takes_back]
         for address, model in self._models.items():
             if model not in obliging:
                 raise ValueError(
                     f"pre_empt_polls: nothing says that a {model} (address {address}) takes its reply back when it"
-                    f" hears the host; it is known of {', '.join(obliging)}"
+                    f" hears the host; leave it out, or have nothing but {', '.join(obliging)} on the line"
                 )
         return self
 

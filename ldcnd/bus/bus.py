@@ -316,6 +316,11 @@ class Bus:
             pause_s = self._mute.pause_s(node, self.longest_s(turn.exchange) + self.settings.margin_s + self.fence_s)
             self._schedule(turn.poller, max(turn.poller.due_at_s, now_s + pause_s))
 
+    def taken_back(self, turn: Turn) -> None:
+        """See `Users`."""
+        if isinstance(turn, PollTurn):
+            turn.poller.taken_back()
+
     def _schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Give a poller its next turn, unless it was removed while its poll was on the wire."""
         if poller in self._pollers:

@@ -163,9 +163,7 @@ class Line:
         """Return until when the node's own reply may still come although one has come already; never when unpaced."""
         if not self._settings.paced:
             return -NEVER_S
-        exchange = turn.exchange
-        wire_s = (len(exchange.request) + exchange.reply_bytes) * self.wire.byte_s
-        return self._sent_at_s + wire_s + exchange.response_s + LINGER_S
+        return self._sent_at_s + self.wire.longest_s(turn.exchange) + LINGER_S
 
     def _settle(self, turn: Turn, reply: bytes, now_s: float) -> None:
         if turn.exchange.check(reply) is ReplyVerdict.REJECTED:

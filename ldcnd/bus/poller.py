@@ -17,6 +17,12 @@ NO_DEADLINE_S = float("inf")
 """Deadline of a poll that only wants time of the line that nobody else's wants; it is never late."""
 
 
+def next_on_grid(due_s: float, period_s: float, now_s: float) -> float:
+    """Return the first due time after `now_s` that is whole periods, at least one, behind `due_s`."""
+    behind = max(0, int((now_s - due_s) / period_s))
+    return due_s + (behind + 1) * period_s
+
+
 class Priority(IntEnum):
     """Whose polls go first on a line that has fallen behind, highest first."""
 

@@ -45,9 +45,8 @@ class PreEmptingLine(Line):
         if self.phase is Phase.AHEAD:
             self._watchdog.set(max(now_s, self._free_at_s))
         elif turn and turn.lane is POLL and self.phase is Phase.REPLY and self._hurried is not turn:
-            executed_s = self._executed_by_s(turn.exchange, self._sent_at_s)
-            at_s = max(now_s, executed_s)
-            if executed_s - HOST_LATE_S + turn.exchange.reply_bytes * self.wire.byte_s - at_s >= WORTH_S:
+            at_s = max(now_s, self._executed_by_s(turn.exchange, self._sent_at_s))
+            if self._sent_at_s + self.wire.longest_s(turn.exchange) - at_s >= WORTH_S:
                 self._hurried, self._answer_by_s = turn, self._watchdog.deadline_s
                 self._watchdog.set(at_s)
 
@@ -60,7 +59,7 @@ class PreEmptingLine(Line):
         if self._first_to_go() is None:
             self._watchdog.set(self._answer_by_s)
             return
-        turn.taken_back()
+        self._users.taken_back(turn)
         self._statistics.taken_back += 1
         self._fence.doubt()
         self._turn, self.phase, self._missing = None, Phase.AHEAD, NOT_PLAIN
@@ -76,7 +75,7 @@ class PreEmptingLine(Line):
             self.wire.sent(request, now_s, AHEAD)
             self._gone += (stop,)
             self._free_at_s = self._executed_by_s(stop.exchange, now_s)
-            self._over_at_s = self._free_at_s + stop.exchange.reply_bytes * self.wire.byte_s + self._settings.margin_s
+            self._over_at_s = now_s + HOST_LATE_S + self.wire.longest_s(stop.exchange) + self._settings.margin_s
             self._watchdog.set(self._free_at_s)
             if failure:
                 self.transport_lost(failure)
@@ -87,8 +86,6 @@ class PreEmptingLine(Line):
 
     def _first_to_go(self) -> Turn | None:
         """Return the first stop that waits and may go ahead, and has not."""
-        if not self._users.stop_waits():
-            return None
         waiting = (stop for stop in self._users.stops() if stop.exchange.repeatable and stop not in self._gone)
         return next(waiting, None)
 

@@ -13,7 +13,7 @@ from functools import lru_cache
 from ldcnd.bus.cost import Cost
 from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poll_queue import PollQueue
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.bus.settings import ServoCycle
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, ReplyVerdict, Timing
@@ -106,8 +106,7 @@ class _Poller(Poller[None]):
 
     def next_exchange(self, now_s: float) -> Exchange[None]:
         """See `Poller`; there is no line that a packet would be for."""
-        behind = max(0, int((now_s - self.due_at_s) / self._period_s))
-        self.due_at_s += (behind + 1) * self._period_s
+        self.due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
         self.deadline_at_s = self.due_at_s + self._period_s
         return _NOTHING
 

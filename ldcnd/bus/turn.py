@@ -60,9 +60,6 @@ class Turn(ABC):
     def rejected(self) -> bool:
         """Learn that the node did not execute the packet; return whether to send it again."""
 
-    def taken_back(self) -> None:  # noqa: B027 - happens to polls only
-        """Learn that a stop did not wait for the reply."""
-
 
 class PollTurn(Turn):
     """A poller's turn; it is never sent again, the poller's next turn comes soon enough."""
@@ -101,10 +98,6 @@ class PollTurn(Turn):
         """See `Turn`."""
         self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
         return False
-
-    def taken_back(self) -> None:
-        """See `Turn`."""
-        self.poller.taken_back()
 
 
 class Job(Turn):

@@ -41,6 +41,9 @@ class Users(Protocol):
     def missed(self, turn: Turn, now_s: float) -> None:
         """Note that the turn's node did not reply, before the turn learns of it."""
 
+    def taken_back(self, turn: Turn) -> None:
+        """Note that a stop did not wait for the reply to this poll."""
+
     def again(self, turn: Turn) -> None:
         """Give the turn back to the front of its lane."""
 

@@ -1,6 +1,7 @@
 """One open transport: its rate, the bytes that pass over it, and the record of them."""
 
 import asyncio
+from typing import Any
 
 from ldcnd.bus.echo import Echo
 from ldcnd.bus.settings import BusSettings
@@ -8,7 +9,7 @@ from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Turn
 from ldcnd.bus.wire_log import WireEvent, WireLog
 from ldcnd.errors import TransportLost
-from ldcnd.exchange import Timing
+from ldcnd.exchange import Exchange, Timing
 from ldcnd.transport.transport import Receiver, Transport
 
 
@@ -38,6 +39,10 @@ class Wire:
     def lag_s(self) -> float:
         """See `Transport`."""
         return self._transport.lag_s
+
+    def longest_s(self, exchange: Exchange[Any]) -> float:
+        """Return how long an exchange can take at the present rate, first bit to last, in seconds."""
+        return (len(exchange.request) + exchange.reply_bytes) * self.byte_s + exchange.response_s
 
     def attach(self, receiver: Receiver) -> None:
         """See `Transport`."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from ldcnd.axis_config import RatesConfig
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.driver import AxisDriver, AxisReading
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
@@ -106,10 +106,10 @@ class AxisPoller(Poller[AxisReading]):
             nearer_s = now_s + self._period_s / 2
             due = [item for item, due_s in slower_due_s.items() if due_s <= nearer_s]
             slower_due_s = slower_due_s | {
-                item: _next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
+                item: next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
             }
             asked = asked.union(due)
-        due_at_s = _next_on_grid(self.due_at_s, self._period_s, now_s)
+        due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
         return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
@@ -119,9 +119,3 @@ class AxisPoller(Poller[AxisReading]):
     def missed(self, error: BusError) -> None:
         """See `Poller`."""
         self._missed(error)
-
-
-def _next_on_grid(due_s: float, period_s: float, now_s: float) -> float:
-    """Return the first due time after `now_s` that is whole periods, at least one, behind `due_s`."""
-    behind = max(0, int((now_s - due_s) / period_s))
-    return due_s + (behind + 1) * period_s

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority
+from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority, next_on_grid
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
@@ -95,8 +95,7 @@ class HostCapture(Poller[AxisReading]):
     def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
         """See `Poller`; without a period the next turn is due at once, otherwise missed periods are skipped."""
         if self._period_s:
-            behind = max(0, int((now_s - self.due_at_s) / self._period_s))
-            self.due_at_s += (behind + 1) * self._period_s
+            self.due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
         else:
             self.due_at_s = now_s
         return self._exchange

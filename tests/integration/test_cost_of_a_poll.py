@@ -80,4 +80,5 @@ async def test_to_choose_by_phase_costs_a_call_for_each_candidate_and_no_more():
     more = [phase - deadline for phase, deadline in zip(by_phase, by_deadline, strict=True)]
     print(f"calls more with {AXES} axes: {[round(each, 1) for each in more]}")
 
-    assert max(more) < CALLS_OF_A_CHOICE + CHOICE
+    assert more == sorted(more)
+    assert CALLS_OF_A_CHOICE < more[-1] < CALLS_OF_A_CHOICE + CHOICE

@@ -47,9 +47,6 @@ class RecordingTurn(Turn):
         again, self.send_again = self.send_again, False
         return again
 
-    def taken_back(self) -> None:
-        self.story.append(f"taken back {toy.number_of(self.exchange.request)}")
-
     def rejected(self) -> bool:
         self.story.append(f"rejected {toy.number_of(self.exchange.request)}")
         again, self.send_again = self.send_again, False
@@ -96,6 +93,9 @@ class PlainUsers:
 
     def missed(self, turn: Turn, now_s: float) -> None:
         self.story.append(f"missed {turn.exchange.node}")
+
+    def taken_back(self, turn: Turn) -> None:
+        self.story.append(f"taken back {toy.number_of(turn.exchange.request)}")
 
     def again(self, turn: Turn) -> None:
         assert isinstance(turn, RecordingTurn)

@@ -1,11 +1,13 @@
+from dataclasses import replace
+
 import pytest
 
 from ldcnd.bus.cost import Cost
 from ldcnd.bus.rehearsal import Drive, mean_lengths_s
-from ldcnd.bus.settings import ServoCycle
+from tests.support.polled_chain import BAUD, CYCLE, saturated
 
-CYCLE = ServoCycle(0.000_512, 1.0138)
-COST = Cost(request_s=0.000_434, wait_s=CYCLE.length_s, reply_s=0.000_792, overhead_s=0.000_06)
+BYTE_S = 10 / BAUD
+COST = Cost(request_s=5 * BYTE_S, wait_s=CYCLE.length_s, reply_s=9 * BYTE_S * CYCLE.stretch, overhead_s=0.000_06)
 
 
 def wait_s(drives: int, rate_hz: float, seed: int = 1) -> float:
@@ -33,12 +35,11 @@ def test_where_the_cycles_lie_matters_little(rate_hz: float):
     assert max(lengths_s) < 1.06 * min(lengths_s)
 
 
-def test_a_line_that_polls_all_the_time_is_as_quick_as_one_that_was_simulated_byte_by_byte():
-    """See docs/explanation/timing.md: 756 polls a second by phase, 674 by deadline."""
-    cost = Cost(request_s=COST.request_s, wait_s=COST.wait_s, reply_s=0.000_792, overhead_s=0.0)
-    length_s = sum(mean_lengths_s((Drive(1000.0, cost),) * 31, CYCLE)) / 31
+async def test_a_line_that_polls_all_the_time_is_as_quick_as_one_that_is_simulated_byte_by_byte():
+    simulated = await saturated(31, 10.0, by_phase=True)
+    drive = Drive(2000.0, replace(COST, overhead_s=0.0))
 
-    assert cost.mean_s / length_s == pytest.approx(756 / 674, rel=0.02)
+    assert sum(mean_lengths_s((drive,) * 31, CYCLE)) / 31 == pytest.approx(1.0 / simulated.per_s, rel=0.03)
 
 
 def test_a_drive_that_has_no_turn_is_reckoned_with_as_without_an_order():

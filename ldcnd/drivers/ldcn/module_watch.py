@@ -2,7 +2,7 @@
 
 import asyncio
 
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.identities import ANY_DIALECT
@@ -29,8 +29,7 @@ class ModuleWatch(Poller[Status]):
 
     def next_exchange(self, now_s: float) -> Exchange[Status]:
         """See `Poller`; a late turn does not shift the next one."""
-        behind = max(0, int((now_s - self.due_at_s) / PERIOD_S))
-        self.due_at_s += (behind + 1) * PERIOD_S
+        self.due_at_s = next_on_grid(self.due_at_s, PERIOD_S, now_s)
         self.deadline_at_s = self.due_at_s + PERIOD_S
         return self._exchange
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import reference, with_response_time
@@ -195,9 +195,7 @@ class UnitPoller(Poller[int | Refusal]):
         if item is Basic.IDENTITY:
             self._due_s[item] = NEVER_S
         else:
-            period_s = self._periods_s[item]
-            behind = max(0, int((now_s - due_s) / period_s))
-            self._due_s[item] = due_s + (behind + 1) * period_s
+            self._due_s[item] = next_on_grid(due_s, self._periods_s[item], now_s)
         self._left = []
         counter = _counter_of(item)
         if counter:
