@@ -11,6 +11,7 @@ from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.pre_empting_line import AHEAD
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.cli.main import cli
+from ldcnd.client.traces import take_trace
 from ldcnd.config import RigConfig
 from ldcnd.daemon.planning import plan_rig, require_plan
 from ldcnd.drivers.ldcn import commands
@@ -22,7 +23,7 @@ from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.messaging.codec import decode
 from ldcnd.model.axes import AxisState, LinkState, Moving
 from ldcnd.model.health import BusHealth
-from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, ResetRequest, Verb
+from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, ResetRequest, TraceRequest, Verb
 from tests.support.captures import FOLDER
 from tests.support.rig import RunningRig, running_rig
 
@@ -150,6 +151,17 @@ async def test_a_move_is_stopped_by_the_packet_that_went_ahead(monkeypatch):
         assert any(sent[number].at_s < at_s < again_s for at_s in stopped_s)
     assert stopped.state is AxisState.STANDSTILL
     assert running.moving is Moving.YES
+
+
+async def test_a_trace_tells_how_many_samples_stops_took_back():
+    async with running_rig(config()) as rig, asyncio.TaskGroup() as group:
+        await rig.until("a1", lambda state: state.link is LinkState.UP)
+        request = TraceRequest(channels=("position",), interval_s=0.02, samples=150)
+        taking = group.create_task(take_trace(rig.client, "a1", request, within_s=60), name="trace")
+        await random_stops(rig, 60)
+        trace = await taking
+
+    assert trace.header.missed > 0
 
 
 @pytest.mark.parametrize("model", ["ls-182ap", "pic-servo-v3", "pic-servo-sc"])
