@@ -11,12 +11,12 @@ from pydantic import AfterValidator, Field, model_validator
 
 from ldcnd.drivers.ldcn.profiles import Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings, PositionErrorClearing
-from ldcnd.drivers.ldcn.simulated_power import Condition
-from ldcnd.drivers.ldcn.simulator import MODELS, ChainSpec, ModuleSpec, TimedEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, TimedEvent
+from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing
+from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 
 ENDLESS_TRAVEL_COUNTS = (-(1 << 30), 1 << 30)

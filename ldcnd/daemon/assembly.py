@@ -28,7 +28,6 @@ from ldcnd.daemon.rig import Rig
 from ldcnd.daemon.smartstep_line import build_line, open_ledger
 from ldcnd.drivers.driver import AxisDriver, AxisSpec, Gains
 from ldcnd.drivers.ldcn.network import RESET_BAUD
-from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.drivers.line import GroupSpec, LineSpec, ModuleEntry
 from ldcnd.drivers.registry import FAMILIES
 from ldcnd.drivers.smartstep.ledger import EepromLedger
@@ -38,6 +37,7 @@ from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import build_chain
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.transport.port_url import SOCKET, port_opener
 from ldcnd.transport.transport import Opener

@@ -26,10 +26,10 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.profiles import LS_182AP
-from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.sim.ldcn.chain import build_chain
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.simulation_config import SimulatedModuleConfig, SimulationConfig
 from tests.support.rough_host import enumeration, frame, jog, powered

@@ -9,7 +9,6 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import load_config
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import (
     CommandExpired,
     CommandIdReused,
@@ -33,6 +32,7 @@ from ldcnd.model.requests import (
     ResetRequest,
     Verb,
 )
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 ACTED_WITHIN_S = 0.02

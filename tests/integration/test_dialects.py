@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.simulated_power import Condition
 from ldcnd.model.axes import AxisState
 from ldcnd.model.requests import HomeRequest, MoveAbsoluteRequest, MoveVelocityRequest, PowerRequest, ResetRequest, Verb
 from ldcnd.model.samples import AdcSample, PositionSample, TelemetryItem, VelocitySample
+from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
     LS_173AP,

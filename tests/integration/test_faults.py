@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.drivers.ldcn.simulated_power import Condition
 from ldcnd.errors import DriveFault, NotReferenced, WrongState
 from ldcnd.model.axes import AxisState
 from ldcnd.model.requests import (
@@ -22,6 +21,7 @@ from ldcnd.model.requests import (
     SetPwmRequest,
     Verb,
 )
+from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
     DIALECTS,

@@ -6,11 +6,11 @@ import pytest
 
 from ldcnd.daemon.group_moves import move_together
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import MalformedRequest, NotSupported, PositionLimit, StopLatched, UnknownAxis
 from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.group_moves import AxisMove, MoveTogetherReply, MoveTogetherRequest
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")

@@ -8,12 +8,12 @@ from ldcnd.config import load_config
 from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.line import GroupSpec, LineSpec, StartPolicy
 from ldcnd.errors import ConfigError, DriveFault, NotSupported, OutcomeUnknown, StopLatched, ValueOutOfRange, WrongState
 from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.requests import HomeMethod, MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.bare_network import bare_network, specs
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.rig import SIMULATED

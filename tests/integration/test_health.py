@@ -10,12 +10,12 @@ from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.statistics import bucket_limit_s
 from ldcnd.config import load_config
 from ldcnd.daemon.smartstep_line import LEDGER_FILE
-from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import PENDING_QUERIES, SampleKind
 from ldcnd.model.axes import LinkState
 from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig
 
 KEYS = Keys("sim")

@@ -8,7 +8,6 @@ import pytest
 
 from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, wait_for_trace
 from ldcnd.config import load_config
-from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
 from ldcnd.model.requests import (
     MoveAbsoluteRequest,
@@ -20,6 +19,7 @@ from ldcnd.model.requests import (
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.traces import TracePhase, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig
 
 

@@ -6,13 +6,13 @@ import pytest
 
 from ldcnd.axis_config import LossConfig, LossPolicy
 from ldcnd.config import RigConfig, load_config
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import NotReferenced, WrongState
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.rehearsal import Rehearsal, RehearsalReply, RehearsalRequest
 from ldcnd.model.requests import MoveAbsoluteRequest, MoveVelocityRequest, PowerRequest, ResetRequest, Verb
 from ldcnd.model.samples import PositionSample, TelemetryItem
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 OUTAGE_S = 1.0

@@ -5,7 +5,6 @@ import contextlib
 
 import pytest
 
-from ldcnd.drivers.ldcn.simulated_power import Condition
 from ldcnd.errors import (
     DriveFault,
     LdcndError,
@@ -23,6 +22,7 @@ from ldcnd.model.requests import (
     TrackRequest,
     Verb,
 )
+from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
     DIALECTS,

@@ -19,11 +19,11 @@ from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.packet import Command, Packet
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.messaging.codec import decode
 from ldcnd.model.axes import AxisState, LinkState, Moving
 from ldcnd.model.health import BusHealth
 from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, ResetRequest, TraceRequest, Verb
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.captures import FOLDER
 from tests.support.rig import RunningRig, running_rig
 

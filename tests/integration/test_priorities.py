@@ -12,13 +12,13 @@ from ldcnd.daemon.planning import plan_rig
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.codec import decode
 from ldcnd.model.axes import AxisInfo
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.requests import TraceRequest
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.priority_rig import Asked, granted, ranked_config
 from tests.support.rig import SIMULATED, running_rig
 

@@ -8,12 +8,12 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.config import load_config
-from ldcnd.drivers.ldcn.simulator import build_chain
 from ldcnd.model.axes import AxisState
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.recording.axis_history import AxisHistory, axis_history
 from ldcnd.recording.reading import Recording
+from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.recordings import recorded_rig
 from tests.support.rig import SIMULATED
 

@@ -6,12 +6,12 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")

@@ -3,10 +3,10 @@
 import asyncio
 
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 from tests.support.rig import running_rig
 

@@ -14,10 +14,10 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.errors import BusError, OutcomeUnknown, ReplyTimeout
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 
 EXCHANGES = 10_000

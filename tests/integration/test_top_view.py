@@ -4,9 +4,9 @@ import asyncio
 from contextlib import asynccontextmanager
 
 from ldcnd.client.trouble import Severity
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.model.axes import AxisState, LinkState, Moving
 from ldcnd.model.requests import HaltRequest, MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.top.columns import as_text, headline
 from ldcnd.top.follow import follow
 from ldcnd.top.rig_view import RigView

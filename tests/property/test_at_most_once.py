@@ -14,13 +14,13 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import LdcndError, RequestRefused
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.requests import MoveRelativeRequest, PowerRequest, Verb
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 
 SCHEDULES_PER_TEST = 250

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
-from ldcnd.drivers.ldcn.simulator import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 
 ALL_MODELS = tuple(ModuleSpec(name) for name in MODELS)
 ADDRESSING = [

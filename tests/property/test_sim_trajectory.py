@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.ldcn.simulated_trajectory import ProfileGenerator
+from ldcnd.sim.ldcn.trajectory import ProfileGenerator
 
 ONE = 1 << 16
 

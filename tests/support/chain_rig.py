@@ -13,9 +13,9 @@ from ldcnd.config import RigConfig
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.bus_service import BusService
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
-from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.transport.transport import Opener
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig

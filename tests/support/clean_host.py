@@ -8,11 +8,11 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.profiles import Support
-from ldcnd.drivers.ldcn.simulated_module import SimulatedModule
 from ldcnd.drivers.line import LineSpec, ModuleEntry
 from ldcnd.drivers.network import BringUpReport
 from ldcnd.errors import NetworkMismatch
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.line import open_simulated_line
 
 

@@ -6,15 +6,15 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 from ldcnd.config import RigConfig
-from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
-from ldcnd.drivers.ldcn.simulated_power import Condition
-from ldcnd.drivers.ldcn.simulator import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.model.axes import AxisState
 from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import PowerRequest, Request, Verb
 from ldcnd.model.samples import FaultSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultPlan
+from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.rig import RunningRig, running_rig
 

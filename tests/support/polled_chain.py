@@ -13,11 +13,11 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
-from ldcnd.drivers.ldcn.simulated_module import SimulatedModule
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.ldcn.status import Status, StatusItem
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.transport.transport import Transport
 from tests.support.late_host import LateHost

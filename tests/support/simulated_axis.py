@@ -5,12 +5,12 @@ from collections.abc import Callable
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.gains import Gains, encode_gains
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings
-from ldcnd.drivers.ldcn.simulated_power import Condition
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.ldcn.status import Status, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.module import ModuleSettings
+from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_host import SimulatedHost
 

@@ -12,8 +12,6 @@ from ldcnd.drivers.ldcn.costs import price_list
 from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.smartstep.costs import price_list as smartstep_price_list
 from ldcnd.drivers.smartstep.parameters import PN000
 from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
@@ -21,6 +19,8 @@ from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
 from ldcnd.drivers.smartstep.simulator import smartstep_chain
 from ldcnd.exchange import Exchange
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.module import ModuleSettings
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
 from tests.support.recording_receiver import RecordingReceiver
 

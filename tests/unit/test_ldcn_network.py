@@ -9,14 +9,14 @@ from ldcnd.drivers.ldcn.identities import Expected, Identity, differences
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import actual_baud
-from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.line import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
 from ldcnd.errors import NetworkMismatch, NotSupported, StopLatched
 from ldcnd.model.requests import HomeMethod
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.module import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.bare_network import bare_network, specs
 

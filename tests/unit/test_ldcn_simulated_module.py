@@ -7,10 +7,10 @@ import pytest
 from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V1, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings
-from ldcnd.drivers.ldcn.simulator import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.ldcn.status import StatusFlag, StatusItem
 from ldcnd.errors import ValueOutOfRange
+from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.module import ModuleSettings
 from tests.support.simulated_host import SimulatedHost, little
 
 IDENTITY = StatusItem.IDENTITY

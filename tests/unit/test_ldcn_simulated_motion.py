@@ -5,9 +5,9 @@ import pytest
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.gains import Gains
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.simulated_power import Condition
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import Trajectory
+from ldcnd.sim.ldcn.power import Condition
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, UTILITY_GAINS, SimulatedAxis
 from tests.support.simulated_host import little
 

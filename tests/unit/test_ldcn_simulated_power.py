@@ -7,9 +7,9 @@ from ldcnd.drivers.ldcn.faults import FaultCode, diagnose
 from ldcnd.drivers.ldcn.gains import Gains, encode_gains
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP
-from ldcnd.drivers.ldcn.simulated_power import Condition
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.power import Condition
 from tests.support.simulated_host import SimulatedHost, little
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.simulated_trajectory import ProfileGenerator
+from ldcnd.sim.ldcn.trajectory import ProfileGenerator
 
 ONE = 1 << 16
 

@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
 from ldcnd.errors import TransportLost
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 
 SET_ADDRESS_1 = bytes.fromhex("aa 00 21 01 ff 21")

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
 
 pytestmark = pytest.mark.real_time
@@ -124,7 +124,7 @@ def test_a_module_that_nobody_asks_does_not_fall_behind():
 PROGRAM = """
 import sys
 from pathlib import Path
-from ldcnd.drivers.ldcn.simulator import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import serve_pty
 chain = build_chain(ChainSpec((ModuleSpec("ls182ap"),), baud_check=False))
 serve_pty(chain, Path(sys.argv[1]), opened=lambda path: print(path, flush=True))

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.sim import command
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings, PositionErrorClearing
-from ldcnd.drivers.ldcn.simulated_power import Condition
-from ldcnd.drivers.ldcn.simulator import MODELS, build_chain
 from ldcnd.errors import ConfigError
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
+from ldcnd.sim.ldcn.chain import MODELS, build_chain
+from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing
+from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 from ldcnd.simulation_config import FaultPlanConfig, ModuleKnobs, PlantConfig, SimulatedChainConfig, SimulationConfig
 from ldcnd.toml_file import read_toml

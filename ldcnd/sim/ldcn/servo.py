@@ -9,14 +9,14 @@ compensation is added to any output that is not 0.
 """
 
 import math
+from dataclasses import dataclass
 
 from ldcnd.drivers.ldcn.controls import HomingControl
 from ldcnd.drivers.ldcn.gains import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.drivers.ldcn.simulated_homing import HomeSearch, Inputs
-from ldcnd.drivers.ldcn.simulated_power import Condition, PowerStage, Trip
-from ldcnd.drivers.ldcn.simulated_trajectory import ProfileGenerator
+from ldcnd.sim.ldcn.power import Condition, PowerStage, Trip
+from ldcnd.sim.ldcn.trajectory import ProfileGenerator
 from ldcnd.sim.plant import Shaft
 
 FULL_PWM = 255
@@ -24,6 +24,34 @@ COUNTER_SPAN = 1 << 32
 SENSOR_RANGE = (8 / 1024, 1015 / 1024)
 """Outside this share of the A/D range an absolute positioning sensor counts as disconnected (LS-182AP manual)."""
 _NO_GAINS = Gains(kp=0, kd=0, ki=0, il=0, ol=0, cl=0, el=0, sr=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The inputs that can capture the home position, as levels."""
+
+    limit1: bool
+    limit2: bool
+    index: bool
+
+
+@dataclass(frozen=True, slots=True)
+class HomeSearch:
+    """One armed search: what it waits for, and how the inputs were when it began."""
+
+    control: HomingControl
+    armed_with: Inputs
+
+    def limit_changed(self, inputs: Inputs) -> bool:
+        """Tell whether a watched limit switch changed."""
+        return bool(
+            (self.control & HomingControl.LIMIT1 and inputs.limit1 != self.armed_with.limit1)
+            or (self.control & HomingControl.LIMIT2 and inputs.limit2 != self.armed_with.limit2)
+        )
+
+    def index_changed(self, inputs: Inputs) -> bool:
+        """Tell whether the watched index changed."""
+        return bool(self.control & HomingControl.INDEX) and inputs.index != self.armed_with.index
 
 
 class ServoLoop:

@@ -18,12 +18,11 @@ from ldcnd.drivers.ldcn.gains import decode_gains
 from ldcnd.drivers.ldcn.packet import Command, Packet
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.simulated_homing import HomeSearch
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings, PositionErrorClearing, SimulatedModule
-from ldcnd.drivers.ldcn.simulated_power import Condition, LogosolPower, PicServoPower, PowerStage
-from ldcnd.drivers.ldcn.simulated_servo import COUNTER_SPAN, ServoLoop
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, decode_trajectory
+from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing, SimulatedModule
+from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage
+from ldcnd.sim.ldcn.servo import COUNTER_SPAN, HomeSearch, ServoLoop
 from ldcnd.sim.plant import MotorPlant, Shaft
 
 SHORTS = range(-0x8000, 0x8000)

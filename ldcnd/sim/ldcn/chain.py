@@ -18,13 +18,13 @@ from ldcnd.drivers.ldcn.profiles import (
     Support,
 )
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.simulated_drive import SimulatedDrive
-from ldcnd.drivers.ldcn.simulated_io import SimulatedIo
-from ldcnd.drivers.ldcn.simulated_module import ModuleSettings, SimulatedModule
-from ldcnd.drivers.ldcn.simulated_power import Condition
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import FaultPlan
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.io import SimulatedIo
+from ldcnd.sim.ldcn.module import ModuleSettings, SimulatedModule
+from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 
 MOST_DRIFT_PPM = 50.0
