@@ -13,7 +13,7 @@ from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.turn import AT_ONCE, LANES
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from tests.bench.processes import SUBJECT_CPU, config_text, daemon, free_endpoint, heard, paced_lines, process
 from tests.bench.report import Row

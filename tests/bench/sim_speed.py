@@ -23,7 +23,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec, Gains, Motion
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.profiles import LS_182AP
 from ldcnd.drivers.ldcn.status import StatusItem

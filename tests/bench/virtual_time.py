@@ -13,7 +13,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.daemon.process import settle_heap
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from tests.bench import commands_and_polls, trace_upload
 from tests.bench.report import Row

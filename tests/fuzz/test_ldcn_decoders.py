@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.faults import diagnose
 from ldcnd.drivers.ldcn.packet import HEADER, Command, Packet, PacketReader, decode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support

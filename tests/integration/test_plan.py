@@ -13,8 +13,8 @@ from ldcnd.cli.main import cli
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.planning import plan_rig, require_plan
 from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import decode

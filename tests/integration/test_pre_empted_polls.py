@@ -15,8 +15,8 @@ from ldcnd.client.traces import take_trace
 from ldcnd.config import RigConfig
 from ldcnd.daemon.planning import plan_rig, require_plan
 from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.packet import Command, Packet
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.messaging.codec import decode

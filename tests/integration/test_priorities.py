@@ -10,7 +10,7 @@ from ldcnd.client.traces import arm_trace
 from ldcnd.config import RigConfig
 from ldcnd.daemon.planning import plan_rig
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.codec import decode

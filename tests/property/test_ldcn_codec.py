@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
-from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile, Support
 from ldcnd.drivers.ldcn.received import LoadTrajectory, SetGain, decode_command
 from ldcnd.drivers.ldcn.registers import (
+    Gains,
     acceleration_counts_per_s2,
     programmed_acceleration,
     programmed_velocity,

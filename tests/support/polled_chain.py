@@ -10,7 +10,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.settings import BusSettings, ServoCycle
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Node
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
 from ldcnd.drivers.ldcn.status import Status, StatusItem

@@ -8,8 +8,8 @@ import pytest
 from ldcnd.bus.cost import LineTiming, cost_of
 from ldcnd.bus.settings import LINGER_S
 from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.costs import price_list
-from ldcnd.drivers.ldcn.destinations import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
 from ldcnd.drivers.smartstep.costs import price_list as smartstep_price_list

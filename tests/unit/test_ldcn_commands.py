@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.commands import Group, Node
 from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
-from ldcnd.drivers.ldcn.destinations import Group, Node
-from ldcnd.drivers.ldcn.gains import Gains
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud
+from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, actual_baud
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange

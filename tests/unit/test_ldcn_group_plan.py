@@ -1,6 +1,6 @@
 """Which group address each module has."""
 
-from ldcnd.drivers.ldcn.group_plan import GroupPlan
+from ldcnd.drivers.ldcn.addressing import GroupPlan
 from ldcnd.drivers.line import GroupSpec
 
 AXES = {1: "x", 2: "y", 3: "z", 5: "c"}

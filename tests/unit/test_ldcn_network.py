@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
-from ldcnd.drivers.ldcn.identities import Expected, Identity, differences
+from ldcnd.drivers.ldcn.addressing import Expected, Identity, differences
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import actual_baud

@@ -3,7 +3,6 @@
 import pytest
 
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.gains import Gains
 from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.received import (
@@ -21,6 +20,7 @@ from ldcnd.drivers.ldcn.received import (
     interpret,
     interpret_bytes,
 )
+from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply
 

@@ -3,7 +3,7 @@
 import pytest
 
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.sim.ldcn.module import ModuleSettings
 from ldcnd.sim.plant import MotorPlant

@@ -4,9 +4,9 @@ import pytest
 
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.faults import FaultCode, diagnose
-from ldcnd.drivers.ldcn.gains import Gains, encode_gains
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP
+from ldcnd.drivers.ldcn.registers import Gains, encode_gains
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import Condition

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.destinations import Group, Node
-from ldcnd.drivers.ldcn.gains import Gains
+from ldcnd.drivers.ldcn.commands import Group, Node
 from ldcnd.drivers.ldcn.packet import Command, decode_packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.received import (
@@ -27,7 +26,7 @@ from ldcnd.drivers.ldcn.received import (
     decode_command,
     interpret_bytes,
 )
-from ldcnd.drivers.ldcn.registers import BaudCodes, baud_divisor
+from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, baud_divisor
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, decode_status, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply

@@ -1,16 +1,268 @@
-"""Addresses on an LDCN/NMC line: everybody back to power-up, and one module after another out of address 0.
+"""Bring-up of an LDCN/NMC line: who is on it, in which groups, at which rate, and one module after another out of 0.
 
-Source: LS-182AP manual, "Addressing", flow chart of the addressing procedure; PIC-SERVO manual, 4.1 "Network
-initialization".
+A module has exactly one group address, so what concerns the whole line goes to all addresses in use. Rates are changed
+by group commands without a leader (PIC-SERVO manual, 5.2 "Set Baud Rate"). What is sent at another rate than a module's
+is noise to it: the bits of the header 0xAA alternate, which no slower sender's byte can look like to a faster receiver,
+and what a faster sender's bytes look like has no header, length and checksum that fit.
+Sources: LS-182AP manual, "Addressing" with the flow chart of the procedure, "Define Status", item 5; PIC-SERVO manual,
+4.1 "Network initialization", 5.2.
 """
 
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
 from ldcnd.bus.bus import Bus
-from ldcnd.drivers.ldcn import commands, destinations
-from ldcnd.drivers.ldcn.destinations import Node, unanswered
-from ldcnd.drivers.ldcn.group_plan import GroupPlan
-from ldcnd.drivers.ldcn.identities import ANY_DIALECT, UNADDRESSED, Identity
-from ldcnd.drivers.ldcn.rates import EVERYBODY, NULLS_SETTLE_S, RESET_BAUD, LineRate, nulls
-from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.commands import Node, unanswered
+from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
+from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
+from ldcnd.drivers.line import GroupSpec
+from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
+from ldcnd.exchange import Exchange
+
+ReplyT = TypeVar("ReplyT")
+
+ANY_DIALECT = PIC_SERVO_V4
+"""Status byte and identity are laid out alike everywhere, so any profile reads them."""
+UNADDRESSED = Node(0, ANY_DIALECT)
+"""The first module of the chain that has no address yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a module says it is; 0 to 255 each."""
+
+    device_id: int
+    version: int
+
+    @property
+    def profile(self) -> Profile | None:
+        """The dialect of this pair; None for a device that nobody described."""
+        return identify(self.device_id, self.version)
+
+    def __str__(self) -> str:
+        """Return a title for people."""
+        profile = self.profile
+        return f"{profile.title if profile else 'an unknown device'} (id {self.device_id}, version {self.version})"
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What the configuration says is at an address.
+
+    Attributes:
+        address: 1 to 127.
+        what: the axis it is, for messages.
+        profile: the dialect spoken with it.
+        identity: accepted although it is not among the profile's own.
+    """
+
+    address: int
+    what: str
+    profile: Profile
+    identity: Identity | None = None
+
+    def accepts(self, found: Identity) -> bool:
+        """Tell whether this identity may be spoken with as configured."""
+        return found == self.identity or found.profile == self.profile
+
+    def differs(self, found: Identity | None) -> str | None:
+        """Return in words how what was found differs; None when it does not."""
+        if found is not None and self.accepts(found):
+            return None
+        return f"address {self.address} ({self.what}): expected {self.profile.title}, {found or 'nothing there'}"
+
+
+def differences(expected: tuple[Expected, ...], found: Mapping[int, Identity]) -> tuple[str, ...]:
+    """Return in words what is missing or something else, by address."""
+    said = (each.differs(found.get(each.address)) for each in expected)
+    return tuple(difference for difference in said if difference)
+
+
+def read_identity(address: int, known: Identity | None = None) -> Exchange[Status]:
+    """Return the exchange that reads id and version, and insists on the known ones if they are given."""
+    exchange = commands.read_status(Node(address, ANY_DIALECT), StatusItem.IDENTITY)
+    if known is None:
+        return exchange
+
+    def decode(data: bytes) -> Status:
+        status = decode_status(ANY_DIALECT, StatusItem.IDENTITY, data)
+        if identity_in(status) != known:
+            raise BadReply(f"node {address} says {identity_in(status)}, known as {known}")
+        return status
+
+    return replace(exchange, decode=decode)
+
+
+def identity_in(status: Status) -> Identity:
+    """Return the identity that a status packet carries."""
+    return Identity(status.device_id or 0, status.version or 0)
+
+
+def once(exchange: Exchange[ReplyT]) -> Exchange[ReplyT]:
+    """Return the exchange for a node that may not be there: it is not worth the bus's further attempts."""
+    return replace(exchange, repeatable=False)
+
+
+FIRST_GROUP = 0x81
+"""Configured groups are numbered from here; 0x80 is avoided, as its leader's byte would be 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Modules that share a group address.
+
+    Attributes:
+        address: 0x80 to 0xFF.
+        members: axis names; for `EVERYBODY` the axes that are in no configured group.
+        leader: the member that answers for the group.
+    """
+
+    address: int
+    members: frozenset[str]
+    leader: str | None = None
+
+
+class GroupPlan:
+    """The groups of one line.
+
+    Attributes:
+        groups: those that have members, `EVERYBODY` first.
+    """
+
+    def __init__(self, specs: tuple[GroupSpec, ...], axes: Mapping[int, str]) -> None:
+        configured = tuple(
+            Group(FIRST_GROUP + number, frozenset(spec.axes), spec.leader) for number, spec in enumerate(specs)
+        )
+        others = frozenset(axes.values()).difference(*(group.members for group in configured))
+        self.groups = (Group(EVERYBODY, others), *configured) if others else configured
+        self._axes = axes
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """Return every group address that a module may have, `EVERYBODY` first."""
+        return (EVERYBODY, *(group.address for group in self.groups if group.address != EVERYBODY))
+
+    def place(self, address: int) -> Group:
+        """Return the group of the module at an individual address."""
+        name = self._axes.get(address)
+        return next((group for group in self.groups if name in group.members), Group(EVERYBODY, frozenset()))
+
+    def leads(self, address: int) -> bool:
+        """Tell whether the module at this address answers for its group."""
+        leader = self.place(address).leader
+        return leader is not None and self._axes.get(address) == leader
+
+    def exactly(self, names: frozenset[str]) -> Group | None:
+        """Return the group with exactly these members: a command to it concerns nobody else."""
+        return next((group for group in self.groups if group.members == names), None)
+
+    def within(self, names: frozenset[str]) -> tuple[Group, ...]:
+        """Return the groups all of whose members are among these."""
+        return tuple(group for group in self.groups if group.members <= names)
+
+
+RESET_BAUD = 19_200
+"""The rate after power-up and Hard Reset."""
+COMMON_BAUDS = (115_200, 57_600, 9600, RESET_BAUD)
+"""Where a crashed host may have left the drives; the last one is where a reset puts them."""
+FASTEST_BAUD = 230_400
+"""PIC-SERVO SC only. By the manuals' formula its code makes 208333 baud, which no receiver takes for 230400: a line
+that tries this rate must be found at both.
+"""
+EVERYBODY = 0xFF
+"""The group address after power-up."""
+NULLS = bytes(16)
+"""Fill up any half-received command buffer (PIC-SERVO manual, 4.1)."""
+NULLS_SETTLE_S = 0.001
+LEADER_REPLY_BYTES = 2
+
+
+def nulls(quiet_s: float) -> Exchange[None]:
+    """Return the exchange that fills up any half-received packet, and a pause."""
+    return unanswered(EVERYBODY, NULLS, quiet_s, repeatable=True)
+
+
+class LineRate:
+    """Who is at which rate.
+
+    Attributes:
+        working: where all modules should be.
+        candidates: where they may be, the most unlikely first, `RESET_BAUD` last.
+        groups: the group addresses in use.
+    """
+
+    def __init__(self, bus: Bus, working: int, codes: BaudCodes, groups: tuple[int, ...], *, fastest: bool) -> None:
+        self.working = working
+        self.candidates: tuple[int, ...] = COMMON_BAUDS
+        if fastest:
+            self.candidates = (FASTEST_BAUD, *COMMON_BAUDS)
+        if working == FASTEST_BAUD:
+            self.candidates = (FASTEST_BAUD, round(actual_baud(baud_divisor(working, codes))), *COMMON_BAUDS)
+        self.groups = groups
+        self._bus = bus
+        self._codes = codes
+
+    @property
+    def changeable(self) -> bool:
+        """Whether the host's port can change its rate."""
+        return not self._bus.fixed_baud
+
+    async def host_to(self, baud: int) -> bool:
+        """Clear the line at the present rate and change ours; tell whether it is the wanted one now."""
+        if self._bus.baud == baud:
+            await self._bus.execute(nulls(NULLS_SETTLE_S))
+        elif self._bus.fixed_baud:
+            return False
+        else:
+            await self._bus.change_baud(nulls(NULLS_SETTLE_S), baud)
+        return True
+
+    async def everybody_to(self, baud: int) -> None:
+        """Move all modules that hear us, and the host; allowed while motors move.
+
+        A group's leader answers at the new rate, which the host does not hear: it waits that reply out.
+        """
+        if self._bus.baud == baud:
+            return
+        profile = PIC_SERVO_SC if baud == FASTEST_BAUD else None
+        burst = b"".join(
+            commands.set_baud(commands.Group(address, profile), baud, self._codes).request for address in self.groups
+        )
+        quiet_s = SERVO_CYCLE_S + LEADER_REPLY_BYTES * self._bus.settings.bits_per_byte / min(baud, self._bus.baud)
+        await self._bus.change_baud(unanswered(EVERYBODY, burst, quiet_s, repeatable=False), baud)
+
+    async def who_is(self, address: int, *, patient: bool = False) -> Identity | None:
+        """Ask an address who it is at the host's rate; None when nobody answers.
+
+        Args:
+            address: 0 for a module without an address.
+            patient: use all of the bus's attempts, for a module that is expected to be there.
+
+        Raises:
+            BusDown, BusBusy: the line failed; says nothing about the module.
+        """
+        exchange = read_identity(address)
+        return await self._answer(lambda: self._bus.execute(exchange if patient else once(exchange)))
+
+    async def who_is_at(self, baud: int, address: int) -> Identity | None:
+        """Ask once at another rate than the others', who hear noise meanwhile; as `who_is` in everything else."""
+        exchange = once(read_identity(address))
+        if self._bus.baud == baud:
+            return await self._answer(lambda: self._bus.execute(exchange))
+        return await self._answer(lambda: self._bus.execute_at(baud, exchange))
+
+    async def _answer(self, ask: Callable[[], Awaitable[Status]]) -> Identity | None:
+        while True:
+            try:
+                return identity_in(await ask())
+            except StopLatched:
+                continue  # a stop of this axis took the question off the queue: it says nothing about the module
+            except (ReplyTimeout, OutcomeUnknown, BadReply, PacketRejected):
+                return None
+
 
 MOST_MODULES = 32
 ADDRESSING_ATTEMPTS = 3
@@ -48,7 +300,7 @@ class Addressing:
     async def _reset_at(self, baud: int, settle_s: float) -> None:
         if not await self._rate.host_to(baud):
             return
-        burst = b"".join(commands.hard_reset(destinations.Group(address)).request for address in self._plan.addresses)
+        burst = b"".join(commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses)
         for _ in range(2):
             await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
 

@@ -1,13 +1,14 @@
 """The control bytes of Stop Motor, Set Homing Mode, I/O Control and Reset Position.
 
-Sources: LS-182AP manual, "Stop Motor", "Set Homing Mode"; PIC-SERVO manual, 5.2; for the motion lock and for
-Reset Position later vendor data sheets.
+Sources: LS-182AP manual, "Stop Motor", "Set Homing Mode"; PIC-SERVO manual, 5.2 (limit switch pins as outputs: "I/O
+Control"); for the motion lock and for Reset Position later vendor data sheets.
 """
 
 from enum import IntEnum, IntFlag
 
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
+from ldcnd.model.requests import HomeMethod, PinMode
 
 
 class StopControl(IntFlag):
@@ -97,3 +98,36 @@ def check_homing(control: HomingControl, profile: Profile | None) -> None:
         raise NotSupported(f"{profile.title} cannot capture home on {sources & ~profile.homing_sources!r}")
     if stops and not profile.stops_on_home:
         raise NotSupported(f"{profile.title} does not stop on home by itself")
+
+
+INPUTS = LimitPins.LIMIT1_INPUT | LimitPins.LIMIT2_INPUT
+"""After power-up."""
+
+
+def with_modes(pins: LimitPins, limit1: PinMode | None, limit2: PinMode | None) -> LimitPins:
+    """Return the control byte with other modes; None leaves a pin as it is."""
+    pins = _with_mode(pins, limit1, LimitPins.LIMIT1_INPUT, LimitPins.LIMIT1_HIGH)
+    return _with_mode(pins, limit2, LimitPins.LIMIT2_INPUT, LimitPins.LIMIT2_HIGH)
+
+
+def blocks_homing(pins: LimitPins, method: HomeMethod) -> bool:
+    """Tell whether the pin that a capture relies on is an output."""
+    match method:
+        case HomeMethod.REVERSE_LIMIT:
+            return not pins & LimitPins.LIMIT1_INPUT
+        case HomeMethod.FORWARD_LIMIT:
+            return not pins & LimitPins.LIMIT2_INPUT
+        case _:
+            return False
+
+
+def _with_mode(pins: LimitPins, mode: PinMode | None, is_input: LimitPins, is_high: LimitPins) -> LimitPins:
+    match mode:
+        case None:
+            return pins
+        case PinMode.INPUT:
+            return pins & ~is_high | is_input
+        case PinMode.HIGH:
+            return pins & ~is_input | is_high
+        case PinMode.LOW:
+            return pins & ~(is_input | is_high)

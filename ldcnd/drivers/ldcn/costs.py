@@ -9,13 +9,11 @@ from types import MappingProxyType
 from typing import Any
 
 from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.addressing import NULLS, NULLS_SETTLE_S, read_identity
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.destinations import Node
-from ldcnd.drivers.ldcn.gains import Gains
-from ldcnd.drivers.ldcn.identities import read_identity
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
-from ldcnd.drivers.ldcn.rates import NULLS, NULLS_SETTLE_S
-from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_divisor
+from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, actual_baud, baud_divisor
 from ldcnd.drivers.ldcn.servo import reading_items
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory

@@ -1,7 +1,7 @@
 """What axes of one LDCN/NMC line do together: start in the same servo cycle, stop by one packet, show one instant.
 
 A group without a leader does not answer: whatever was done is proven afterwards by each drive's own status.
-Source: LS-182AP manual, "Addressing"; PIC-SERVO manual, 3.3 "Group Commands", 5.2 "Start Motion", "Save Current
+Source: LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1 "Group Commands", 5.2 "Start Motion", "Save Current
 Position As Home".
 """
 
@@ -11,14 +11,11 @@ from collections.abc import Callable, Mapping
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.drivers.driver import Motion, StopMode
-from ldcnd.drivers.ldcn import commands, destinations
-from ldcnd.drivers.ldcn.addressing import Addressing
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.destinations import Node, unanswered
-from ldcnd.drivers.ldcn.group_plan import Group, GroupPlan
-from ldcnd.drivers.ldcn.rates import EVERYBODY
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
+from ldcnd.drivers.ldcn.commands import Node, unanswered
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.errors import BusError, DriveFault, LdcndError, NotSupported, OutcomeUnknown, ReplyTimeout, WrongState
 from ldcnd.log import get_logger
@@ -27,12 +24,6 @@ log = get_logger("ldcn")
 
 READY_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 FROZEN_ITEMS = StatusItem.POSITION | StatusItem.HOME
-
-STOP_CONTROLS = {
-    StopMode.SMOOTH: StopControl.AMP_ENABLE | StopControl.SMOOTH,
-    StopMode.ABRUPT: StopControl.AMP_ENABLE | StopControl.ABRUPT,
-    StopMode.OFF: StopControl.MOTOR_OFF,
-}
 
 
 class Groups:
@@ -64,7 +55,7 @@ class Groups:
         if not groups:
             return
         control = STOP_CONTROLS[mode]
-        burst = b"".join(commands.stop_motor(destinations.Group(group.address), control).request for group in groups)
+        burst = b"".join(commands.stop_motor(commands.Group(group.address), control).request for group in groups)
         stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True)
         await self._bus.execute(stop, Lane.STOP)
 
@@ -121,7 +112,7 @@ class Groups:
             raise WrongState(f"axis {homing[0]} is homing: its home register is in use", axis=homing[0])
         await self._prove()
         before = {name: await self._frozen(name) for name in self._drives}
-        burst = b"".join(commands.save_home(destinations.Group(group.address)).request for group in groups)
+        burst = b"".join(commands.save_home(commands.Group(group.address)).request for group in groups)
         await self._bus.execute(unanswered(EVERYBODY, burst, self._quiet_s(groups), repeatable=False))
         positions = {}
         for name in self._drives:
@@ -167,7 +158,7 @@ class Groups:
     async def _start_motion(self, group: Group) -> None:
         """Start Motion, once; a leader's reply proves that the packet was understood, and its loss proves nothing."""
         if group.leader is None:
-            await self._bus.execute(commands.start_motion(destinations.Group(group.address)))
+            await self._bus.execute(commands.start_motion(commands.Group(group.address)))
             return
         leader = self._drives[group.leader]
         await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))

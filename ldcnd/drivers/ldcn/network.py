@@ -3,30 +3,74 @@
 Sources: LS-182AP manual, "Addressing", "Changing communications rates"; PIC-SERVO manual, 4.1 "Network initialization".
 """
 
+import asyncio
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.poller import Poller
+from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.bus.resync import Resync
 from ldcnd.drivers.driver import AxisDriver, AxisSpec, Motion, StopMode
-from ldcnd.drivers.ldcn.addressing import Addressing
-from ldcnd.drivers.ldcn.adoption import Adopted, Adoption
-from ldcnd.drivers.ldcn.group_plan import GroupPlan
+from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn.addressing import (
+    ANY_DIALECT,
+    FASTEST_BAUD,
+    NULLS,
+    NULLS_SETTLE_S,
+    RESET_BAUD,
+    Addressing,
+    Expected,
+    GroupPlan,
+    Identity,
+    LineRate,
+    differences,
+    read_identity,
+)
+from ldcnd.drivers.ldcn.adoption import Adopted, Adoption, Rejoin
+from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
-from ldcnd.drivers.ldcn.identities import Expected, Identity, differences, read_identity
-from ldcnd.drivers.ldcn.module_watch import ModuleWatch
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.rates import FASTEST_BAUD, NULLS, NULLS_SETTLE_S, RESET_BAUD, LineRate
 from ldcnd.drivers.ldcn.registers import BaudCodes
-from ldcnd.drivers.ldcn.rejoin import Rejoin
 from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
 from ldcnd.drivers.network import BringUpReport, Network
-from ldcnd.errors import NetworkMismatch
-from ldcnd.exchange import Exchange
+from ldcnd.errors import BusError, NetworkMismatch
+from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
+
+PERIOD_S = 1.0
+
+
+class ModuleWatch(Poller[Status]):
+    """One module's status byte.
+
+    Attributes:
+        status: the latest, 0 to 255; None while it does not answer.
+    """
+
+    def __init__(self, address: int) -> None:
+        self.node = address
+        self.status: int | None = None
+        self.due_at_s = asyncio.get_running_loop().time()
+        self.deadline_at_s = self.due_at_s + PERIOD_S
+        self._exchange = commands.read_status(Node(address, ANY_DIALECT), STATUS_BYTE_ONLY)
+
+    def next_exchange(self, now_s: float) -> Exchange[Status]:
+        """See `Poller`; a late turn does not shift the next one."""
+        self.due_at_s = next_on_grid(self.due_at_s, PERIOD_S, now_s)
+        self.deadline_at_s = self.due_at_s + PERIOD_S
+        return self._exchange
+
+    def deliver(self, reply: Status, timing: Timing) -> None:  # noqa: ARG002 - part of the contract
+        """See `Poller`."""
+        self.status = int(reply.flags)
+
+    def missed(self, error: BusError) -> None:  # noqa: ARG002 - part of the contract
+        """See `Poller`."""
+        self.status = None
+
 
 log = get_logger("ldcn")
 

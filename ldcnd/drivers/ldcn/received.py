@@ -8,10 +8,17 @@ Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-
 from dataclasses import dataclass
 
 from ldcnd.drivers.ldcn.controls import HomingControl, PositionReset, StopControl
-from ldcnd.drivers.ldcn.fields import GROUP_MEMBER, POSITION
-from ldcnd.drivers.ldcn.gains import Gains, decode_gains
-from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet
+from ldcnd.drivers.ldcn.packet import (
+    GROUP_MEMBER,
+    POSITION,
+    Command,
+    Packet,
+    PacketReader,
+    ReceivedPacket,
+    decode_packet,
+)
 from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.registers import Gains, decode_gains
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.ldcn.trajectory import Trajectory, TrajectoryControl, decode_trajectory, trajectory_bytes
 from ldcnd.errors import BadReply

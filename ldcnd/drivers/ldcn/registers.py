@@ -1,16 +1,24 @@
-"""LDCN/NMC registers whose unit is made of clocks: programmed velocity and acceleration, baud rate divisor.
+"""LDCN/NMC registers: those made of clocks, the data of Set Gain, and what the host knows of what it cannot read back.
 
 Velocity and acceleration are 16.16 fixed-point numbers of counts per servo tick (per tick squared); on devices whose
 servo rate divisor also slows the profile generator, the tick is the divisor times 0.512 ms.
-Sources: LS-182AP manual, "Servo Control", "Set Baud Rate" and the calculation at its end; PIC-SERVO manual, 4.4, 5.2.
+Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Conditions", "Set Baud Rate" and the
+calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
 import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from enum import Enum
 from types import MappingProxyType
 
+from ldcnd.drivers import driver
+from ldcnd.drivers.driver import Register
+from ldcnd.drivers.ldcn.controls import INPUTS
+from ldcnd.drivers.ldcn.packet import Field
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.errors import NotSupported, ValueOutOfRange
+from ldcnd.model.axes import Provenance
 
 SERVO_CYCLE_S = 0.000512
 """The servo period at divisor 1; commands are executed at its end whatever the divisor is."""
@@ -135,3 +143,157 @@ def _programmed(what: str, unit: str, value: float, factor: float) -> int:
             nearest=least,
         )
     return min(register, MOST_RATE)
+
+
+_KP = Field("KP", 2, 0, 0x7FFF)
+_KD = Field("KD", 2, 0, 0x7FFF)
+_KI = Field("KI", 2, 0, 0x7FFF)
+_IL = Field("IL", 2, 0, 0x7FFF)
+_OL = Field("OL", 1, 0, 0xFF)
+_CL = Field("CL", 1, 0, 0xFF)
+_RESERVED_CL = Field("CL (reserved on this drive)", 1, 0, 0)
+_EL = Field("EL", 2, 0, 0x3FFF)
+_SR = Field("SR", 1, 1, MOST_DIVISOR)
+_DEADBAND = Field("deadband compensation", 1, 0, 0xFF)
+_STEP_MULTIPLIER = Field("step multiplier", 1, 1, 0xFF)
+
+_BYTES_WITH_DEADBAND = 14
+_BYTES_WITH_STEP_MULTIPLIER = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """The registers of Set Gain.
+
+    Attributes:
+        kp: position gain, 0 to 0x7FFF.
+        kd: derivative gain, 0 to 0x7FFF.
+        ki: integral gain, 0 to 0x7FFF.
+        il: integration limit, 0 to 0x7FFF; the drive multiplies it by 256.
+        ol: PWM output limit, 0 to 255; the LS-182AP manual recommends 250.
+        cl: current limit, 0 to 255, odd when the sense voltage rises with the current; 0 is off, and the only value on
+            Logosol drives.
+        el: position error limit, 0 to 0x3FFF counts.
+        sr: servo rate divisor, 1 to 255.
+        deadband: amplifier deadband compensation, 0 to 255; 0 on PIC-SERVO versions 1 to 3.
+        step_multiplier: 1 to 255; 1 on everything but PIC-SERVO SC.
+    """
+
+    kp: int
+    kd: int
+    ki: int
+    il: int
+    ol: int
+    cl: int
+    el: int
+    sr: int
+    deadband: int = 0
+    step_multiplier: int = 1
+
+
+def encode_gains(profile: Profile, gains: Gains) -> bytes:
+    """Return the 13, 14 or 15 data bytes for this device.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+        NotSupported: the device lacks a register that is not at its default.
+    """
+    if gains.deadband and profile.gain_bytes < _BYTES_WITH_DEADBAND:
+        raise NotSupported(f"{profile.title} has no deadband compensation")
+    if gains.step_multiplier != 1 and profile.gain_bytes < _BYTES_WITH_STEP_MULTIPLIER:
+        raise NotSupported(f"{profile.title} has no step multiplier")
+    values = (gains.kp, gains.kd, gains.ki, gains.il, gains.ol, gains.cl, gains.el, gains.sr)
+    optional = (gains.deadband, gains.step_multiplier)
+    fields = _fields(profile)
+    return b"".join(field.encode(value) for field, value in zip(fields, values + optional, strict=False))
+
+
+def decode_gains(profile: Profile, data: bytes) -> Gains:
+    """Take data bytes as this device would, in range or not.
+
+    Surplus bytes are ignored, a missing step multiplier is 1, everything else that is missing is 0.
+    """
+    values = []
+    at = 0
+    for field in _fields(profile):
+        present = field is not _STEP_MULTIPLIER or at < len(data)
+        values.append(field.decode(data[at:]) if present else 1)
+        at += field.width
+    return Gains(*values)
+
+
+def _fields(profile: Profile) -> tuple[Field, ...]:
+    """Return the registers in order; older devices have fewer."""
+    fields: tuple[Field, ...] = (_KP, _KD, _KI, _IL, _OL, _CL if profile.current_limit else _RESERVED_CL, _EL, _SR)
+    if profile.gain_bytes >= _BYTES_WITH_DEADBAND:
+        fields += (_DEADBAND,)
+    if profile.gain_bytes >= _BYTES_WITH_STEP_MULTIPLIER:
+        fields += (_STEP_MULTIPLIER,)
+    return fields
+
+
+GAIN_NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
+TRAJECTORY_NAMES = ("position", "velocity", "acceleration", "pwm_or_target")
+LIMIT_PINS = "io_control"
+BYTES_WITH_DEADBAND = 14
+
+
+class RegisterBook:
+    """The registers of one drive, each with where its value comes from.
+
+    A register that is being written is unknown until the drive has acknowledged it.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        names = list(GAIN_NAMES)
+        if not profile.current_limit:
+            names.remove("cl")
+        if profile.gain_bytes < BYTES_WITH_DEADBAND:
+            names.remove("deadband")
+        names += TRAJECTORY_NAMES
+        if profile.limit_outputs:
+            names.append(LIMIT_PINS)
+        self._registers = {name: Register(name, None, Provenance.UNKNOWN) for name in names}
+
+    def all(self) -> tuple[Register, ...]:
+        """Return every register the drive has, in the order of the manual."""
+        return tuple(self._registers.values())
+
+    def value(self, name: str) -> int | None:
+        """Return what a register holds, or None when that is unknown or there is none of that name."""
+        register = self._registers.get(name)
+        return register.value if register else None
+
+    def written(self, name: str) -> bool:
+        """Tell whether this daemon wrote a register since the drive was reset or taken over."""
+        register = self._registers.get(name)
+        return register is not None and register.provenance is Provenance.WRITTEN_AND_ACKNOWLEDGED
+
+    def reset(self) -> None:
+        """The drive was reset: everything is 0 but the servo rate divisor and the pins, says the manual."""
+        self._set(dict.fromkeys(self._registers, 0) | {"sr": 1, LIMIT_PINS: INPUTS}, Provenance.ASSUMED)
+
+    def assume(self, values: Mapping[str, int]) -> None:
+        """The drive was taken over as it is: these are what somebody must have written, nothing else is known."""
+        self.doubt(self._registers)
+        self._set(values, Provenance.ASSUMED)
+
+    def doubt(self, names: Iterable[str]) -> None:
+        """Something is about to change these registers, or may have."""
+        for name in names:
+            if name in self._registers:
+                self._registers[name] = Register(name, None, Provenance.UNKNOWN)
+
+    def wrote(self, values: Mapping[str, int]) -> None:
+        """The drive has acknowledged these values."""
+        self._set(values, Provenance.WRITTEN_AND_ACKNOWLEDGED)
+
+    def _set(self, values: Mapping[str, int], provenance: Provenance) -> None:
+        for name, value in values.items():
+            if name in self._registers:
+                self._registers[name] = Register(name, int(value), provenance)
+
+
+def gain_values(gains: driver.Gains) -> dict[str, int]:
+    """Return what Set Gain writes."""
+    return asdict(gains)

@@ -1,7 +1,7 @@
 """One LDCN or NMC servo drive as an `AxisDriver`: which packets a command takes.
 
-What its status packets mean is in drive_state.py, which home captures it has in homing.py, what its motions are to it
-in motions.py, what is known of its registers in register_book.py.
+What its status packets mean is in faults.py, what its motions are to it in trajectory.py, what is known of its
+registers in registers.py. Versions 1 and 2 of PIC-SERVO do not stop on home by themselves: the host stops them.
 
 Reset Position is never sent: it would make every position on record mean something else, must not be repeated when its
 reply is lost, and is forbidden during a trapezoidal move. The offset between counts and axis units is the host's.
@@ -10,6 +10,7 @@ Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute p
 """
 
 from dataclasses import asdict, replace
+from types import MappingProxyType
 from typing import Any
 
 from ldcnd.bus.bus import Bus
@@ -27,23 +28,59 @@ from ldcnd.drivers.driver import (
     StopMode,
 )
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
-from ldcnd.drivers.ldcn.destinations import Node
-from ldcnd.drivers.ldcn.drive_state import DriveState
-from ldcnd.drivers.ldcn.faults import FaultCode, sensor_lost
-from ldcnd.drivers.ldcn.gains import Gains
-from ldcnd.drivers.ldcn.homing import home_methods, homing_control, opens_loop
-from ldcnd.drivers.ldcn.limit_pins import INPUTS, blocks_homing, with_modes
-from ldcnd.drivers.ldcn.motions import quantised, trajectory_of
-from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.register_book import LIMIT_PINS, RegisterBook, gain_values, trajectory_values
+from ldcnd.drivers.ldcn.commands import Node
+from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
+from ldcnd.drivers.ldcn.faults import DriveState, FaultCode, sensor_lost
+from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
+from ldcnd.drivers.ldcn.registers import LIMIT_PINS, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
 from ldcnd.exchange import Exchange
 from ldcnd.model.requests import HomeMethod, PinMode
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.verb import PARAMETER_CAPABILITIES, Verb
+
+SOURCES = MappingProxyType(
+    {
+        HomeMethod.REVERSE_LIMIT: HomingSource.LIMIT1,
+        HomeMethod.FORWARD_LIMIT: HomingSource.LIMIT2,
+        HomeMethod.INDEX: HomingSource.INDEX,
+        HomeMethod.POSITION_ERROR: HomingSource.POSITION_ERROR,
+        HomeMethod.CURRENT: HomingSource.CURRENT,
+    }
+)
+STOPS = MappingProxyType(
+    {
+        StopMode.SMOOTH: HomingControl.STOP_SMOOTH,
+        StopMode.ABRUPT: HomingControl.STOP_ABRUPT,
+        StopMode.OFF: HomingControl.MOTOR_OFF,
+    }
+)
+
+
+def home_methods(profile: Profile) -> frozenset[HomeMethod]:
+    """Return what can capture the home position of this device."""
+    return frozenset(method for method, source in SOURCES.items() if source & profile.homing_sources)
+
+
+def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
+    """Return the control byte that arms a capture.
+
+    An excess position error opens the loop by itself, so no way to stop goes with it.
+    """
+    control = HomingControl(SOURCES[capture.method])
+    if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
+        control |= STOPS[capture.stop]
+    return control
+
+
+def opens_loop(profile: Profile, capture: HomeCapture) -> bool:
+    """Tell whether the drive opens its loop by itself when it has captured."""
+    if capture.method is HomeMethod.POSITION_ERROR:
+        return True
+    return profile.stops_on_home and capture.stop is StopMode.OFF
+
 
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""

@@ -1,16 +1,26 @@
-"""The data of Load Trajectory: goal, velocity, acceleration, PWM or analog target, and how they are executed.
+"""The data of Load Trajectory, and the motions of the daemon as such data.
 
-Sources: LS-182AP manual, "Load Trajectory", "Absolute positioning mode"; PIC-SERVO manual, 4.4, 4.5, 5.2. Where the
-LS-182AP text has bit 4 choose between trapezoid and velocity it means bit 5, as its own list of bits says.
+Sources: LS-182AP manual, "Load Trajectory", "PWM Mode Operation", "Absolute positioning mode", "Analog positioning
+sensor control"; PIC-SERVO manual, 4.4, 4.5, 5.2. Where the LS-182AP text has bit 4 choose between trapezoid and
+velocity it means bit 5, as its own list of bits says.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag, StrEnum
 
-from ldcnd.drivers.ldcn.fields import POSITION, Field
+from ldcnd.drivers.driver import AnalogMotion, Motion, PwmOutput
+from ldcnd.drivers.ldcn.faults import SENSOR_BITS, SENSOR_LEAST, SENSOR_MOST
+from ldcnd.drivers.ldcn.packet import POSITION, Field
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import MOST_RATE
-from ldcnd.errors import NotSupported
+from ldcnd.drivers.ldcn.registers import (
+    MOST_RATE,
+    TRAJECTORY_NAMES,
+    acceleration_counts_per_s2,
+    programmed_acceleration,
+    programmed_velocity,
+    velocity_counts_per_s,
+)
+from ldcnd.errors import NotSupported, ValueOutOfRange
 
 VELOCITY = Field("velocity", 4, 0, MOST_RATE)
 ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
@@ -141,3 +151,76 @@ def _pwm_or_target(profile: Profile, control: TrajectoryControl) -> Field:
     if control & TrajectoryControl.SERVO and profile.analog_target:
         return Field("analog target", profile.pwm_bytes, 0, (1 << profile.adc_bits) - 1)
     return Field("PWM", profile.pwm_bytes, 0, MOST_PWM)
+
+
+def trajectory_values(trajectory: Trajectory) -> dict[str, int]:
+    """Return what Load Trajectory writes: the fields that are present."""
+    values = {name: getattr(trajectory, name) for name in TRAJECTORY_NAMES}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def quantised(motion: Motion, servo_divisor: int, profile: Profile) -> Motion:
+    """Return the motion as the registers will hold it.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+    """
+    velocity = programmed_velocity(abs(motion.velocity_counts_per_s), servo_divisor, profile)
+    acceleration = programmed_acceleration(motion.acceleration_counts_per_s2, servo_divisor, profile)
+    speed = velocity_counts_per_s(velocity, servo_divisor, profile)
+    return replace(
+        motion,
+        velocity_counts_per_s=speed if motion.velocity_counts_per_s > 0 else -speed,
+        acceleration_counts_per_s2=acceleration_counts_per_s2(acceleration, servo_divisor, profile),
+    )
+
+
+def trajectory_of(motion: Motion | AnalogMotion | PwmOutput, servo_divisor: int, profile: Profile) -> Trajectory:
+    """Return what Load Trajectory takes for a motion; it waits for Start Motion.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register, or is an analog target that looks like a broken sensor.
+        NotSupported: an analog target on a drive without absolute positioning.
+    """
+    acceleration = programmed_acceleration(motion.acceleration_counts_per_s2, servo_divisor, profile)
+    match motion:
+        case PwmOutput():
+            return Trajectory(
+                acceleration=acceleration,
+                pwm_or_target=round(abs(motion.duty) * MOST_PWM),
+                servo=False,
+                reverse=motion.duty < 0,
+            )
+        case AnalogMotion():
+            _check_analog_target(motion.target_counts, profile)
+            return Trajectory(
+                velocity=programmed_velocity(motion.velocity_counts_per_s, servo_divisor, profile),
+                acceleration=acceleration,
+                pwm_or_target=motion.target_counts,
+                mode=ProfileMode.VELOCITY,
+            )
+        case Motion():
+            continuous = motion.target_counts is None
+            return Trajectory(
+                position=motion.target_counts,
+                velocity=programmed_velocity(abs(motion.velocity_counts_per_s), servo_divisor, profile),
+                acceleration=acceleration,
+                mode=ProfileMode.VELOCITY if continuous else ProfileMode.TRAPEZOIDAL,
+                reverse=continuous and motion.velocity_counts_per_s < 0,
+            )
+
+
+def _check_analog_target(target: int, profile: Profile) -> None:
+    """Refuse a target where the drive would take its sensor for a broken one."""
+    if not profile.analog_target:
+        raise NotSupported(f"{profile.title} cannot move to an analog target")
+    shift = SENSOR_BITS - profile.adc_bits
+    low, high = -(-SENSOR_LEAST >> shift), SENSOR_MOST >> shift
+    if not low <= target <= high:
+        nearest = low if target < low else high
+        raise ValueOutOfRange(
+            f"analog target {target} is outside {low} to {high}, where the drive takes its sensor for broken",
+            value=target,
+            limit=nearest,
+            nearest=nearest,
+        )

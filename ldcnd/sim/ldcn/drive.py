@@ -13,11 +13,9 @@ Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3.
 """
 
 from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
-from ldcnd.drivers.ldcn.fields import POSITION
-from ldcnd.drivers.ldcn.gains import decode_gains
-from ldcnd.drivers.ldcn.packet import Command, Packet
+from ldcnd.drivers.ldcn.packet import POSITION, Command, Packet
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, decode_gains
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, decode_trajectory
 from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing, SimulatedModule

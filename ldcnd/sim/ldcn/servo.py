@@ -12,9 +12,8 @@ import math
 from dataclasses import dataclass
 
 from ldcnd.drivers.ldcn.controls import HomingControl
-from ldcnd.drivers.ldcn.gains import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import FRACTION
+from ldcnd.drivers.ldcn.registers import FRACTION, Gains
 from ldcnd.sim.ldcn.power import Condition, PowerStage, Trip
 from ldcnd.sim.ldcn.trajectory import ProfileGenerator
 from ldcnd.sim.plant import Shaft
