@@ -11,8 +11,8 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.smartstep_line import build_line
-from ldcnd.drivers.smartstep.axis import SmartStepAxis
 from ldcnd.drivers.smartstep.commissioning import examine
+from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.errors import BusDown, ConfigError
 from ldcnd.model.findings import Finding, Verdict
 

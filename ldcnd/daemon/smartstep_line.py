@@ -10,18 +10,17 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, SimulatedLineConfig
 from ldcnd.drivers.driver import AxisSpec
-from ldcnd.drivers.smartstep.axis import UnitSpec
+from ldcnd.drivers.smartstep.drive import UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger
-from ldcnd.drivers.smartstep.network import SmartStepNetwork
+from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
 from ldcnd.drivers.smartstep.parameter_store import EepromRules
 from ldcnd.drivers.smartstep.parameters import PN000
-from ldcnd.drivers.smartstep.port import BAUD, smartstep_opener
+from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import Echo, Framing, SmartStepProfile
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulator import smartstep_chain
-from ldcnd.drivers.smartstep.unit_poller import Basic, Item
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line
+from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.transport.port_url import port_opener
 from ldcnd.transport.transport import Opener
 

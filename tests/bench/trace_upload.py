@@ -7,12 +7,12 @@ from ldcnd.axis_config import AxisConfig, RatesConfig
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.client.traces import take_trace
 from ldcnd.config import RigConfig
+from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, Function
-from ldcnd.drivers.smartstep.simulated_unit import CHARACTER_S
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.strings import LONGEST_STRING_BYTES
-from ldcnd.drivers.smartstep.trace_memory import chunk_plan
+from ldcnd.drivers.smartstep.trace_data import chunk_plan
 from ldcnd.model.requests import TraceRequest
+from ldcnd.sim.smartstep.unit import CHARACTER_S
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock
 from tests.support.rig import RunningRig

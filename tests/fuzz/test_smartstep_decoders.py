@@ -13,18 +13,17 @@ from ldcnd.drivers.smartstep.commands import (
     read_monitor,
     read_operating_mode,
     reference,
+    string_reference,
     write_eeprom,
 )
-from ldcnd.drivers.smartstep.packet import Command, Reply, checksum, decode_command, decode_reply
+from ldcnd.drivers.smartstep.monitors import SPEED_FEEDBACK
+from ldcnd.drivers.smartstep.packet import Command, Reply, checksum, decode_command, decode_reply, piece_bytes
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.drivers.smartstep.profiles import ByteOrder, SmartStepProfile, StringChecksum
-from ldcnd.drivers.smartstep.reply_reader import piece_bytes
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.status import SPEED_FEEDBACK
-from ldcnd.drivers.smartstep.strings import string_reference
-from ldcnd.drivers.smartstep.trace_words import split_words
+from ldcnd.drivers.smartstep.trace_data import split_words
 from ldcnd.errors import BadReply
 from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.sim.smartstep.unit import SimulatedUnit
 
 EXCHANGES: list[Exchange] = [
     reference(0, 0x0100),

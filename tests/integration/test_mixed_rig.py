@@ -10,8 +10,6 @@ import pytest
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.config import load_config
 from ldcnd.drivers.smartstep.parameters import PN100
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulator import smartstep_chain
 from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.monitors import MonitorName
@@ -39,6 +37,8 @@ from ldcnd.model.requests import (
     WriteParameterRequest,
 )
 from ldcnd.model.samples import FaultSample, PositionSample, StateSample, TelemetryItem, VelocitySample
+from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.rig import RunningRig, running_rig
 from tests.support.smartstep_line import simulated
 

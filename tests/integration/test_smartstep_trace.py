@@ -7,7 +7,6 @@ import pytest
 
 from ldcnd.client.traces import arm_trace, fetch_trace, take_trace, wait_for_trace
 from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, StringChecksum, TraceWordLayout
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
 from ldcnd.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys
@@ -15,6 +14,7 @@ from ldcnd.model.plan import RigPlan
 from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb, WriteParameterRequest
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.traces import TracePhase, TraceTrigger, TriggerKind
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.rig import EPOCH_NS
 from tests.support.trace_rig import trace_rig, trace_rig_over_zenoh
 

@@ -11,12 +11,11 @@ from ldcnd.bus.cost import Cost
 from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, plan_line
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.smartstep.costs import words_of
-from ldcnd.drivers.smartstep.monitors import WORDS
+from ldcnd.drivers.smartstep.monitors import OUTPUT_SIGNALS, SPEED_FEEDBACK, WORDS
+from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.status import OUTPUT_SIGNALS, SPEED_FEEDBACK
-from ldcnd.drivers.smartstep.unit_poller import Basic, Item, Listeners, UnitPoller
 from ldcnd.model.monitors import MonitorName
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 
 VARIANT = SimulatedVariant()

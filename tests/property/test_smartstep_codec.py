@@ -5,23 +5,30 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.drivers.smartstep.commands import reference
+from ldcnd.drivers.smartstep.commands import reference, string_reference
 from ldcnd.drivers.smartstep.packet import (
     Command,
     Function,
     Reply,
+    ReplyReader,
     ResponseStatus,
+    add_parity,
     decode_command,
     decode_reply,
+    strip_parity,
 )
-from ldcnd.drivers.smartstep.parity import add_parity, strip_parity
 from ldcnd.drivers.smartstep.profiles import ByteOrder, StringChecksum, TraceWordLayout
-from ldcnd.drivers.smartstep.reply_reader import ReplyReader
-from ldcnd.drivers.smartstep.simulated_unit import string_reply
-from ldcnd.drivers.smartstep.strings import string_reference
-from ldcnd.drivers.smartstep.trace_memory import first_point, unwrap
-from ldcnd.drivers.smartstep.trace_words import TracePoint, decode_word, encode_word, join_words, split_words
+from ldcnd.drivers.smartstep.trace_data import (
+    TracePoint,
+    decode_word,
+    encode_word,
+    first_point,
+    join_words,
+    split_words,
+    unwrap,
+)
 from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.sim.smartstep.unit import string_reply
 
 units = st.integers(0, 15)
 words = st.integers(0, 0xFFFF)

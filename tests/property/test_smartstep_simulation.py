@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.smartstep.counters import Counter, CounterReading
+from ldcnd.drivers.smartstep.monitors import Counter, CounterReading
 from ldcnd.drivers.smartstep.packet import Command, Function, decode_reply
 from ldcnd.drivers.smartstep.parameters import PN000
-from ldcnd.drivers.smartstep.simulated_motor import SimulatedMotor
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
+from ldcnd.sim.smartstep.drive import SimulatedMotor
+from ldcnd.sim.smartstep.unit import SimulatedUnit
 
 commands = st.builds(
     Command,

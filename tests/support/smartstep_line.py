@@ -9,18 +9,17 @@ from pathlib import Path
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec
-from ldcnd.drivers.smartstep.axis import SmartStepAxis, UnitSpec
+from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger
-from ldcnd.drivers.smartstep.network import SmartStepNetwork
+from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
 from ldcnd.drivers.smartstep.parameter_store import EepromRules
 from ldcnd.drivers.smartstep.parameters import PN000, Parameter
-from ldcnd.drivers.smartstep.port import BAUD, smartstep_opener
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile, Wiring
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.simulator import smartstep_chain
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.line import open_simulated_line
+from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 
 def simulated(

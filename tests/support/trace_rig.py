@@ -14,14 +14,13 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drivers.smartstep.parameters import PN000
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.simulator import smartstep_chain
-from ldcnd.drivers.smartstep.trace_setup import DataObject, IoObject
-from ldcnd.drivers.smartstep.trace_words import TracePoint
+from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from ldcnd.smartstep_config import SmartStepUnitConfig
 from tests.support.process import free_port
 from tests.support.rig import RunningRig, running_rig

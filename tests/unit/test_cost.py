@@ -14,14 +14,14 @@ from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
 from ldcnd.drivers.smartstep.costs import price_list as smartstep_price_list
 from ldcnd.drivers.smartstep.parameters import PN000
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.simulator import smartstep_chain
 from ldcnd.exchange import Exchange
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.module import ModuleSettings
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
+from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.recording_receiver import RecordingReceiver
 
 NO_HOST = 0.0

@@ -9,7 +9,7 @@ from ldcnd import errors
 from ldcnd.cli.main import cli, main
 from ldcnd.daemon.axis_tracker import LINK_LOST, LOOP_OPENED, AxisTracker
 from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
-from ldcnd.drivers.smartstep.alarms import ALARMS, AlarmKind
+from ldcnd.drivers.smartstep.monitors import ALARMS, AlarmKind
 from ldcnd.errors import DriveFault, ErrorCode, LdcndError
 from ldcnd.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
 from ldcnd.messaging.codec import error_reply

@@ -1,6 +1,17 @@
 import pytest
 
-from ldcnd.drivers.smartstep.packet import Command, Function, Reply, ResponseStatus, decode_reply
+from ldcnd.drivers.smartstep.packet import (
+    DAMAGED,
+    Command,
+    Function,
+    Reply,
+    ReplyReader,
+    ResponseStatus,
+    add_parity,
+    decode_reply,
+    piece_bytes,
+    strip_parity,
+)
 from ldcnd.errors import BadReply, ValueOutOfRange
 
 
@@ -65,3 +76,66 @@ def test_status_outside_the_manuals_table_is_bad(code):
 def test_status_says_its_function_and_outcome(status, function, normal):
     assert ResponseStatus(status).function is function
     assert ResponseStatus(status).normal is normal
+
+
+def test_alphabet_as_8n1_bytes():
+    encoded = add_parity(b"W0123456789ABCDEF\r")
+
+    assert encoded == bytes.fromhex("D7 30 B1 B2 33 B4 35 36 B7 B8 39 41 42 C3 44 C5 C6 8D")
+
+
+@pytest.mark.parametrize("code", range(128))
+def test_every_character_survives_and_every_single_bit_error_shows(code):
+    encoded = add_parity(bytes([code]))
+
+    damaged = b"".join(strip_parity(bytes([encoded[0] ^ 1 << bit])) for bit in range(8))
+
+    assert strip_parity(encoded) == bytes([code])
+    assert damaged == bytes([DAMAGED] * 8)
+
+
+def test_packet_with_a_damaged_character_keeps_its_length():
+    encoded = bytearray(add_parity(b"W0001000000FF\r"))
+    encoded[5] ^= 0x80
+
+    assert strip_parity(bytes(encoded)) == b"W0001\x7f00000FF\r"
+
+
+REPLY = b"W0001000028D7\r"
+
+
+def test_noise_before_a_reply_is_skipped():
+    reader = ReplyReader(14)
+
+    assert reader.feed(b"\x00\xff\r0" + REPLY) == [REPLY]
+    assert reader.skipped == 4
+
+
+def test_second_start_ends_what_was_no_packet():
+    reader = ReplyReader(14)
+
+    assert reader.feed(b"W00" + REPLY) == [REPLY]
+    assert reader.skipped == 3
+
+
+def test_reply_may_come_one_character_at_a_time():
+    reader = ReplyReader(14)
+
+    candidates = [candidate for code in REPLY for candidate in reader.feed(bytes([code]))]
+
+    assert candidates == [REPLY]
+
+
+def test_endless_packet_is_given_up():
+    reader = ReplyReader(14)
+
+    assert reader.feed(b"W" + b"0" * 30 + REPLY) == [REPLY]
+    assert reader.skipped == 31
+
+
+@pytest.mark.parametrize(
+    ("data", "length"),
+    [(b"", None), (b"W", None), (b"abc", 3), (b"abW", 2), (b"W\r", 2), (REPLY + b"W", 14), (b"W" * 2, 1)],
+)
+def test_piece_ends_where_its_bytes_say(data, length):
+    assert piece_bytes(data, 14) == length

@@ -6,11 +6,10 @@ from contextlib import suppress
 import pytest
 
 from ldcnd.bus.wire_log import WireEvent, WireRecord
+from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import set_operating_mode
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
 from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN102, PN202, PN304, PN402
 from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
 from ldcnd.errors import (
     AddressRefused,
     BusyTracing,
@@ -25,6 +24,7 @@ from ldcnd.errors import (
 from ldcnd.model.parameters import Memory
 from ldcnd.model.requests import WriteParameterRequest
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 
 

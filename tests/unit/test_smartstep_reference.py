@@ -5,14 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import Register
-from ldcnd.drivers.smartstep.alarms import ALARMS
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
+from ldcnd.drivers.smartstep.monitors import ALARMS, MONITORS
 from ldcnd.drivers.smartstep.packet import ResponseStatus
 from ldcnd.drivers.smartstep.parameters import PARAMETERS, Fact, Parameter
 from ldcnd.drivers.smartstep.profiles import DOUBTS, Confidence
-from ldcnd.drivers.smartstep.status import MONITORS
-from ldcnd.drivers.smartstep.trace_setup import DataObject, IoObject
+from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "smartstep.md").read_text()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.smartstep.commands import reference
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.addresses import OperatingMode
+from ldcnd.drivers.smartstep.commands import StringReply, reference, string_reference
 from ldcnd.drivers.smartstep.packet import (
     Command,
     Function,
@@ -20,10 +20,9 @@ from ldcnd.drivers.smartstep.packet import (
 )
 from ldcnd.drivers.smartstep.parameters import PN000, PN100
 from ldcnd.drivers.smartstep.profiles import StringChecksum
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit, string_reply
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.strings import StringReply, string_reference
 from ldcnd.exchange import ReplyVerdict
+from ldcnd.sim.smartstep.unit import SimulatedUnit, string_reply
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
-"""The address map, without the parameters (parameters.py) and the monitors (status.py).
+"""The address map without parameters and monitors, and the operating modes of 2000H, a closed list.
 
-Source: manual 3 and 4, address tables.
+Related drives move their motor in other modes (jog, auto-tuning, origin search). So commands.py takes no number for
+2000H, only a member of the enumeration.
+Source: manual 3, 4, 5 (2) and 6 (2), address tables.
 """
 
 from enum import IntEnum
@@ -52,3 +54,20 @@ class TraceRegister(IntEnum):
     PTRGNO = Register.PTRGNO
     TRGC1 = Register.TRGC1
     TRGC2 = Register.TRGC2
+
+
+class OperatingMode(IntEnum):
+    """What the drive is doing beside its normal work."""
+
+    NORMAL = 0x0000
+    DATA_TRACE = 0x2000
+    COMMAND_COUNTER_CLEAR = 0x2003
+    FEEDBACK_COUNTER_CLEAR = 0x2004
+
+
+def operating_mode(word: int) -> OperatingMode | int:
+    """Return the mode that a drive reports, as a plain number when it is not a documented one."""
+    try:
+        return OperatingMode(word)
+    except ValueError:
+        return word

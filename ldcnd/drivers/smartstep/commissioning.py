@@ -8,20 +8,19 @@ from collections.abc import AsyncIterator
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.smartstep import commands
-from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, Register
-from ldcnd.drivers.smartstep.alarms import AlarmKind, alarm
-from ldcnd.drivers.smartstep.axis import SmartStepAxis
-from ldcnd.drivers.smartstep.network import hears_itself
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
-from ldcnd.drivers.smartstep.parameters import PN000, unit_number
-from ldcnd.drivers.smartstep.refusals import Refusal
-from ldcnd.drivers.smartstep.status import (
+from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, OperatingMode, Register
+from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES, Refusal, StringReply, string_reference
+from ldcnd.drivers.smartstep.drive import SmartStepAxis
+from ldcnd.drivers.smartstep.monitors import (
     INPUT_COUNTER_LOW,
+    AlarmKind,
     FunctionSwitch,
+    alarm,
     function_switches,
     gain_switch,
 )
-from ldcnd.drivers.smartstep.strings import LONGEST_STRING_BYTES, StringReply, string_reference
+from ldcnd.drivers.smartstep.network import hears_itself
+from ldcnd.drivers.smartstep.parameters import PN000, unit_number
 from ldcnd.errors import BadReply, BusError, DriveFault
 from ldcnd.model.findings import Finding, Verdict
 

@@ -9,12 +9,11 @@ from typing import Any
 
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.drivers.smartstep import commands
-from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TraceRegister
+from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, OperatingMode, TraceRegister
+from ldcnd.drivers.smartstep.commands import string_reference
 from ldcnd.drivers.smartstep.monitors import COUNTERS
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.poller import BASIC_WORDS, Item
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
-from ldcnd.drivers.smartstep.strings import string_reference
-from ldcnd.drivers.smartstep.unit_poller import BASIC_WORDS, Item
 from ldcnd.exchange import Exchange
 from ldcnd.model.monitors import MonitorName
 from ldcnd.model.samples import TelemetryItem

@@ -1,8 +1,9 @@
-"""SmartStep packets: 14 characters each way, their fields and their checksum.
+"""SmartStep packets: 14 characters each way, their checksum, their parity, and where one ends in a stream.
 
-Knows characters only; what an address or its data mean is in commands.py and status.py. Where the manual prints a
+Knows characters only; what an address or its data mean is in addresses.py and commands.py. Where the manual prints a
 format one or two letters short, its rule of 14 characters decides.
-Source: "Serial communications with Smart Step servodriver" (OMRON Barcelona), 2.2 "Communication mode".
+Source: "Serial communications with Smart Step servodriver" (OMRON Barcelona), 2.1 "Basic specifications", 2.2
+"Communication mode".
 """
 
 from binascii import unhexlify
@@ -160,3 +161,69 @@ def _fields(packet: bytes) -> tuple[int, int, int, int] | None:
     ):
         return None
     return int(digits[:1], 16), int(digits[1:2], 16), int(digits[2:6], 16), int(digits[6:10], 16)
+
+
+DAMAGED = 0x7F
+"""Stands for a character with wrong parity: it keeps its place and can belong to no packet."""
+
+_ENCODED = bytes((code & 0x7F) | ((code & 0x7F).bit_count() & 1) << 7 for code in range(256))
+_DECODED = bytes(code & 0x7F if code.bit_count() % 2 == 0 else DAMAGED for code in range(256))
+
+
+def add_parity(characters: bytes) -> bytes:
+    """Return the 8N1 bytes of seven-bit characters."""
+    return characters.translate(_ENCODED)
+
+
+def strip_parity(data: bytes) -> bytes:
+    """Return the seven-bit characters of 8N1 bytes, `DAMAGED` in the place of each with wrong parity."""
+    return data.translate(_DECODED)
+
+
+def piece_bytes(data: bytes, longest: int) -> int | None:
+    """Return the length of the first piece of the stream, or None while its end has not come.
+
+    A second W, or more than `longest` bytes without CR, ends what was no packet.
+
+    Args:
+        data: what has arrived, from the end of the last piece on.
+        longest: no packet is longer than this.
+    """
+    if not data:
+        return None
+    if data[:1] != START:
+        start = data.find(START)
+        return len(data) if start < 0 else start
+    end = data.find(END) + 1
+    restart = data.find(START, 1)
+    if restart > 0 and (end == 0 or restart < end):
+        end = restart
+    if end == 0:
+        return longest if len(data) >= longest else None
+    return min(end, longest)
+
+
+class ReplyReader:
+    """Cuts a stream into packet candidates; the cuts do not depend on how the stream arrives.
+
+    Attributes:
+        skipped: bytes so far that belonged to no candidate.
+    """
+
+    def __init__(self, longest: int) -> None:
+        self.skipped = 0
+        self._longest = longest
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take further bytes and return the candidates, W to CR, that they complete."""
+        self._buffer += data
+        candidates = []
+        while (length := piece_bytes(bytes(self._buffer), self._longest)) is not None:
+            piece = bytes(self._buffer[:length])
+            del self._buffer[:length]
+            if piece[:1] == START and piece[-1:] == END:
+                candidates.append(piece)
+            else:
+                self.skipped += length
+        return candidates

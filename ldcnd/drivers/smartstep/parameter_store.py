@@ -1,4 +1,4 @@
-"""Reading and writing the parameters of one drive: RAM by default, EEPROM rarely and never twice for one request.
+"""Parameters, counters and alarms of one drive as the daemon asks for them; RAM by default, EEPROM rarely.
 
 EEPROM: the value is read first and nothing is sent if it is there already; each write is entered in the ledger before
 it is sent; when its reply is lost, the memory is read back, and only a value that is still the old one lets the write
@@ -6,11 +6,15 @@ be sent again.
 Source: manual 2.2, note on EEPROM; 3.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from ldcnd.drivers.parameter_access import Written
+from ldcnd.drivers.parameter_access import ParameterAccess, Written
+from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import write_eeprom, write_ram
 from ldcnd.drivers.smartstep.ledger import EEPROM_LIFE, WARNING_WRITES, EepromLedger
+from ldcnd.drivers.smartstep.modes import clear_counter
+from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH, Counter, alarm
 from ldcnd.drivers.smartstep.parameters import (
     PARAMETERS,
     PN000,
@@ -19,7 +23,7 @@ from ldcnd.drivers.smartstep.parameters import (
     unit_number,
     unlisted_parameter,
 )
-from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile
+from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile, doubt_info
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.errors import (
     AddressRefused,
@@ -33,7 +37,7 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.log import get_logger
-from ldcnd.model.parameters import Memory, ParameterInfo, ParameterValue
+from ldcnd.model.parameters import AlarmEntry, CounterName, DoubtInfo, Memory, ParameterInfo, ParameterValue
 from ldcnd.model.requests import WriteParameterRequest
 
 log = get_logger("smartstep")
@@ -248,3 +252,60 @@ def _pending(parameter: Parameter, value: ParameterValue) -> tuple[str, ...]:
     if not value.differs:
         return ()
     return (f"{parameter.label}: {value.active} is in use, {value.stored} is stored: they meet at the next power-on",)
+
+
+COUNTERS = {CounterName.COMMAND: Counter.COMMAND, CounterName.FEEDBACK: Counter.FEEDBACK}
+
+
+class UnitParameters(ParameterAccess):
+    """See `ParameterAccess`."""
+
+    def __init__(
+        self, words: Words, profile: SmartStepProfile, eeprom: EepromRules, cleared: Callable[[], None]
+    ) -> None:
+        self._words = words
+        self._profile = profile
+        self._store = ParameterStore(words, profile, eeprom)
+        self._cleared = cleared
+
+    @property
+    def self_hearing(self) -> bool:
+        """See `ParameterAccess`."""
+        return self._words.self_hearing
+
+    def known(self) -> tuple[ParameterInfo, ...]:
+        """See `ParameterAccess`."""
+        return tuple(map(parameter_info, PARAMETERS))
+
+    async def read(self, parameter: str, *, unlisted: bool = False) -> ParameterValue:
+        """See `ParameterAccess`."""
+        return await self._store.read(self._store.find(parameter, unlisted=unlisted))
+
+    async def read_all(self) -> tuple[ParameterValue, ...]:
+        """See `ParameterAccess`."""
+        return await self._store.read_all()
+
+    async def write(self, request: WriteParameterRequest) -> Written:
+        """See `ParameterAccess`."""
+        return await self._store.write(request)
+
+    async def clear_counter(self, counter: CounterName) -> int:
+        """See `ParameterAccess`."""
+        value = await clear_counter(self._words, COUNTERS[counter])
+        self._cleared()
+        return value
+
+    async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
+        """See `ParameterAccess`."""
+        present = _entry(await self._words.read(Register.PRESENT_ALARM))
+        history = [_entry(await self._words.read(Register.ALARM_HISTORY + place)) for place in range(HISTORY_LENGTH)]
+        return present, tuple(history)
+
+    def doubts(self) -> tuple[DoubtInfo, ...]:
+        """See `ParameterAccess`."""
+        return tuple(doubt_info(self._profile, doubt) for doubt in self._profile.doubts)
+
+
+def _entry(word: int) -> AlarmEntry:
+    known = alarm(word)
+    return AlarmEntry(code=known.code, text=known.text, kind=known.kind.value)

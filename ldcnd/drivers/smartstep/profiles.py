@@ -3,12 +3,15 @@
 The manual lost its figures and has misprints; a profile says how one drive is taken to behave, and each switch that
 rests on inference is listed as a doubt, to be settled on a bench.
 Source: manual, all chapters; where it is silent, public manuals of related drives.
+
+Doubts about a drive, as clients see them.
 """
 
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum
 
 from ldcnd.errors import ConfigError
+from ldcnd.model.parameters import DoubtInfo
 
 
 class Confidence(Enum):
@@ -232,3 +235,21 @@ class SmartStepProfile:
 
 
 SMARTSTEP = SmartStepProfile()
+
+
+def doubt_info(profile: SmartStepProfile, doubt: Doubt) -> DoubtInfo:
+    """Describe one doubt and what the profile assumes."""
+    return DoubtInfo(
+        key=doubt.key,
+        question=doubt.question,
+        confidence=doubt.confidence.value,
+        standing=doubt.standing.value,
+        setting=_setting(profile, doubt.key),
+    )
+
+
+def _setting(profile: SmartStepProfile, key: str) -> str | None:
+    if key not in SmartStepProfile.__slots__:
+        return None
+    value = getattr(profile, key)
+    return str(value.value if isinstance(value, Enum) else value)

@@ -7,11 +7,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from ldcnd.drivers.smartstep.addresses import Register
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.status import signed_word
-from ldcnd.drivers.smartstep.trace_memory import HIGHEST_PRE_TRIGGER, POINTS
-from ldcnd.drivers.smartstep.trace_setup import DataObject, IoObject, object_word, period_s
-from ldcnd.drivers.smartstep.trace_words import TracePoint, encode_word
+from ldcnd.drivers.smartstep.monitors import signed_word
+from ldcnd.drivers.smartstep.trace_data import (
+    HIGHEST_PRE_TRIGGER,
+    POINTS,
+    DataObject,
+    IoObject,
+    TracePoint,
+    encode_word,
+    object_word,
+    period_s,
+)
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 Sampler = Callable[[DataObject, IoObject], TracePoint]
 """Reads the drive at the instant of a point."""

@@ -1,11 +1,11 @@
 import pytest
 
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile, TriggerWordSource
-from ldcnd.drivers.smartstep.simulated_variant import BENCH_TRIGGER_MAP
-from ldcnd.drivers.smartstep.trace_channels import CHANNELS, assign, trigger_condition, trigger_operand
-from ldcnd.drivers.smartstep.trace_scaling import TraceConstants
+from ldcnd.drivers.smartstep.trace_data import TraceConstants
+from ldcnd.drivers.smartstep.trace_result import CHANNELS, assign, trigger_condition, trigger_operand
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.model.traces import TraceTrigger, TriggerKind
+from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
 
 MAPPED = SmartStepProfile(trigger_word=TriggerWordSource.CONFIGURED, trigger_map=BENCH_TRIGGER_MAP)
 CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500)

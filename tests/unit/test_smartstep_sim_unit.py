@@ -1,28 +1,27 @@
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import TraceRegister
+from ldcnd.drivers.smartstep.addresses import OperatingMode, TraceRegister
 from ldcnd.drivers.smartstep.commands import (
+    Refusal,
+    RefusalReason,
     execute,
     is_self_hearing,
     read_operating_mode,
     reference,
     set_operating_mode,
+    string_reference,
     write_eeprom,
     write_ram,
     write_trace_register,
 )
-from ldcnd.drivers.smartstep.counters import Counter, CounterReading
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
-from ldcnd.drivers.smartstep.packet import ResponseStatus, decode_command, decode_reply
+from ldcnd.drivers.smartstep.monitors import Counter, CounterReading
+from ldcnd.drivers.smartstep.packet import DAMAGED, ResponseStatus, decode_command, decode_reply
 from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN202
-from ldcnd.drivers.smartstep.parity import DAMAGED
 from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, SmartStepProfile, StringChecksum
-from ldcnd.drivers.smartstep.refusals import Refusal, RefusalReason
-from ldcnd.drivers.smartstep.simulated_unit import CHARACTER_S, SimulatedUnit
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.strings import string_reference
-from ldcnd.drivers.smartstep.trace_words import split_words
+from ldcnd.drivers.smartstep.trace_data import split_words
 from ldcnd.exchange import Exchange
+from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 READ_PN100 = b"W0001000000FF\r"
 

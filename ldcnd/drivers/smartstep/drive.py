@@ -15,14 +15,14 @@ from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.drivers.read_only import ReadOnlyAxis
 from ldcnd.drivers.smartstep.addresses import Register
-from ldcnd.drivers.smartstep.alarms import NO_ALARM, AlarmKind, alarm
-from ldcnd.drivers.smartstep.parameter_store import EepromRules
-from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
-from ldcnd.drivers.smartstep.status import (
+from ldcnd.drivers.smartstep.monitors import (
     INPUT_SIGNALS,
+    NO_ALARM,
     OUTPUT_SIGNALS,
     SPEED_FEEDBACK,
+    AlarmKind,
     DriverType,
+    alarm,
     alarm_is_out,
     driver_type,
     input_levels,
@@ -30,9 +30,10 @@ from ldcnd.drivers.smartstep.status import (
     run_is_on,
     signed_word,
 )
+from ldcnd.drivers.smartstep.parameter_store import EepromRules, UnitParameters
+from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller, UnitWords
+from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.trace import SmartStepTracer
-from ldcnd.drivers.smartstep.unit_parameters import UnitParameters
-from ldcnd.drivers.smartstep.unit_poller import Basic, Item, Listeners, UnitPoller, UnitWords
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.exchange import Timing
 from ldcnd.model.monitors import MonitorName

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TRACE_2_AREA
+from ldcnd.drivers.smartstep.monitors import FEEDBACK_COUNTER_LOW, INPUT_COUNTER_LOW
 from ldcnd.drivers.smartstep.packet import (
     END,
     PACKET_CHARACTERS,
@@ -20,10 +21,9 @@ from ldcnd.drivers.smartstep.packet import (
 )
 from ldcnd.drivers.smartstep.parameters import Parameter
 from ldcnd.drivers.smartstep.profiles import CountUnit, StringChecksum
-from ldcnd.drivers.smartstep.simulated_drive import SimulatedDrive
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.status import FEEDBACK_COUNTER_LOW, INPUT_COUNTER_LOW
-from ldcnd.drivers.smartstep.trace_words import join_words
+from ldcnd.drivers.smartstep.trace_data import join_words
+from ldcnd.sim.smartstep.drive import SimulatedDrive
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 CHARACTER_S = 10 / 9600
 """Start, seven data, parity, stop."""

@@ -1,9 +1,9 @@
 import pytest
 
-from ldcnd.drivers.smartstep.drive_errors import drive_error
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
+from ldcnd.drivers.smartstep.addresses import OperatingMode
+from ldcnd.drivers.smartstep.commands import Refusal
 from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.refusals import Refusal
+from ldcnd.drivers.smartstep.words import drive_error
 from ldcnd.errors import AddressRefused, BusyTracing, ByteCountRefused, DataRefused
 
 

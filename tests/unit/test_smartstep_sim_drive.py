@@ -1,19 +1,142 @@
 import pytest
 
-from ldcnd.drivers.smartstep.alarms import ALARMS, NO_ALARM, AlarmKind
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
-from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, PN100, PN505
-from ldcnd.drivers.smartstep.simulated_drive import SimulatedDrive
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.status import (
+from ldcnd.drivers.smartstep.addresses import OperatingMode
+from ldcnd.drivers.smartstep.monitors import (
+    ALARMS,
     MONITORS,
+    NO_ALARM,
+    AlarmKind,
     InputSignal,
     OutputSignal,
     input_levels,
     output_levels,
     signed_word,
 )
+from ldcnd.drivers.smartstep.packet import ResponseStatus
+from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, PN100, PN304, PN505
+from ldcnd.sim.smartstep.drive import EEPROM_LIFE, SimulatedDrive, SimulatedMemory, SimulatedMotor
+from ldcnd.sim.smartstep.variant import SimulatedVariant
+
+
+def test_ram_is_lost_and_eeprom_kept_at_power_on():
+    memory = SimulatedMemory({PN100: 40}, eeprom_changes_ram=False)
+    memory.write(PN100.ram_address, 60)
+    memory.write(PN304.eeprom_address, 1000)
+
+    assert (memory.active(PN100), memory.stored(PN100)) == (60, 40)
+    memory.power_on()
+
+    assert (memory.active(PN100), memory.active(PN304)) == (40, 1000)
+
+
+@pytest.mark.parametrize(("at_once", "active"), [(False, 40), (True, 60)])
+def test_eeprom_write_changes_ram_where_the_variant_says_so(at_once, active):
+    memory = SimulatedMemory({PN100: 40}, eeprom_changes_ram=at_once)
+
+    memory.write(PN100.eeprom_address, 60)
+
+    assert memory.stored(PN100) == 60
+    assert memory.active(PN100) == active
+
+
+def test_value_out_of_range_is_refused_and_costs_no_write():
+    memory = SimulatedMemory({PN100: 40}, eeprom_changes_ram=False)
+
+    assert not memory.write(PN100.eeprom_address, 2001)
+    assert memory.stored(PN100) == 40
+    assert memory.writes[PN100.number] == 0
+
+
+def test_eeprom_wears_out_after_its_life():
+    memory = SimulatedMemory({PN100: 40}, eeprom_changes_ram=False)
+    for _ in range(EEPROM_LIFE):
+        memory.write(PN100.eeprom_address, 60)
+
+    memory.write(PN100.eeprom_address, 70)
+
+    assert memory.writes[PN100.number] == EEPROM_LIFE + 1
+    assert memory.stored(PN100) == 60
+
+
+@pytest.mark.parametrize("address", [0x0003, 0x1003, 0x0FFF, 0x2000])
+def test_there_is_nothing_at_unlisted_addresses(address):
+    memory = SimulatedMemory({}, eeprom_changes_ram=False)
+
+    assert memory.read(address) is None
+    assert not memory.holds(address)
+
+
+MOTOR_RATE_AT_3000_RPM = 100_000.0
+
+
+def turning(rate: float = MOTOR_RATE_AT_3000_RPM, to_s: float = 2.0) -> SimulatedMotor:
+    motor = SimulatedMotor(servo_on=True, pulse_rate=rate)
+    motor.advance(to_s)
+    return motor
+
+
+def test_pulse_train_makes_speed_and_following_deviation():
+    motor = turning()
+
+    assert motor.rpm(motor.speed) == pytest.approx(3000)
+    assert motor.deviation == pytest.approx(400_000 / 40)
+    assert motor.position == pytest.approx(400_000 * 2.0 - motor.deviation)
+
+
+def test_counts_commanded_are_travelled_or_still_in_the_deviation():
+    motor = turning()
+    motor.pulse_rate = 0.0
+    motor.advance(5.0)
+
+    assert motor.position == pytest.approx(motor.command_units * motor.gear)
+    assert motor.speed == pytest.approx(0, abs=1e-6)
+
+
+def test_servo_off_coasts_and_clears_the_deviation():
+    motor = turning()
+    before = motor.position
+    motor.servo_on = False
+    motor.advance(4.0)
+
+    assert motor.position == pytest.approx(before + 400_000 * 0.05)
+    assert motor.deviation == 0.0
+    assert motor.command_units == pytest.approx(400_000)
+
+
+def test_jammed_shaft_stands_while_deviation_and_torque_grow():
+    motor = SimulatedMotor(servo_on=True, pulse_rate=100.0, jammed=True)
+    motor.advance(1.0)
+
+    assert (motor.position, motor.speed) == (0.0, 0.0)
+    assert motor.deviation == pytest.approx(400)
+    assert motor.torque_percent == pytest.approx(200)
+
+
+def test_acceleration_takes_torque():
+    starting = SimulatedMotor(servo_on=True, pulse_rate=MOTOR_RATE_AT_3000_RPM)
+    starting.advance(0.001)
+
+    assert starting.torque_percent > turning().torque_percent + 100
+
+
+def test_earlier_time_changes_nothing():
+    motor = turning()
+    before = motor.position
+
+    motor.advance(1.0)
+
+    assert (motor.position, motor.at_s) == (before, 2.0)
+
+
+def test_trembling_feedback_has_two_values():
+    motor = SimulatedMotor(servo_on=True, tremble=-1)
+    seen = set()
+    for step in range(50):
+        motor.advance(step * 0.003)
+        seen.add(motor.feedback)
+
+    assert seen == {0, -1}
+
 
 SETTING, DATA_ERROR, ADDRESS_ERROR = (
     ResponseStatus.SETTING,

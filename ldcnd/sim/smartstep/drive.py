@@ -1,16 +1,30 @@
-"""A simulated SmartStep behind its packets: motor, memory, alarms, signals, modes and trace, with time as an input.
+"""A simulated SmartStep behind its packets: memory, motor, alarms, signals, modes and trace, with time as an input.
 
-Source: manual 3 to 6. What no command can do, a person's hand does here: signals, power, pulses, faults.
+What no command can do, a person's hand does here: signals, power, pulses, faults. Parameter ranges are those of
+parameters.py, recollected ones included: a real drive may differ. The motor follows a pulse train through a position
+loop of first order in closed form, deviation' = reference speed - gain x deviation, so any step in time is one
+calculation; its units are encoder counts and seconds.
+Source: manual 2.2, note on EEPROM; 3 to 6.
 """
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_AREA, Register
-from ldcnd.drivers.smartstep.alarms import HISTORY_LENGTH, NO_ALARM, AlarmKind, alarm
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode, operating_mode
-from ldcnd.drivers.smartstep.packet import ResponseStatus
+from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_AREA, RAM_OFFSET, OperatingMode, Register, operating_mode
+from ldcnd.drivers.smartstep.monitors import (
+    HISTORY_LENGTH,
+    NO_ALARM,
+    AlarmKind,
+    DriverType,
+    FunctionSwitch,
+    InputSignal,
+    OutputSignal,
+    alarm,
+)
+from ldcnd.drivers.smartstep.packet import HIGHEST_WORD, ResponseStatus
 from ldcnd.drivers.smartstep.parameters import (
+    PARAMETERS,
     PN000,
     PN102,
     PN202,
@@ -19,16 +33,170 @@ from ldcnd.drivers.smartstep.parameters import (
     PN403,
     PN500,
     PN505,
+    Limits,
     Parameter,
     unit_number,
 )
-from ldcnd.drivers.smartstep.simulated_memory import SimulatedMemory
-from ldcnd.drivers.smartstep.simulated_motor import SimulatedMotor
-from ldcnd.drivers.smartstep.simulated_recorder import SimulatedRecorder
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.status import DriverType, FunctionSwitch, InputSignal, OutputSignal
-from ldcnd.drivers.smartstep.trace_setup import DataObject, IoObject
-from ldcnd.drivers.smartstep.trace_words import FULL_SCALE, TracePoint
+from ldcnd.drivers.smartstep.trace_data import FULL_SCALE, DataObject, IoObject, TracePoint
+from ldcnd.sim.smartstep.recorder import SimulatedRecorder
+from ldcnd.sim.smartstep.variant import SimulatedVariant
+
+EEPROM_LIFE = 10_000
+
+
+class SimulatedMemory:
+    """Words by parameter number.
+
+    Attributes:
+        writes: how often each EEPROM word was written.
+    """
+
+    def __init__(self, stored: Mapping[Parameter, int], *, eeprom_changes_ram: bool) -> None:
+        self.writes = {parameter.number: 0 for parameter in PARAMETERS}
+        self._limits = {parameter.number: _limits(parameter) for parameter in PARAMETERS}
+        self._eeprom = {parameter.number: _factory_value(parameter) for parameter in PARAMETERS}
+        self._eeprom.update({parameter.number: value for parameter, value in stored.items()})
+        self._ram = dict(self._eeprom)
+        self._eeprom_changes_ram = eeprom_changes_ram
+
+    def power_on(self) -> None:
+        """Load RAM from EEPROM."""
+        self._ram = dict(self._eeprom)
+
+    def active(self, parameter: Parameter) -> int:
+        """Return the value in use."""
+        return self._ram[parameter.number]
+
+    def stored(self, parameter: Parameter) -> int:
+        """Return the value kept over power-off."""
+        return self._eeprom[parameter.number]
+
+    def read(self, address: int) -> int | None:
+        """Return the word at an address of the parameter areas; None where there is none."""
+        if address in EEPROM_AREA:
+            return self._eeprom.get(address)
+        return self._ram.get(address - RAM_OFFSET) if address in RAM_AREA else None
+
+    def holds(self, address: int) -> bool:
+        """Tell whether there is a word at this address."""
+        return self.read(address) is not None
+
+    def write(self, address: int, value: int) -> bool:
+        """Store a word at an address that exists; return False when the value is out of its range."""
+        number = address if address in EEPROM_AREA else address - RAM_OFFSET
+        limits = self._limits[number]
+        if not limits.lowest <= value <= limits.highest:
+            return False
+        if address in RAM_AREA:
+            self._ram[number] = value
+            return True
+        self.writes[number] += 1
+        if self.writes[number] <= EEPROM_LIFE:
+            self._eeprom[number] = value
+            if self._eeprom_changes_ram:
+                self._ram[number] = value
+        return True
+
+
+def _limits(parameter: Parameter) -> Limits:
+    return parameter.limits.value if parameter.limits else Limits(0, HIGHEST_WORD)
+
+
+def _factory_value(parameter: Parameter) -> int:
+    return parameter.default.value if parameter.default else 0
+
+
+_FRICTION_PERCENT = 5.0
+_PERCENT_PER_COUNT_S2 = 2e-4
+_JAM_PERCENT_PER_COUNT = 0.5
+_COAST_S = 0.05
+_TREMBLE_PERIOD_S = 0.0073
+
+
+@dataclass(slots=True)
+class SimulatedMotor:
+    """Where the motor is and how it moves; public fields may be changed between two calls of `advance`.
+
+    Attributes:
+        pulse_rate: command units per second, signed; what the pulse generator sends.
+        gear: encoder counts per command unit.
+        gain: of the position loop, 1/s.
+        servo_on: otherwise the motor coasts to rest and the deviation counter stays at zero.
+        jammed: the shaft is held.
+        load_percent: a constant torque of the load.
+        tremble: the feedback jumps between its value and this much more, as on the edge of a count.
+    """
+
+    counts_per_rev: int = 8000
+    pulse_rate: float = 0.0
+    gear: float = 4.0
+    gain: float = 40.0
+    servo_on: bool = False
+    jammed: bool = False
+    load_percent: float = 0.0
+    tremble: int = 0
+    at_s: float = 0.0
+    command_units: float = 0.0
+    position: float = 0.0
+    deviation: float = 0.0
+    speed: float = 0.0
+    acceleration: float = 0.0
+
+    def advance(self, to_s: float) -> None:
+        """Move on in time; an earlier time changes nothing."""
+        step_s = to_s - self.at_s
+        if step_s <= 0:
+            return
+        self.at_s = to_s
+        self.command_units += self.pulse_rate * step_s
+        if not self.servo_on:
+            self._coast(step_s)
+        elif self.jammed:
+            self.deviation += self.reference_speed * step_s
+            self.speed = self.acceleration = 0.0
+        else:
+            self._follow(step_s)
+
+    @property
+    def reference_speed(self) -> float:
+        """The pulse train in counts per second."""
+        return self.pulse_rate * self.gear
+
+    @property
+    def feedback(self) -> int:
+        """The encoder's count, trembling included."""
+        up = self.tremble if int(self.at_s / _TREMBLE_PERIOD_S) % 2 else 0
+        return math.floor(self.position) + up
+
+    @property
+    def torque_percent(self) -> float:
+        """Torque of rated, unlimited."""
+        if not self.servo_on:
+            return 0.0
+        if self.jammed:
+            return self.load_percent + _JAM_PERCENT_PER_COUNT * self.deviation
+        friction = math.copysign(_FRICTION_PERCENT, self.speed) if abs(self.speed) > 1.0 else 0.0
+        return self.load_percent + friction + _PERCENT_PER_COUNT_S2 * self.acceleration
+
+    def rpm(self, counts_per_s: float) -> float:
+        """Return counts per second as r/min."""
+        return counts_per_s * 60.0 / self.counts_per_rev
+
+    def _coast(self, step_s: float) -> None:
+        fading = math.exp(-step_s / _COAST_S)
+        self.position += self.speed * _COAST_S * (1.0 - fading)
+        self.speed *= fading
+        self.acceleration = -self.speed / _COAST_S
+        self.deviation = 0.0
+
+    def _follow(self, step_s: float) -> None:
+        settled = self.reference_speed / self.gain
+        before = self.deviation
+        self.deviation = settled + (before - settled) * math.exp(-self.gain * step_s)
+        self.position += self.reference_speed * step_s - (self.deviation - before)
+        self.speed = self.gain * self.deviation
+        self.acceleration = self.gain * (self.reference_speed - self.speed)
+
 
 OVERSPEED_RPM = 4500.0
 OVERSPEED = 0x0051

@@ -1,11 +1,9 @@
 import pytest
 
 from ldcnd.drivers.smartstep.profiles import TraceWordLayout
-from ldcnd.drivers.smartstep.simulated_recorder import SimulatedRecorder
-from ldcnd.drivers.smartstep.simulated_variant import BENCH_TRIGGER_MAP, SimulatedVariant
-from ldcnd.drivers.smartstep.trace_memory import first_point, unwrap
-from ldcnd.drivers.smartstep.trace_setup import DataObject, IoObject
-from ldcnd.drivers.smartstep.trace_words import TracePoint, decode_word
+from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint, decode_word, first_point, unwrap
+from ldcnd.sim.smartstep.recorder import SimulatedRecorder
+from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 
 TRACE_1, TRACE_2, SMPTMS, PTRGNO, TRGC1, TRGC2, TRGADR = range(0x5000, 0x5007)
 RISING, FALLING = BENCH_TRIGGER_MAP.rising, BENCH_TRIGGER_MAP.falling

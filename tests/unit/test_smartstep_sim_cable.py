@@ -9,20 +9,94 @@ import pytest
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.smartstep.commands import FLUSH, probe, reference, write_eeprom, write_ram
-from ldcnd.drivers.smartstep.packet import ResponseStatus
+from ldcnd.drivers.smartstep.commands import FLUSH, Refusal, probe, reference, string_reference, write_eeprom, write_ram
+from ldcnd.drivers.smartstep.packet import DAMAGED, ResponseStatus, add_parity, strip_parity
 from ldcnd.drivers.smartstep.parameters import PN000, PN100
-from ldcnd.drivers.smartstep.parity import add_parity, strip_parity
 from ldcnd.drivers.smartstep.profiles import Framing, Wiring
-from ldcnd.drivers.smartstep.refusals import Refusal
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
-from ldcnd.drivers.smartstep.simulator import smartstep_chain
-from ldcnd.drivers.smartstep.strings import string_reference
 from ldcnd.errors import OutcomeUnknown, ReplyTimeout
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line
+from ldcnd.sim.smartstep.cable import SimulatedCable, smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
+
+
+def heard(cable: SimulatedCable, characters: bytes, at_s: float = 1.0) -> list[bytes]:
+    cable.host_sends(characters, at_s)
+    return [item.characters for item in cable.host_hears(at_s + 1.0)]
+
+
+def test_only_the_addressed_unit_answers():
+    cable = SimulatedCable([unit(1), unit(2)])
+    exchange = reference(2, PN100.eeprom_address)
+
+    (reply,) = heard(cable, exchange.request)
+
+    assert exchange.decode(reply) == 42
+
+
+def test_reply_begins_when_the_command_is_through():
+    cable = SimulatedCable([unit(1, SimulatedVariant(response_s=0.1))])
+
+    sent = cable.host_sends(reference(1, 0x8000).request, 1.0)
+    next_start_s = cable.next_start_s()
+    (reply,) = cable.host_hears(2.0)
+
+    assert next_start_s == reply.start_s == sent.end_s + 0.1
+    assert cable.next_start_s() is None
+
+
+def test_host_hears_itself_only_on_two_wires_with_echo():
+    request = probe(1).request
+
+    assert len(heard(SimulatedCable([unit(1)], echo=True), request)) == 1
+    assert len(heard(SimulatedCable([unit(1)], Wiring.TWO_WIRE), request)) == 1
+    echoed = heard(SimulatedCable([unit(1)], Wiring.TWO_WIRE, echo=True), request)
+    assert echoed[0] == request
+    probe(1).decode(echoed[1])
+
+
+def test_echo_without_a_drive_is_the_request_alone():
+    request = probe(3).request
+
+    assert heard(SimulatedCable([unit(1)], Wiring.TWO_WIRE, echo=True), request) == [request]
+
+
+def test_two_units_of_one_number_damage_each_other():
+    cable = SimulatedCable([unit(1), unit(1)])
+
+    replies = heard(cable, reference(1, 0x8000).request)
+
+    assert replies == [bytes([DAMAGED] * 14)] * 2
+
+
+def test_unit_0_jams_the_drives_it_shares_a_pair_with_but_is_heard_itself():
+    cable = SimulatedCable([unit(0), unit(1)])
+
+    assert heard(cable, reference(1, 0x8000).request, 1.0) == [bytes([DAMAGED] * 14)]
+    assert reference(0, 0x0100).decode(heard(cable, reference(0, 0x0100).request, 3.0)[0]) == 40
+
+
+def test_unit_0_on_two_wires_never_hears_the_host():
+    cable = SimulatedCable([unit(0)], Wiring.TWO_WIRE)
+
+    assert heard(cable, reference(0, 0x8000).request) == []
+
+
+def test_drives_on_two_wires_overhear_replies_of_others_and_stay_silent():
+    cable = SimulatedCable([unit(1), unit(2)], Wiring.TWO_WIRE)
+
+    assert len(heard(cable, reference(1, PN100.eeprom_address).request)) == 1
+
+
+def test_host_that_talks_into_a_reply_on_two_wires_is_not_understood():
+    cable = SimulatedCable([unit(1), unit(2)], Wiring.TWO_WIRE)
+    sent = cable.host_sends(reference(1, 0x8000).request, 1.0)
+
+    cable.host_sends(reference(2, 0x8000).request, sent.end_s + 0.012)
+
+    assert [item.characters[1:2] for item in cable.host_hears(3.0)] == [b"1"]
 
 
 def unit(number: int, variant: SimulatedVariant | None = None) -> SimulatedUnit:

@@ -3,13 +3,13 @@ import asyncio
 import pytest
 
 from ldcnd.bus.wire_log import WireEvent
+from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import set_operating_mode
-from ldcnd.drivers.smartstep.operating_modes import OperatingMode
-from ldcnd.drivers.smartstep.simulated_unit import SimulatedUnit
-from ldcnd.drivers.smartstep.simulated_variant import SimulatedVariant
 from ldcnd.errors import BusyTracing, OutcomeUnknown, ReplyTimeout, WrongState
 from ldcnd.model.parameters import CounterName
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 
 

@@ -13,12 +13,21 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import Register
-from ldcnd.drivers.smartstep.commands import reference, with_response_time
-from ldcnd.drivers.smartstep.counters import Counter, CounterQuality, CounterReading, CounterValue
-from ldcnd.drivers.smartstep.monitors import COUNTERS, WORDS, counter_value, word_value
+from ldcnd.drivers.smartstep.commands import Refusal, reference, with_response_time
+from ldcnd.drivers.smartstep.monitors import (
+    COUNTERS,
+    INPUT_SIGNALS,
+    OUTPUT_SIGNALS,
+    SPEED_FEEDBACK,
+    WORDS,
+    Counter,
+    CounterQuality,
+    CounterReading,
+    CounterValue,
+    counter_value,
+    word_value,
+)
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
-from ldcnd.drivers.smartstep.refusals import Refusal
-from ldcnd.drivers.smartstep.status import INPUT_SIGNALS, OUTPUT_SIGNALS, SPEED_FEEDBACK
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
