@@ -4,6 +4,7 @@ from enum import StrEnum
 
 from pydantic import Field
 
+from ldcnd.model.commands import About, Command, Effect
 from ldcnd.model.frozen import Frozen
 
 
@@ -67,13 +68,6 @@ class CommandEvent(Frozen):
     """The error code, when there is one."""
 
 
-class OutcomeRequest(Frozen):
-    """Ask what became of a command."""
-
-    command_id: str
-    """Which command."""
-
-
 class CommandOutcome(Frozen):
     """What became of a command: the reply to `@cmd/_/outcome`."""
 
@@ -89,17 +83,6 @@ class CommandOutcome(Frozen):
     """Why, when it did not end as asked."""
 
 
-class EventsRequest(Frozen):
-    """Ask for events: the latest, or those from a number on."""
-
-    axis: str | None = None
-    """Only this axis."""
-    count: int = Field(default=100, ge=1, le=1000)
-    """At most so many, and never more than one reply takes."""
-    from_number: int | None = Field(default=None, ge=0)
-    """The first of these and later ones; the latest when missing."""
-
-
 class EventList(Frozen):
     """Events, oldest first: the reply to `@cmd/_/events`."""
 
@@ -113,3 +96,33 @@ class EventList(Frozen):
     """The number of the event that comes next."""
     events: tuple[CommandEvent, ...]
     """What has happened."""
+
+
+class ReadOutcome(Command[CommandOutcome]):
+    """Ask what became of a command."""
+
+    verb = "outcome"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+    command_id: str
+    """Which command."""
+
+
+class ReadEvents(Command[EventList]):
+    """Ask for events: the latest, or those from a number on."""
+
+    verb = "events"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+    axis: str | None = None
+    """Only this axis."""
+    count: int = Field(default=100, ge=1, le=1000)
+    """At most so many, and never more than one reply takes."""
+    from_number: int | None = Field(default=None, ge=0)
+    """The first of these and later ones; the latest when missing."""
+
+
+OutcomeRequest = ReadOutcome  # former names, until the last importer has moved
+EventsRequest = ReadEvents

@@ -1,11 +1,12 @@
 """How well a rig is doing, once a second: what a monitoring system watches."""
 
+from enum import StrEnum
 from typing import Literal
 
 from pydantic import Field
 
-from ldcnd.model.axes import LinkState
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.samples import LinkState
 
 
 class LaneHealth(Frozen):
@@ -131,3 +132,28 @@ class DaemonHealth(Frozen):
     """Queries that have no answer yet: questions, commands and stops."""
     dropped: int = Field(default=0, ge=0)
     """Queries that were refused for being too many, and news of clients that were lost, since the daemon started."""
+
+
+class Verdict(StrEnum):
+    """What a finding means."""
+
+    FINE = "fine"
+    LOOK = "look"
+    """Nothing is wrong for certain, but it deserves a look."""
+    WRONG = "wrong"
+    """It must be put right before the line is used."""
+
+
+class Finding(Frozen):
+    """One thing that was examined."""
+
+    axis: str
+    """The drive."""
+    what: str
+    """What was examined."""
+    verdict: Verdict
+    """What the result means."""
+    text: str
+    """The result, for a person."""
+    settles: str | None = None
+    """The doubt of the drive's profile that it says something about."""

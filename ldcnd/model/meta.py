@@ -1,8 +1,13 @@
 """What describes a rig to those who have never heard of it: served under `meta/`."""
 
+from enum import StrEnum
 from typing import Literal
 
+from pydantic import Field
+
+from ldcnd.model.commands import Verb
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.plan import PollPriority
 
 
 class DaemonInfo(Frozen):
@@ -120,3 +125,77 @@ class BusInfo(Frozen):
     """99 % of all stops had their reply within so many seconds."""
     stop_longest_s: float
     """The longest time from queueing a stop to its reply."""
+
+
+class Provenance(StrEnum):
+    """How the daemon knows a register that cannot be read back."""
+
+    WRITTEN_AND_ACKNOWLEDGED = "written_and_acknowledged"
+    """This daemon wrote it and the drive acknowledged."""
+    ASSUMED = "assumed"
+    """From the configuration or from what the manual says about a reset; nobody has confirmed it."""
+    UNKNOWN = "unknown"
+    """Anything may be in it."""
+
+
+class RegisterInfo(Frozen):
+    """One register of a drive that cannot be read back."""
+
+    name: str
+    """Its name in the drive's manual."""
+    value: int | None
+    """Raw value; null when it is unknown."""
+    provenance: Provenance
+    """How the value is known."""
+
+
+class AxisLimits(Frozen):
+    """Software limits, in axis units; a missing one does not limit."""
+
+    position_min: float | None = None
+    """Lowest target of any move."""
+    position_max: float | None = None
+    """Highest target of any move."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Highest speed, in units a second."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Highest acceleration, in units a second squared."""
+
+
+class AxisInfo(Frozen):
+    """What an axis is: served on `meta/axes/<axis>`."""
+
+    axis: str
+    """Its name, the chunk in every key."""
+    bus: str
+    """The line it is on."""
+    address: int = Field(ge=0, le=127)
+    """Its node address or unit number on that line."""
+    family: str
+    """The drive family that speaks for it."""
+    model: str
+    """The configured drive model."""
+    identity: str | None
+    """What the drive said it is; null while it has not answered."""
+    unit: str
+    """Unit of all its values; "count" when no scale is configured."""
+    counts_per_unit: float | None
+    """Encoder counts per unit; null when no scale is configured and the axis works in counts."""
+    direction: str
+    """forward or reverse: the sign between counts and units."""
+    limits: AxisLimits
+    """Software limits in axis units."""
+    capabilities: tuple[Verb, ...]
+    """The commands it takes."""
+    items: tuple[str, ...]
+    """The telemetry items it publishes."""
+    adc_full_scale: int | None
+    """Counts of the A/D converter at full scale; null without one."""
+    monitors: tuple[str, ...] = ()
+    """The monitors it publishes below `monitor/`."""
+    trace_channels: tuple[str, ...] = ()
+    """What a trace can record."""
+    priority: PollPriority = "normal"
+    """How its polls fare while its line cannot carry all of them."""
+    registers: tuple[RegisterInfo, ...] = ()
+    """What the drive's write-only registers hold, as far as the daemon knows."""

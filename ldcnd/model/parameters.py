@@ -4,8 +4,11 @@ from enum import StrEnum
 
 from pydantic import Field
 
+from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Effect, Verb
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.replies import CommandReply
+
+SLOW_S = 60.0
+"""Longest wait for what takes many words with a slow drive, in seconds."""
 
 
 class Memory(StrEnum):
@@ -149,3 +152,98 @@ class DriveProfile(CommandReply):
     """The drive takes its own replies for commands: nothing may be written on such wires."""
     doubts: tuple[DoubtInfo, ...]
     """All that is not certain."""
+
+
+class ListParameters(AxisCommand[ParameterList]):
+    """List what is known of the drive's parameters; asks nothing of the drive."""
+
+    verb = Verb.LIST_PARAMETERS
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+
+
+class ReadParameter(AxisCommand[ParameterReply]):
+    """Read one parameter from both memories."""
+
+    verb = Verb.READ_PARAMETER
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+    parameter: str
+    """Its number, such as Pn100, or the manual's name in any case."""
+    unlisted: bool = False
+    """Allow a number that the manual does not list."""
+
+
+class ReadAllParameters(AxisCommand[ParameterDump]):
+    """Read every listed parameter from both memories; takes seconds on a slow line."""
+
+    verb = Verb.READ_ALL_PARAMETERS
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+
+class WriteParameter(AxisCommand[ParameterReply]):
+    """Write one parameter, in RAM unless EEPROM is named; nothing is sent when it has the value already."""
+
+    verb = Verb.WRITE_PARAMETER
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+    parameter: str
+    """Its number, such as Pn100, or the manual's name in any case."""
+    value: int = Field(ge=0, le=0xFFFF)
+    """The new value, a word without sign."""
+    memory: Memory = Memory.RAM
+    """RAM forgets at power-off; EEPROM endures 10,000 writes and must be asked for by name."""
+    unlisted: bool = False
+    """Allow a number that the manual does not list."""
+    confirm_unit: int | None = Field(default=None, ge=0, le=15)
+    """The unit number that the drive will have after its next power-on, when this write changes it."""
+
+
+class ClearCounter(AxisCommand[CounterReply]):
+    """Set a pulse counter to 0; the motor must stand."""
+
+    verb = Verb.CLEAR_COUNTER
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+    counter: CounterName
+    """Which counter."""
+
+
+class ReadAlarms(AxisCommand[AlarmReport]):
+    """Read the present alarm and the alarm history."""
+
+    verb = Verb.READ_ALARMS
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+
+class ReadProfile(AxisCommand[DriveProfile]):
+    """Tell how the drive is taken to behave, doubts included; asks nothing of the drive."""
+
+    verb = Verb.READ_PROFILE
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (
+    ListParameters,
+    ReadParameter,
+    ReadAllParameters,
+    WriteParameter,
+    ClearCounter,
+    ReadAlarms,
+    ReadProfile,
+)
+"""The commands of this file."""

@@ -1,9 +1,13 @@
 """What the lines of a rig promise before anything is opened: served on `meta/plan`."""
 
+from typing import Literal
+
 from pydantic import Field
 
-from ldcnd.model.axes import PollPriority
 from ldcnd.model.frozen import Frozen
+
+PollPriority = Literal["high", "normal", "low"]
+"""How the polls of an axis fare while its line cannot carry all of them."""
 
 
 class ItemPlan(Frozen):

@@ -4,8 +4,46 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.frozen import Frozen
+
+
+class AxisState(StrEnum):
+    """PLCopen axis states."""
+
+    DISABLED = "disabled"
+    STANDSTILL = "standstill"
+    HOMING = "homing"
+    DISCRETE_MOTION = "discrete_motion"
+    CONTINUOUS_MOTION = "continuous_motion"
+    STOPPING = "stopping"
+    ERROR_STOP = "error_stop"
+
+
+class Moving(StrEnum):
+    """Whether the axis moves; unknown is an answer of its own and never means no."""
+
+    YES = "yes"
+    NO = "no"
+    UNKNOWN = "unknown"
+
+
+class Quality(StrEnum):
+    """How much a sample is worth."""
+
+    GOOD = "good"
+    UNCERTAIN = "uncertain"
+    """Measured, but with a doubt: the drive missed polls lately, or its scale is not configured."""
+    BAD = "bad"
+    """Not a measurement any more: the last known value of a drive that does not answer."""
+
+
+class LinkState(StrEnum):
+    """Whether the drive answers."""
+
+    UP = "up"
+    DEGRADED = "degraded"
+    """It missed its latest polls."""
+    DOWN = "down"
 
 
 class TelemetryItem(StrEnum):
@@ -127,6 +165,40 @@ class StateSample(Sample):
     """What it is doing."""
     last_error: str | None = None
     """Why the last command ended other than done, until the next command is accepted."""
+
+
+class MonitorName(StrEnum):
+    """The last chunk of a monitor key."""
+
+    SPEED_FEEDBACK = "speed_feedback"
+    SPEED_REFERENCE = "speed_reference"
+    TORQUE_REFERENCE = "torque_reference"
+    PULSES_FROM_Z = "pulses_from_z"
+    ELECTRICAL_ANGLE = "electrical_angle"
+    INPUT_SIGNALS = "input_signals"
+    OUTPUT_SIGNALS = "output_signals"
+    REFERENCE_PULSE_SPEED = "reference_pulse_speed"
+    POSITION_DEVIATION = "position_deviation"
+    CUMULATIVE_LOAD = "cumulative_load"
+    REGENERATIVE_LOAD = "regenerative_load"
+    BRAKE_LOAD = "brake_load"
+    INPUT_COUNTER = "input_counter"
+    FEEDBACK_COUNTER = "feedback_counter"
+    GAIN_SWITCH = "gain_switch"
+    FUNCTION_SWITCHES = "function_switches"
+
+
+class MonitorSample(Sample):
+    """One monitor of a drive, in the drive's own unit."""
+
+    value: int
+    """The value with its sign; for signals and switches their word."""
+    unit: str
+    """Unit of the value; empty for signals and switches."""
+    title: str
+    """The manual's words."""
+    high: tuple[str, ...] = ()
+    """For signals, those whose level is high, whatever that means; for switches, those that are on."""
 
 
 SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {

@@ -5,17 +5,22 @@ A trace is published as a header on `tele/<axis>/trace`, again whenever its phas
 """
 
 from enum import StrEnum
+from typing import Annotated, Literal
 
 from pydantic import Field
 
+from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Verb
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.parameters import DoubtInfo
-from ldcnd.model.replies import CommandReply
 from ldcnd.model.samples import Sample
 
 MOST_CHANNELS = 8
 MOST_SAMPLES = 10_000
 LONGEST_WAIT_S = 3600.0
+ARMING_S = 30.0
+"""A slow drive is told and asked some twenty words before its trace begins, in seconds."""
+ENDING_S = 10.0
+"""A slow drive needs so long to leave its trace, in seconds."""
 
 
 class TriggerKind(StrEnum):
@@ -204,3 +209,36 @@ class TraceAbortReply(CommandReply):
 
     trace_id: str | None
     """The trace that was ended; null for one that somebody else had left armed in the drive."""
+
+
+class TakeTrace(AxisCommand[TraceReply]):
+    """Record channels of an axis against time; moves nothing."""
+
+    verb = Verb.TRACE
+    capability = Capability.TRACES
+    answer_s = ARMING_S
+
+    channels: tuple[str, ...] = Field(min_length=1, max_length=MOST_CHANNELS)
+    """What to record; `meta/axes/<axis>` lists what the axis has."""
+    interval_s: Annotated[float, Field(gt=0)] | Literal["fastest"] = "fastest"
+    """Time between two samples, in seconds, or "fastest"."""
+    samples: int = Field(default=500, ge=2, le=MOST_SAMPLES)
+    """How many samples; a drive's own recorder always takes as many as it has room for."""
+    pre_trigger: int = Field(default=0, ge=0)
+    """So many of them before the trigger; ignored without one."""
+    trigger: TraceTrigger | None = None
+    """What to wait for; a missing one starts at once."""
+    timeout_s: float = Field(default=30.0, gt=0, le=LONGEST_WAIT_S)
+    """Longest wait for the trigger, in seconds."""
+
+
+class AbortTrace(AxisCommand[TraceAbortReply]):
+    """End the trace that is under way, or one that was left armed in the drive; its samples are lost."""
+
+    verb = Verb.TRACE_ABORT
+    capability = Capability.TRACES
+    answer_s = ENDING_S
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (TakeTrace, AbortTrace)
+"""The commands of this file."""

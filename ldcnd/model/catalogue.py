@@ -1,0 +1,63 @@
+"""All commands, and all models that cross the network."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from ldcnd.model import commands, parameters, rig_commands, traces
+from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, ErrorReply, StopReply, Verb
+from ldcnd.model.events import CommandEvent
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
+from ldcnd.model.plan import RigPlan
+from ldcnd.model.rig_commands import LeaseRequest
+from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
+from ldcnd.model.traces import TraceChunk, TraceHeader
+
+_AXIS = (*commands.COMMANDS, *parameters.COMMANDS, *traces.COMMANDS)
+
+AXIS_COMMANDS: Mapping[Verb, type[AxisCommand[CommandReply]]] = MappingProxyType(
+    {verb: command for verb in Verb for command in _AXIS if command.verb == verb and issubclass(command, AxisCommand)}
+)
+"""What an axis can be told, by verb."""
+AXIS_QUESTIONS: Mapping[str, type[Command[Frozen]]] = MappingProxyType(
+    {command.verb: command for command in _AXIS if not issubclass(command, AxisCommand)}
+)
+"""What the daemon answers about an axis without asking its drive, by verb."""
+RIG_COMMANDS: Mapping[str, type[Command[Frozen]]] = MappingProxyType(
+    {command.verb: command for command in rig_commands.COMMANDS}
+)
+"""What the rig as a whole can be told and asked, by verb."""
+COMMANDS: tuple[type[Command[Frozen]], ...] = (
+    *AXIS_COMMANDS.values(),
+    *AXIS_QUESTIONS.values(),
+    *RIG_COMMANDS.values(),
+)
+"""Every command, in the order in which they are documented."""
+
+
+def verbs_for(*capabilities: Capability) -> frozenset[Verb]:
+    """Return what a drive with these capabilities can be told."""
+    return frozenset(verb for verb, command in AXIS_COMMANDS.items() if command.capability in capabilities)
+
+
+PUBLIC_MODELS: tuple[type[Frozen], ...] = (
+    *COMMANDS,
+    *(command.reply_model() for command in COMMANDS),
+    *SAMPLE_MODELS.values(),
+    AxisInfo,
+    BusHealth,
+    BusInfo,
+    CommandEvent,
+    CommandList,
+    DaemonHealth,
+    DaemonInfo,
+    ErrorReply,
+    MonitorSample,
+    RigPlan,
+    StopReply,
+    TraceChunk,
+    TraceHeader,
+    LeaseRequest,  # stands for both commands that carry it
+)
+"""Everything that crosses the network but the configuration, which is no part of the vocabulary."""

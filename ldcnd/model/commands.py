@@ -1,0 +1,581 @@
+"""What an axis can be asked to do: one class for each command, and what every command has in common.
+
+A command is sent as the payload of a query on `@cmd/<axis>/<verb>`, or on `@cmd/_/<verb>` when it is about the rig. Its
+class says everything about it: keys, schemas, time-outs, access rules and the tables of the command line, the console
+and the documentation are derived from its attributes. Commands about parameters, traces and events stand beside what
+they answer with; `ldcnd.model.catalogue` has them all.
+"""
+
+from enum import StrEnum
+from functools import cache
+from typing import ClassVar, Generic, Literal, TypeVar
+
+from pydantic import ConfigDict, Field
+
+from ldcnd.errors import ErrorCode
+from ldcnd.model.frozen import Frozen
+
+LONGEST_NAME = 64
+"""Characters of a name or an id that a client gives."""
+ANSWER_S = 5.0
+"""Longest wait of a client for the reply to a command that is a few exchanges with its drive, in seconds."""
+
+
+class Verb(StrEnum):
+    """What an axis can be asked to do, and the last chunk of the key; what it cannot is refused as not_supported."""
+
+    POWER = "power"
+    MOVE_ABSOLUTE = "move_absolute"
+    MOVE_RELATIVE = "move_relative"
+    MOVE_VELOCITY = "move_velocity"
+    HALT = "halt"
+    STOP = "stop"
+    QUICK_STOP = "quick_stop"
+    HOME = "home"
+    RESET = "reset"
+    SET_POSITION = "set_position"
+    SET_GAINS = "set_gains"
+    LIST_PARAMETERS = "list_parameters"
+    READ_PARAMETER = "read_parameter"
+    READ_ALL_PARAMETERS = "read_all_parameters"
+    WRITE_PARAMETER = "write_parameter"
+    CLEAR_COUNTER = "clear_counter"
+    READ_ALARMS = "read_alarms"
+    READ_PROFILE = "read_profile"
+    MOVE_ANALOG = "move_analog"
+    SET_PWM = "set_pwm"
+    TRACK = "track"
+    SET_OUTPUTS = "set_outputs"
+    TRACE = "trace"
+    TRACE_ABORT = "trace_abort"
+
+
+class About(StrEnum):
+    """What a command names: an axis, or the rig as a whole."""
+
+    AXIS = "axis"
+    RIG = "rig"
+
+
+class Effect(StrEnum):
+    """What a command does to the rig."""
+
+    QUESTION = "question"
+    """Changes nothing: it needs no lease and leaves no event."""
+    REST = "rest"
+    """Brings an axis to rest: it needs no lease, is never late, and is carried out as often as it is sent."""
+    CHANGE = "change"
+    """Anything else: it is carried out at most once for each command id."""
+
+
+class Ends(StrEnum):
+    """When a command is over."""
+
+    WITH_REPLY = "with_reply"
+    """With its reply: the drive has acknowledged it and nothing is left to do."""
+    BY_READING = "by_reading"
+    """When a later reading of the drive shows it, such as a move that has settled."""
+
+
+class Capability(StrEnum):
+    """What a drive must have to take a command."""
+
+    MOTION = "motion"
+    """A position loop that takes commands over its line."""
+    PARAMETERS = "parameters"
+    """Parameters that can be read over its line."""
+    TRACES = "traces"
+    """Values that can be polled."""
+
+
+class Role(StrEnum):
+    """What a login is good for."""
+
+    VIEWER = "viewer"
+    """Reads everything, and may stop."""
+    OPERATOR = "operator"
+    """Reads, stops and commands."""
+    DAEMON = "daemon"
+    """Serves a rig; listens."""
+    ROUTER = "router"
+    """Carries messages between the others, and keeps viewers and operators apart; listens."""
+
+
+ReplyT_co = TypeVar("ReplyT_co", bound=Frozen, covariant=True)
+
+
+def _schema_title(command: type) -> str:
+    """Return the title of a command's schema: `MoveAbsoluteRequest` for `move_absolute`."""
+    verb = getattr(command, "verb", None)
+    return command.__name__ if verb is None else "".join(map(str.capitalize, verb.split("_"))) + "Request"
+
+
+class Command(Frozen, Generic[ReplyT_co]):
+    """The base of all commands, generic in what a command is answered with.
+
+    Attributes:
+        verb: last chunk of its key.
+        about: whether it names an axis.
+        effect: what it does to the rig.
+        needs_lease: where leases are required, it is refused without one.
+        ends: when it is over.
+        answer_s: longest wait of a client for its reply, in seconds.
+        role: the least that a login must be good for to send it.
+    """
+
+    model_config = ConfigDict(model_title_generator=_schema_title)
+
+    verb: ClassVar[str]
+    about: ClassVar[About]
+    effect: ClassVar[Effect] = Effect.CHANGE
+    needs_lease: ClassVar[bool] = False
+    ends: ClassVar[Ends] = Ends.WITH_REPLY
+    answer_s: ClassVar[float] = ANSWER_S
+    role: ClassVar[Role] = Role.OPERATOR
+
+    @classmethod
+    def reply_model(cls) -> type[ReplyT_co]:
+        """Return what the command is answered with."""
+        return _reply_model(cls)
+
+    @classmethod
+    def summary(cls) -> str:
+        """Return the first line of what the class says about itself."""
+        return (cls.__doc__ or "").strip().partition("\n")[0]
+
+
+@cache
+def _reply_model(command: type[Command[ReplyT_co]]) -> type[ReplyT_co]:
+    for base in command.__mro__:
+        if issubclass(base, Command) and (arguments := base.__pydantic_generic_metadata__["args"]):
+            reply: type[ReplyT_co] = arguments[0]
+            return reply
+    raise TypeError(f"{command.__name__} does not say what it is answered with")
+
+
+class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
+    """The base of what one axis is told to do: with what proves that it may be carried out, and only once.
+
+    Attributes:
+        capability: what a drive must have to take it.
+    """
+
+    about: ClassVar[About] = About.AXIS
+    needs_lease: ClassVar[bool] = True
+    capability: ClassVar[Capability] = Capability.MOTION
+    verb: ClassVar[Verb]
+
+    command_id: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
+    """Names the command; the same id is carried out at most once and answered alike. Given by the daemon if missing."""
+    client: str | None = Field(default=None, max_length=LONGEST_NAME)
+    """Who sends it: a name for people, in events and the log; not authenticated. A lease knows its own."""
+    lease: str | None = None
+    """The lease under which it is sent."""
+    sequence: int | None = Field(default=None, ge=0)
+    """Grows with every command under the lease; an older one that comes later is refused."""
+    instance: str | None = None
+    """The run of the daemon that it is meant for, as in `meta/daemon`; after a restart, which forgets all command ids,
+    a command that was sent again is refused instead of being carried out twice."""
+    not_after: int | None = None
+    """Do not start it after this instant, UTC in ns since 1970; needs clocks that agree."""
+
+
+class CommandReply(Frozen):
+    """The drive acknowledged the command. Values are what the drive's registers make of those that were asked for."""
+
+    command_id: str
+    """Names the command in `state`, in events and in the log."""
+    status: Literal["accepted"] = "accepted"
+    """Accepted: acknowledged by the drive, not yet complete."""
+    axis: str
+    """The axis."""
+    verb: str
+    """The command."""
+    position: float | None = None
+    """Target in axis units."""
+    velocity: float | None = None
+    """Velocity in axis units a second."""
+    acceleration: float | None = None
+    """Acceleration in axis units a second squared."""
+    duration_s: float | None = Field(default=None, ge=0)
+    """How long the profile takes, without settling; for set_pwm how long the duty stays on."""
+    target: int | None = None
+    """Target in A/D counts, for an analog move."""
+    duty: float | None = None
+    """Duty as the drive's register makes it, -1 to 1."""
+
+
+class StopReply(Frozen):
+    """The stop was sent; which axes confirmed it by the time of this answer."""
+
+    status: Literal["stopping"] = "stopping"
+    """Stopping: latched, nothing moves again before reset."""
+    axes: tuple[str, ...]
+    """The axes concerned."""
+    confirmed: tuple[str, ...]
+    """The axes whose drives acknowledged the stop."""
+
+
+class ReceivedError(Frozen):
+    """Why a query was not carried out, as a client reads it: the daemon may be newer and know more codes."""
+
+    code: str = Field(description="what went wrong")
+    message: str = Field(description="one sentence for a person: what, to whom, which value, which limit")
+    retryable: bool = Field(description="the same request may be sent again without harm and may then succeed")
+    axis: str | None = Field(default=None, description="the axis concerned")
+    value: float | str | None = Field(default=None, description="the offending value, in the unit that the caller used")
+    limit: float | str | None = Field(default=None, description="the limit that the value broke")
+    nearest: float | None = Field(default=None, description="the closest value that would be accepted")
+    remedy: str | None = Field(default=None, description="what to do about it")
+    page: str | None = Field(default=None, description="where its page is, below a console or the documentation")
+
+
+class ErrorReply(ReceivedError):
+    """Why a query was not carried out; sent as JSON in an error reply, whatever the query's encoding."""
+
+    code: ErrorCode = Field(description="what went wrong, out of a closed list")
+
+
+# -- motion ----------------------------------------------------------------------------------------------------------
+
+
+class Power(AxisCommand[CommandReply]):
+    """Close or open the position loop; nothing moves."""
+
+    verb = Verb.POWER
+
+    on: bool
+    """True closes the loop at the present position, false opens it and disables the amplifier."""
+
+
+class BufferMode(StrEnum):
+    """What a move does that finds the axis moving; PLCopen's buffer modes, and a refusal."""
+
+    REFUSE = "refuse"
+    """It is refused: whoever sends it did not know."""
+    ABORTING = "aborting"
+    """The axis is halted first; what it was doing ends as aborted."""
+    BUFFERED = "buffered"
+    """It waits until what the axis is doing has ended."""
+
+
+class Move(AxisCommand[CommandReply]):
+    """What the moves have in common."""
+
+    ends = Ends.BY_READING
+
+    buffer_mode: BufferMode = BufferMode.REFUSE
+    """What happens if the axis moves already; the answer comes when the drive has acknowledged the new move."""
+
+
+class MoveAbsolute(Move):
+    """Move to a position on a trapezoidal profile."""
+
+    verb = Verb.MOVE_ABSOLUTE
+
+    position: float
+    """Target in axis units."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+class MoveRelative(Move):
+    """Move by a distance from where the axis is told to be; becomes absolute when it is admitted."""
+
+    verb = Verb.MOVE_RELATIVE
+
+    distance: float
+    """Distance in axis units, signed."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+class MoveVelocity(Move):
+    """Move at a constant velocity until told otherwise or until the software limit."""
+
+    verb = Verb.MOVE_VELOCITY
+
+    velocity: float
+    """Velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+class Halt(AxisCommand[CommandReply]):
+    """Decelerate to standstill; another command may follow."""
+
+    verb = Verb.HALT
+    effect = Effect.REST
+    needs_lease = False
+    ends = Ends.BY_READING
+
+
+class Stop(AxisCommand[CommandReply]):
+    """Decelerate to standstill and latch: nothing moves again before reset."""
+
+    verb = Verb.STOP
+    effect = Effect.REST
+    needs_lease = False
+
+
+class QuickStop(AxisCommand[CommandReply]):
+    """Stop without a ramp, holding position, and latch: nothing moves again before reset."""
+
+    verb = Verb.QUICK_STOP
+    effect = Effect.REST
+    needs_lease = False
+
+
+class HomeMethod(StrEnum):
+    """What marks the reference position."""
+
+    INDEX = "index"
+    FORWARD_LIMIT = "forward_limit"
+    REVERSE_LIMIT = "reverse_limit"
+    POSITION_ERROR = "position_error"
+    CURRENT = "current"
+
+
+class HomeStop(StrEnum):
+    """How the motor stops when the reference position was found."""
+
+    SMOOTH = "smooth"
+    """Decelerate, then hold."""
+    ABRUPT = "abrupt"
+    """Hold at once."""
+    OFF = "off"
+    """Open the loop: the motor coasts and the axis is disabled afterwards."""
+
+
+class Home(AxisCommand[CommandReply]):
+    """Find the reference position; what is missing comes from the axis's configuration.
+
+    An axis that stands on the limit switch it is to run onto moves off it first.
+    """
+
+    verb = Verb.HOME
+    ends = Ends.BY_READING
+
+    method: HomeMethod | None = None
+    """What marks the reference position."""
+    velocity: float | None = None
+    """Search velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared."""
+    position: float | None = None
+    """What the position is called there, in axis units."""
+    timeout_s: float | None = Field(default=None, gt=0, le=3600)
+    """Longest search, in seconds; moving off a limit switch first counts as a search of its own."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest search, in axis units; a missing one is as far as the velocity goes in that time."""
+    stop: HomeStop | None = None
+    """How the motor stops there."""
+    move_to: float | None = None
+    """Where to go afterwards, in axis units; a missing one stays where the motor stopped."""
+
+
+class Reset(AxisCommand[CommandReply]):
+    """Clear the stop latch and the drive's faults; after a drive fault the axis is disabled. Nothing moves."""
+
+    verb = Verb.RESET
+
+
+class SetPosition(AxisCommand[CommandReply]):
+    """Tell a standing axis where it is; afterwards it is referenced."""
+
+    verb = Verb.SET_POSITION
+
+    position: float
+    """What the present position is called, in axis units."""
+
+
+class SetGains(AxisCommand[CommandReply]):
+    """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are."""
+
+    verb = Verb.SET_GAINS
+
+    kp: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Position gain."""
+    kd: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Velocity gain."""
+    ki: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Integral gain."""
+    il: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Integration limit."""
+    ol: int | None = Field(default=None, ge=0, le=0xFF)
+    """Output limit."""
+    cl: int | None = Field(default=None, ge=0, le=0xFF)
+    """Current limit: 0 is off; odd where the sense voltage rises with the current, even where it falls."""
+    el: int | None = Field(default=None, ge=0, le=0x3FFF)
+    """Position error limit."""
+    deadband: int | None = Field(default=None, ge=0, le=0xFF)
+    """Amplifier deadband compensation."""
+    sr: int | None = Field(default=None, ge=1, le=0xFF)
+    """Servo rate divisor; it changes what velocities mean to the drive, so only a standing axis takes it."""
+
+
+class MoveAnalog(AxisCommand[CommandReply]):
+    """Move until the analog position sensor reads a value; the drive finds the direction itself."""
+
+    verb = Verb.MOVE_ANALOG
+    ends = Ends.BY_READING
+
+    target: int = Field(ge=0)
+    """A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+class SetPwm(AxisCommand[CommandReply]):
+    """Put a raw duty on the motor, with the position loop open, for a limited time; then the axis stops and holds."""
+
+    verb = Verb.SET_PWM
+    ends = Ends.BY_READING
+
+    duty: float = Field(ge=-1, le=1)
+    """Share of the supply voltage, positive forward."""
+    duration_s: float = Field(gt=0)
+    """How long, in seconds."""
+
+
+class Track(AxisCommand[CommandReply]):
+    """Go to a position at once, without a profile: one set-point of a stream."""
+
+    verb = Verb.TRACK
+    ends = Ends.BY_READING
+
+    position: float
+    """Set-point in axis units."""
+
+
+class PinMode(StrEnum):
+    """What a limit switch pin does."""
+
+    INPUT = "input"
+    HIGH = "high"
+    LOW = "low"
+
+
+class SetOutputs(AxisCommand[CommandReply]):
+    """Use limit switch pins as outputs, or as inputs again; a missing pin stays as it is."""
+
+    verb = Verb.SET_OUTPUTS
+
+    limit1: PinMode | None = None
+    """The pin of limit switch 1 (reverse)."""
+    limit2: PinMode | None = None
+    """The pin of limit switch 2 (forward)."""
+
+
+# -- questions about an axis -----------------------------------------------------------------------------------------
+
+
+class Cause(Frozen):
+    """One thing that forbids a motion."""
+
+    code: str
+    """The error code that a motion would be refused with."""
+    text: str
+    """What is in the way."""
+    remedy: str | None
+    """The command, or the hand, that clears it."""
+    page: str | None = None
+    """Where its page is, below a console or the documentation."""
+
+
+class WhyReply(Frozen):
+    """The causal chain: the reply to `@cmd/<axis>/why`."""
+
+    axis: str
+    """The axis."""
+    can_move: bool
+    """Whether a motion within the limits would be accepted from the one who asks."""
+    causes: tuple[Cause, ...]
+    """What is in the way, in the order in which it has to be cleared."""
+    first_fault: str | None
+    """What went wrong first, if anything did since the last reset."""
+
+
+class Why(Command[WhyReply]):
+    """Ask why an axis cannot move."""
+
+    verb = "why"
+    about = About.AXIS
+    effect = Effect.QUESTION
+
+    lease: str | None = None
+    """The lease under which the motion would be sent."""
+    absolute: bool = True
+    """Whether the motion would name a position, which needs a referenced axis."""
+
+
+class PlanReply(Frozen):
+    """What the motion would be; nothing was sent: the reply to `@cmd/<axis>/plan`."""
+
+    axis: str
+    """The axis."""
+    refusal: ErrorReply | None
+    """Why its values would be refused, with the nearest that would not; null when they would be accepted."""
+    obstacles: tuple[str, ...]
+    """What else is in the way now; see `why`."""
+    position: float | None = None
+    """Where it would end, in axis units; null when it has no end."""
+    velocity: float | None = None
+    """Velocity that the registers would hold, units a second."""
+    velocity_error: float | None = None
+    """Held minus asked."""
+    acceleration: float | None = None
+    """Acceleration that the registers would hold, units a second squared."""
+    acceleration_error: float | None = None
+    """Held minus asked."""
+    duration_s: float | None = None
+    """Of the profile, without settling; null when it has no end."""
+    packets: tuple[str, ...] = ()
+    """What would be sent, in hexadecimal."""
+    bus_s: float | None = None
+    """For how long that would occupy the line at most, in seconds."""
+
+
+class Preview(Command[PlanReply]):
+    """Ask what a motion would do; exactly one of position, distance and velocity-alone says which motion is meant."""
+
+    verb = "plan"
+    about = About.AXIS
+    effect = Effect.QUESTION
+
+    position: float | None = None
+    """A move to this position, in axis units."""
+    distance: float | None = None
+    """A move by this distance, in axis units."""
+    velocity: float | None = None
+    """Speed of the move; alone: a motion at this velocity, signed. Units a second."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Units a second squared; the axis default when missing."""
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (
+    Power,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Halt,
+    Stop,
+    QuickStop,
+    Home,
+    Reset,
+    SetPosition,
+    SetGains,
+    MoveAnalog,
+    SetPwm,
+    Track,
+    SetOutputs,
+    Why,
+    Preview,
+)
+"""The commands of this file."""

@@ -1,0 +1,207 @@
+"""What the rig as a whole can be asked: leases, moves of several axes, loss drills, what was on a line."""
+
+from enum import StrEnum
+
+from pydantic import ConfigDict, Field
+
+from ldcnd.model.commands import About, Command, CommandReply, Effect, Ends, MoveAbsolute
+from ldcnd.model.events import ReadEvents, ReadOutcome
+from ldcnd.model.frozen import Frozen
+
+SHORTEST_LEASE_S = 0.2
+"""Seconds that a lease lasts at least."""
+
+
+class LeaseReply(Frozen):
+    """A lease that holds."""
+
+    lease: str
+    """To be carried by every command."""
+    client: str
+    """Who holds it."""
+    axes: tuple[str, ...]
+    """The axes it covers."""
+    lease_s: float
+    """It ends so many seconds after the daemon received this request, unless renewed."""
+
+
+class Acquire(Command[LeaseReply]):
+    """Take control of axes, or of the whole rig."""
+
+    verb = "acquire"
+    about = About.RIG
+
+    client: str = Field(min_length=1, max_length=64)
+    """Who asks: a name for people, shown to others and in the log."""
+    axes: tuple[str, ...] = ()
+    """Which axes, or groups of them; none means all."""
+    lease_s: float = Field(default=1.0, ge=SHORTEST_LEASE_S, le=60)
+    """For how long, in seconds; it must be renewed before."""
+    force: bool = False
+    """Take control away from whoever has it; that is logged."""
+
+
+class LeaseRequest(Frozen):
+    """Renew or release a lease."""
+
+    lease: str
+    """As the reply to acquire named it."""
+
+
+class Renew(LeaseRequest, Command[LeaseReply]):
+    """Keep a lease for its duration from now on."""
+
+    model_config = ConfigDict(title="LeaseRequest")
+
+    verb = "renew"
+    about = About.RIG
+
+
+class Release(LeaseRequest, Command[LeaseReply]):
+    """Give a lease back."""
+
+    model_config = ConfigDict(title="LeaseRequest")
+
+    verb = "release"
+    about = About.RIG
+
+
+class Holder(Frozen):
+    """Who controls an axis."""
+
+    axis: str
+    """The axis."""
+    client: str | None
+    """Who; null when nobody does."""
+
+
+class HolderList(Frozen):
+    """Who controls what: the reply to `@cmd/_/holders`."""
+
+    required: bool
+    """Whether a lease is needed to move anything."""
+    holders: tuple[Holder, ...]
+    """Every axis."""
+
+
+class ListHolders(Command[HolderList]):
+    """Ask who controls what."""
+
+    verb = "holders"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+
+class AxisMove(MoveAbsolute):
+    """The share of one axis; it can carry a command id of its own."""
+
+    model_config = ConfigDict(title="AxisMove")
+
+    axis: str
+    """The axis."""
+
+
+class MoveTogetherReply(Frozen):
+    """Every drive has proven that it started."""
+
+    replies: tuple[CommandReply, ...]
+    """One for each axis, in the order of the request."""
+
+
+class MoveTogether(Command[MoveTogetherReply]):
+    """Start absolute moves of the axes of one configured group in the same servo cycle, or none of them."""
+
+    verb = "move_together"
+    about = About.RIG
+    needs_lease = True
+    ends = Ends.BY_READING
+
+    moves: tuple[AxisMove, ...] = Field(min_length=2, max_length=31)
+    """Exactly the members of a group, each once."""
+
+
+class Rehearsal(StrEnum):
+    """Who is to disappear."""
+
+    DAEMON_STOP = "daemon_stop"
+    """Do to the axis what its policy says for the end of the daemon, without ending."""
+    BUS_LOSS = "bus_loss"
+    """Drop the axis's line and open it again."""
+
+
+class RehearsalReply(Frozen):
+    """The loss was played: the reply to `@cmd/_/rehearse`."""
+
+    kind: Rehearsal
+    """Who disappeared."""
+    axis: str
+    """The axis."""
+    policy: str
+    """What its configuration says for this loss."""
+
+
+class Rehearse(Command[RehearsalReply]):
+    """Rehearse a loss on one axis."""
+
+    model_config = ConfigDict(title="RehearsalRequest")
+
+    verb = "rehearse"
+    about = About.RIG
+    answer_s = 30.0
+
+    kind: Rehearsal
+    """Who is to disappear."""
+    axis: str
+    """Whose policy is rehearsed; a lost line concerns all axes on it."""
+
+
+class WireLogReply(Frozen):
+    """Some consecutive records of a line, oldest first: the reply to `@cmd/_/wire_log`."""
+
+    bus: str
+    """The line."""
+    family: str
+    """The drive family on it: how the bytes are to be read."""
+    zero: int
+    """The wall time at which the records' clock was 0, UTC in ns since 1970."""
+    started: float
+    """What that clock showed when the daemon was started, in seconds."""
+    now: float
+    """What that clock showed when this was answered, in seconds."""
+    first_record: int = Field(ge=0)
+    """Number of the first record in `lines`; records are counted since the daemon started."""
+    next_record: int = Field(ge=0)
+    """Number of the record behind the last one in `lines`: ask from here for more."""
+    end_record: int = Field(ge=0)
+    """Number that the next record to happen will get; equal to `next_record` when this reply has all."""
+    lines: tuple[str, ...]
+    """One record each: seconds, event, bytes in hexadecimal, and perhaps a remark behind a number sign."""
+
+
+class ReadWireLog(Command[WireLogReply]):
+    """Ask what was on a line in the last seconds."""
+
+    verb = "wire_log"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+    bus: str
+    """Which line."""
+    seconds: float = Field(default=10.0, gt=0, le=86_400)
+    """How far back, in seconds; what is older than the recorder keeps is gone."""
+    from_record: int | None = Field(default=None, ge=0)
+    """Go on from this record; null for the first one within `seconds`."""
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (
+    Acquire,
+    Renew,
+    Release,
+    ListHolders,
+    ReadOutcome,
+    ReadEvents,
+    Rehearse,
+    MoveTogether,
+    ReadWireLog,
+)
+"""The commands about the rig, those about events included."""

@@ -1,0 +1,103 @@
+"""One class says everything about a command: what goes over the network, and what is derived from it."""
+
+import io
+import json
+import subprocess
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from ldcnd.daemon.contract import all_schemas
+from ldcnd.messaging.codec import Encoding, decode, encode
+from ldcnd.model.catalogue import AXIS_COMMANDS, AXIS_QUESTIONS, COMMANDS, RIG_COMMANDS, verbs_for
+from ldcnd.model.commands import About, AxisCommand, Capability, Command, CommandReply, Effect, Ends, Verb
+from ldcnd.model.frozen import Frozen, schema_name
+from tests.support.process import ROOT
+
+VECTORS = json.loads((ROOT / "tests" / "vectors" / "commands.json").read_text(encoding="utf-8"))["commands"]
+BY_VERB = {**AXIS_COMMANDS, **AXIS_QUESTIONS, **RIG_COMMANDS}
+CHANGELOG = ROOT / "CHANGELOG.md"
+
+
+def test_every_verb_of_an_axis_has_one_class():
+    assert list(AXIS_COMMANDS) == list(Verb)
+    assert len(BY_VERB) == len(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.__name__)
+def test_a_command_says_everything_about_itself(command: type[Command[Frozen]]):
+    assert command.verb
+    assert command.about in About
+    assert command.summary().endswith(".")
+    assert command.answer_s > 0
+    assert command.reply_model() is not Frozen
+    if issubclass(command, AxisCommand):
+        assert issubclass(command.reply_model(), CommandReply)
+        assert command.needs_lease == (command.effect is Effect.CHANGE)
+    if command.effect is Effect.QUESTION:
+        assert not command.needs_lease
+        assert command.ends is Ends.WITH_REPLY
+
+
+def test_what_brings_an_axis_to_rest_needs_no_lease():
+    assert {verb for verb, command in AXIS_COMMANDS.items() if command.effect is Effect.REST} == {
+        Verb.STOP,
+        Verb.QUICK_STOP,
+        Verb.HALT,
+    }
+
+
+def test_a_drive_takes_what_its_capabilities_stand_for():
+    assert verbs_for(*Capability) == frozenset(Verb)
+    assert verbs_for(Capability.TRACES) == {Verb.TRACE, Verb.TRACE_ABORT}
+    assert Verb.READ_PARAMETER in verbs_for(Capability.PARAMETERS)
+    assert Verb.HALT not in verbs_for(Capability.PARAMETERS, Capability.TRACES)
+
+
+@pytest.mark.parametrize("verb", VECTORS)
+def test_the_payload_of_a_command_is_what_it_always_was(verb: str):
+    vector = VECTORS[verb]
+
+    command = decode(BY_VERB[verb], json.dumps(vector["fields"]).encode(), Encoding.JSON)
+
+    assert encode(command, Encoding.MSGPACK) == (bytes.fromhex(vector["msgpack"]), vector["encoding"])
+    assert encode(command, Encoding.JSON)[0].decode() == vector["json"]
+    assert decode(BY_VERB[verb], bytes.fromhex(vector["msgpack"]), vector["encoding"]) == command
+
+
+def test_every_command_has_a_payload_vector():
+    assert set(VECTORS) >= set(BY_VERB)
+
+
+def test_a_schema_that_differs_from_the_commit_before_is_in_the_changelog():
+    """In `### Changed`, `### Added` or `### Removed` of the version to come, under its name and in backquotes."""
+    unreleased = CHANGELOG.read_text(encoding="utf-8").partition("## Unreleased")[2].partition("\n## ")[0]
+    now = all_schemas()
+
+    for commit in ("HEAD", "HEAD^"):
+        before = _schemas_of(commit)
+        if before is None:
+            pytest.skip("not in a git checkout with a history")
+        changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
+        assert [name for name in changed if f"`{name}`" not in unreleased] == []
+
+
+def test_schema_names_are_the_titles_of_the_schemas():
+    for name, text in all_schemas().items():
+        assert name == schema_name(type(json.loads(text)["title"], (Frozen,), {}))
+
+
+def _schemas_of(commit: str) -> dict[str, str] | None:
+    archive = subprocess.run(  # noqa: S603
+        ["git", "archive", "--format=tar", commit, "schemas"],  # noqa: S607
+        cwd=ROOT,
+        capture_output=True,
+        check=False,
+        timeout=30,
+    )
+    if archive.returncode != 0:
+        return None
+    with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as tar:
+        files = {Path(member.name).stem: tar.extractfile(member) for member in tar if member.isfile()}
+        return {name: file.read().decode() for name, file in files.items() if file}
