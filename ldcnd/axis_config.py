@@ -121,8 +121,6 @@ class RatesConfig(Frozen):
     """Analog input."""
     state: float = Field(default=5.0, gt=0, le=2000)
     """The drive's status and state; cannot be switched off, faults come with it."""
-    idle: float = Field(default=1.0, gt=0, le=2000)
-    """How often at most what nobody subscribes to, with `telemetry.on_demand`; state and faults keep their rate."""
 
 
 class AxisConfig(Frozen):

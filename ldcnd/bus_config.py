@@ -87,9 +87,6 @@ refuse, and skip for smartstep, where the drives' speed only shows on site."""
     stop_probe_hz: float = Field(default=0.5, ge=0, le=20)
     """How often it is measured how long a stop would wait, by a question in its place; ldcn only, 0 for never. \
 None where polls would miss their turns for it."""
-    pre_empt_polls: bool = False
-    """A stop does not wait for the reply to a poll, which the drive takes back: of use on slow lines of PIC-SERVO \
-drives."""
     order: Literal["deadline", "phase"] = "phase"
     """Between polls that are equally urgent: who is due longest, or whose servo cycle ends first, so that more fit."""
     start: StartPolicy = StartPolicy.RESET
@@ -148,23 +145,6 @@ drives."""
             profile = PROFILES.get(model)
             if profile and self.baud > profile.top_baud:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {profile.top_baud} at most")
-        return self
-
-    @model_validator(mode="after")
-    def _obliging_drives(self) -> Self:
-        if not self.pre_empt_polls:
-            return self
-        if self.port.startswith("socket://"):
-            raise ValueError(
-                f"pre_empt_polls: nobody knows when a packet leaves behind the network ({self.port}); leave it out"
-            )
-        obliging = [name for name, profile in PROFILES.items() if profile.takes_back]
-        for address, model in self._models.items():
-            if model not in obliging:
-                raise ValueError(
-                    f"pre_empt_polls: nothing says that a {model} (address {address}) takes its reply back when it"
-                    f" hears the host; leave it out, or have nothing but {', '.join(obliging)} on the line"
-                )
         return self
 
     @model_validator(mode="after")

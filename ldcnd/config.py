@@ -74,8 +74,6 @@ class TelemetryConfig(Frozen):
 
     encoding: Literal["msgpack", "json"] = "msgpack"
     """json can be read by every Zenoh tool; msgpack is smaller."""
-    on_demand: bool = False
-    """Ask a resting axis for what nobody subscribes to only at its `rates.idle`; SmartSteps pace themselves."""
 
 
 class RigConfig(Frozen):

@@ -1,15 +1,23 @@
 """TOML files: read, validated whole, refused with every complaint at once."""
 
+import difflib
 import tomllib
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from ldcnd.errors import ConfigError
 from ldcnd.model.frozen import Frozen
 
 DocumentT = TypeVar("DocumentT", bound=Frozen)
+
+REMOVED_KEYS = {
+    "idle": "`telemetry.on_demand` is gone; delete this key",
+    "on_demand": "every item is polled at its rate whether it has subscribers or not; delete this key",
+    "pre_empt_polls": "stops wait for the exchange on the wire; delete this key and, on a slow line, raise `baud`",
+}
+"""Keys of earlier versions, and what to do about them."""
 
 
 def read_toml(path: Path, document_type: type[DocumentT]) -> DocumentT:
@@ -32,10 +40,10 @@ def read_toml(path: Path, document_type: type[DocumentT]) -> DocumentT:
     try:
         return document_type.model_validate(document)
     except ValidationError as error:
-        raise ConfigError("\n".join(f"{path}: {line}" for line in complaints(error))) from error
+        raise ConfigError("\n".join(f"{path}: {line}" for line in complaints(error, document_type))) from error
 
 
-def complaints(error: ValidationError) -> list[str]:
+def complaints(error: ValidationError, document_type: type[BaseModel]) -> list[str]:
     """Say for each refused key what is wrong with it."""
     said = []
     details = error.errors()
@@ -48,5 +56,34 @@ def complaints(error: ValidationError) -> list[str]:
         key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in detail["loc"]).lstrip(".")
         shown = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
         given = f" (given: {shown!r})" if shown is not None else ""
+        if detail["type"] == "extra_forbidden":
+            said.append(f"{key}: {_unknown_key(document_type, detail['loc'])}")
+            continue
         said.append(f"{key or 'whole file'}: {detail['msg'].removeprefix('Value error, ')}{given}")
     return said
+
+
+def _unknown_key(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> str:
+    """Say that a key does not exist, and which one may have been meant."""
+    name = str(loc[-1])
+    if name in REMOVED_KEYS:
+        return f"no longer supported: {REMOVED_KEYS[name]}"
+    close = difflib.get_close_matches(name, _keys_at(document_type, loc[:-1]), n=1)
+    return f"there is no such key{f'; did you mean {close[0]!r}?' if close else ''}"
+
+
+def _keys_at(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table at this place; empty where the place is not a single kind of table."""
+    table: object = document_type
+    for part in loc:
+        if isinstance(part, int):
+            continue
+        field = table.model_fields.get(part) if isinstance(table, type) and issubclass(table, BaseModel) else None
+        table = _table_in(field.annotation) if field else None
+    return list(table.model_fields) if isinstance(table, type) and issubclass(table, BaseModel) else []
+
+
+def _table_in(annotation: object) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((found for each in get_args(annotation) if (found := _table_in(each))), None)

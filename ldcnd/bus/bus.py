@@ -9,7 +9,6 @@ from ldcnd.bus.line_phase import Phase
 from ldcnd.bus.mute_nodes import MuteNodes
 from ldcnd.bus.phase_order import PhaseOrder
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.pre_empting_line import PreEmptingLine
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
@@ -244,8 +243,7 @@ class Bus:
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
         self._mute.forget()
-        make_line = PreEmptingLine if self.settings.pre_empts_polls else Line
-        self._line = line = make_line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
+        self._line = line = Line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
         self._closed.clear()
         self._opened.set()
         log.info("line open", bus=self.settings.name, baud=self.settings.baud)
@@ -293,10 +291,6 @@ class Bus:
         """See `Users`."""
         return self._queue.stop_waits()
 
-    def stops(self) -> list[Job]:
-        """See `Users`."""
-        return [job for job in self._queue.waiting(Lane.STOP) if not job.abandoned]
-
     def failing(self) -> set[int]:
         """See `Users`."""
         return self._mute.failing()
@@ -315,11 +309,6 @@ class Bus:
         if isinstance(turn, PollTurn):
             pause_s = self._mute.pause_s(node, self.longest_s(turn.exchange) + self.settings.margin_s + self.fence_s)
             self._schedule(turn.poller, max(turn.poller.due_at_s, now_s + pause_s))
-
-    def taken_back(self, turn: Turn) -> None:
-        """See `Users`."""
-        if isinstance(turn, PollTurn):
-            turn.poller.taken_back()
 
     def _schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Give a poller its next turn, unless it was removed while its poll was on the wire."""

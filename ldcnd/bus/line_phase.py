@@ -12,8 +12,6 @@ class Phase(Enum):
     """A packet that must not be repeated has its reply; a second one would prove that the first was not its own."""
     QUIET = "quiet"
     """After a request that draws no reply."""
-    AHEAD = "ahead"
-    """After a stop that did not wait for a poll's reply; see `PreEmptingLine`."""
     FENCE = "fence"
     """Waiting for late bytes to stop."""
     SETTLE = "settle"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from ldcnd.bus.cost import Cost
 from ldcnd.bus.rehearsal import Drive, mean_lengths_s
 from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
-from ldcnd.bus.settings import HOST_LATE_S, LONGEST_REST_S, ServoCycle
+from ldcnd.bus.settings import ServoCycle
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
@@ -63,7 +63,6 @@ class Urgent:
         margin_s: by which a reply's deadline exceeds its longest time.
         search_s: longest question to a drive that has been lost; it is asked while one is missing only.
         probe: of the stop lane; None for none.
-        pre_empts_polls: stops do not wait for the replies to polls; see `PreEmptingLine`.
     """
 
     command_s: float
@@ -72,7 +71,6 @@ class Urgent:
     margin_s: float
     search_s: float = 0.0
     probe: PeriodicTask | None = None
-    pre_empts_polls: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +83,6 @@ class LinePlan:
         load: share of the line that polls take at worst, `mean_load` on average.
         commands_per_s: so many evenly spaced commands fit in before a poll misses its turn in the worst case.
         stop_wait_s: from queueing a stop to its first bit at the latest, on a line that is in step.
-        stop_ahead_s: the same behind a poll where it does not wait for the reply; None where it does.
         stop_s: to the end of its reply.
         stop_after_loss_s: to the end of its reply when the exchange on the wire is lost.
     """
@@ -96,7 +93,6 @@ class LinePlan:
     mean_load: float
     commands_per_s: float
     stop_wait_s: float
-    stop_ahead_s: float | None
     stop_s: float
     stop_after_loss_s: float
 
@@ -130,9 +126,6 @@ def plan_line(
     probes = [urgent.probe] if urgent.probe else []
     longest_s = max([urgent.command_s, *(task.cost_s for task in tasks)])
     stop_s = longest_s + urgent.stop_s
-    ahead_s = _stop_ahead_s(polls) if urgent.pre_empts_polls else None
-    if ahead_s is not None and any(poll.cost.reply_s > LONGEST_REST_S for poll in polls):
-        stop_s = max(stop_s, ahead_s + HOST_LATE_S + 2 * urgent.stop_s + urgent.margin_s + urgent.recovery_s)
     return LinePlan(
         polls=tuple(polls),
         responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else _in_turns_s(polls, probes)),
@@ -140,7 +133,6 @@ def plan_line(
         mean_load=_mean_load(polls, cycle) + load_of(probes),
         commands_per_s=_most_commands_per_s(polls, probes, urgent.command_s, by_deadline=by_deadline),
         stop_wait_s=longest_s,
-        stop_ahead_s=ahead_s,
         stop_s=stop_s,
         stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
     )
@@ -151,12 +143,6 @@ def _mean_load(polls: Sequence[Poll], cycle: ServoCycle | None) -> float:
     if cycle and len(polls) > 1:
         lengths_s = mean_lengths_s(tuple(Drive(poll.rate_hz, poll.mean_cost) for poll in polls), cycle)
     return math.fsum(poll.rate_hz * length_s for poll, length_s in zip(polls, lengths_s, strict=True))
-
-
-def _stop_ahead_s(polls: Sequence[Poll]) -> float:
-    """Return how long a stop waits at most that comes while a poll is on the wire and does not wait for its reply."""
-    costs = [poll.cost for poll in polls]
-    return max(cost.longest_s - max(0.0, cost.reply_s - LONGEST_REST_S) for cost in costs)
 
 
 def in_time(polls: Sequence[Poll], urgent: Sequence[PeriodicTask], *, by_deadline: bool) -> bool:

@@ -59,9 +59,6 @@ class Poller(ABC, Generic[ReplyT]):
     def deliver(self, reply: ReplyT, timing: Timing) -> None:
         """Take the decoded reply; the next request is on the wire already."""
 
-    def taken_back(self) -> None:
-        """Learn that a stop did not wait for the reply in this slot; the node is not to blame."""
-
     @abstractmethod
     def missed(self, error: BusError) -> None:
         """Learn that this slot brought nothing."""

@@ -10,10 +10,6 @@ adapters pass bytes on a little late."""
 
 HOST_LATE_S = 0.001
 """By so much later than it should have a packet has left the host at most, also through an adapter on USB."""
-WORTH_S = 0.002
-"""A stop waits for a poll's reply of which less is left; the timers of an event loop are late by up to half of that."""
-LONGEST_REST_S = HOST_LATE_S + WORTH_S
-"""A reply that takes no longer than this is always waited for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +38,6 @@ class BusSettings:
         echo: the adapter returns our own bytes before the reply.
         paced: bytes take real time on this line, so that what comes too early is foreign; false only for
             far ends that answer faster than the baud rate allows.
-        pre_empts_polls: stops do not wait for the replies to polls; see `PreEmptingLine`.
         cycle: of the drives, to order polls by; None when they have none, or when polls are not to be ordered by it.
         recorded_s: how far back the flight recorder reaches.
         recorded_bytes: how much memory it may take.
@@ -55,7 +50,6 @@ class BusSettings:
     attempts: int = 3
     echo: bool = False
     paced: bool = True
-    pre_empts_polls: bool = False
     cycle: ServoCycle | None = None
     recorded_s: float = KEPT_S
     recorded_bytes: int = KEPT_BYTES

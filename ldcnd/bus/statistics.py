@@ -51,8 +51,6 @@ class BusStatistics:
     resent: int = 0
     resynchronisations: int = 0
     stray_bytes: int = 0
-    taken_back: int = 0
-    """Replies to polls for which a stop did not wait."""
     openings: int = 0
     losses: int = 0
     bytes_out: int = 0

@@ -1,6 +1,5 @@
 """The contract between a line and the bus that it serves."""
 
-from collections.abc import Sequence
 from typing import Protocol
 
 from ldcnd.bus.turn import Turn
@@ -29,9 +28,6 @@ class Users(Protocol):
     def stop_waits(self) -> bool:
         """Tell whether a stop is queued."""
 
-    def stops(self) -> Sequence[Turn]:
-        """Return the stops that are queued, first to go first."""
-
     def failing(self) -> set[int]:
         """Return the nodes that left their last exchange unanswered."""
 
@@ -40,9 +36,6 @@ class Users(Protocol):
 
     def missed(self, turn: Turn, now_s: float) -> None:
         """Note that the turn's node did not reply, before the turn learns of it."""
-
-    def taken_back(self, turn: Turn) -> None:
-        """Note that a stop did not wait for the reply to this poll."""
 
     def again(self, turn: Turn) -> None:
         """Give the turn back to the front of its lane."""

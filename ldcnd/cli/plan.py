@@ -32,8 +32,6 @@ def _table(bus: BusPlan) -> str:
         f"  stop         {_ms(bus.stop_wait_s)} to its first bit, {_ms(bus.stop_s)} to the drive's answer",
         f"               {_ms(bus.stop_after_loss_s)} to the answer after a lost reply",
     ]
-    if bus.stop_ahead_s is not None:
-        stops.append(f"               {_ms(bus.stop_ahead_s)} to its first bit ahead of the reply to a poll")
     lines = [
         f"bus {bus.bus}, {bus.baud} baud (drives: {bus.node_baud:.0f}): {'holds' if bus.holds else 'CANNOT HOLD'}",
         f"  load         {bus.load:6.1%} at worst, {bus.mean_load:.1%} on average",

@@ -83,7 +83,7 @@ def _told(entry: FaultEntry) -> str:
 
 
 def _slowness(health: AxisHealth) -> list[str]:
-    """Compare with what the drive is asked for now, which may be its idle rate."""
+    """Compare with what the drive is asked for."""
     asked = {item.item: item.asked_hz for item in health.items}
     wanted_hz = asked.get(TelemetryItem.POSITION, health.rate_wanted_hz)
     if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:

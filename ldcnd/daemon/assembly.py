@@ -15,11 +15,10 @@ from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, SimulatedLineConfig
 from ldcnd.daemon.authority import random_token
 from ldcnd.daemon.axis_service import AxisService
-from ldcnd.daemon.bus_service import NO_DEMANDS, BusService
+from ldcnd.daemon.bus_service import BusService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.control import build_control
 from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.demand import Demand
 from ldcnd.daemon.event_log import EventLog
 from ldcnd.daemon.ledger import Ledger
 from ldcnd.daemon.planning import servo_cycle, with_probes_that_fit
@@ -130,7 +129,6 @@ def _build_bus(
             settings.name,
             opening_baud,
             margin_s=settings.margin_ms / 1000,
-            pre_empts_polls=settings.pre_empt_polls,
             cycle=servo_cycle(settings),
             recorded_s=settings.recorder.seconds,
             recorded_bytes=settings.recorder.memory_mb * 1_000_000,
@@ -140,14 +138,12 @@ def _build_bus(
     specs = tuple(_spec(axis) for axis in settings.axis)
     network = FAMILIES[settings.family](bus, specs, settings.baud, _line(settings))
     axes = tuple(make_axis(axis, bus, network.axes[axis.name]) for axis in settings.axis)
-    demands = {axis.name: Demand() for axis in settings.axis} if config.telemetry.on_demand else NO_DEMANDS
     return BusService(
         bus,
         network,
         axes,
         port=settings.port,
         family=settings.family,
-        demands=demands,
         stop_probe_hz=with_probes_that_fit(settings).stop_probe_hz,
     )
 

@@ -66,21 +66,6 @@ class AxisPoller(Poller[AxisReading]):
         self.due_at_s = start_at_s
         self.deadline_at_s = start_at_s + self._period_s
 
-    def retime(self, rates_hz: Mapping[TelemetryItem, float], now_s: float) -> bool:
-        """Ask for the same items at other rates; return whether the next turn comes earlier because of it.
-
-        What is asked for more often is due within its new period, what is asked for more seldom after its next turn.
-        """
-        self._prepared = None
-        before_s = self._slower_due_s
-        self._take_rates(rates_hz)
-        self._slower_due_s = {
-            item: min(before_s.get(item, self.due_at_s), now_s + period_s) for item, period_s in self._slower_s.items()
-        }
-        due_at_s, self.due_at_s = self.due_at_s, min(self.due_at_s, now_s + self._period_s)
-        self.deadline_at_s = self.due_at_s + self._period_s
-        return self.due_at_s < due_at_s
-
     def _take_rates(self, rates_hz: Mapping[TelemetryItem, float]) -> None:
         self.rates_hz = rates_hz
         self._period_s = 1.0 / max(rates_hz.values())

@@ -2,20 +2,17 @@
 
 import asyncio
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, Priority
 from ldcnd.bus.wire_log import WireEvent
-from ldcnd.daemon.axis_poller import AxisPoller, Deliver, wanted_rates_hz
+from ldcnd.daemon.axis_poller import AxisPoller, wanted_rates_hz
 from ldcnd.daemon.axis_service import AxisService
-from ldcnd.daemon.demand import Demand
-from ldcnd.drivers.driver import AxisReading, ReadingListeners, StopMode
+from ldcnd.drivers.driver import ReadingListeners, StopMode
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import BusError, LdcndError
-from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.samples import TelemetryItem
 
@@ -28,7 +25,6 @@ LONGEST_LOOK_S = 2.0
 """Longest pause between two looks for drives that have gone: what powers up must be back within 3 s."""
 LOOK_SHARE = 0.01
 """Of the line's time, for these looks; more where the longest pause is too short for that."""
-NO_DEMANDS: Mapping[str, Demand] = MappingProxyType({})
 
 
 class BusService:
@@ -39,7 +35,6 @@ class BusService:
         family: the drive family on it.
         report: how the line came up; None while it is not up.
         problem: why it is not up; empty while it is.
-        demands: what of each axis somebody takes, by its name; an axis that is not here is always asked for all.
     """
 
     def __init__(
@@ -50,11 +45,9 @@ class BusService:
         *,
         port: str,
         family: str,
-        demands: Mapping[str, Demand] = NO_DEMANDS,
         stop_probe_hz: float = 0.0,
     ) -> None:
         self.bus = bus
-        self.demands = demands
         self.port = port
         self.family = family
         self.network = network
@@ -104,11 +97,6 @@ class BusService:
             polled_anew = (config.rates, config.priority) != (before.rates, before.priority)
             if polled_anew and self.report is not None:
                 self._poll(axis, asyncio.get_running_loop().time())
-
-    def subscribed(self, axis: AxisService, item: TelemetryItem, *, present: bool) -> None:
-        """Learn that somebody subscribes to an item of an axis, or nobody any more."""
-        self.demands[axis.config.name].subscribed(item, asyncio.get_running_loop().time(), present=present)
-        self._retime(axis)
 
     def asked_hz(self, axis: str) -> Mapping[TelemetryItem, float]:
         """Return how often the items of an axis are asked for now; empty for a family that paces itself."""
@@ -209,35 +197,9 @@ class BusService:
         if previous := self._pollers.get(axis.config.name):
             self.bus.remove_poller(previous)
         own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed))
-        poller = own or AxisPoller(axis.driver, self._rates_hz(axis, now_s), now_s, self._listener(axis), axis.missed)
+        rates_hz = wanted_rates_hz(axis.config.rates, adc=bool(axis.driver.adc_full_scale))
+        poller = own or AxisPoller(axis.driver, rates_hz, now_s, axis.observed, axis.missed)
         poller.priority = Priority[axis.config.priority.upper()]
         self._pollers[axis.config.name] = poller
         self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)
         self.bus.add_poller(poller)
-
-    def _listener(self, axis: AxisService) -> Deliver:
-        """Return who takes the readings of an axis; where rates follow the demand, they are looked at each time."""
-        if axis.config.name not in self.demands:
-            return axis.observed
-
-        def observed(reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-            axis.observed(reading, asked, timing)
-            self._retime(axis)
-
-        return observed
-
-    def _retime(self, axis: AxisService) -> None:
-        poller = self._pollers.get(axis.config.name)
-        if self.report is None or not isinstance(poller, AxisPoller):
-            return
-        now_s = asyncio.get_running_loop().time()
-        rates_hz = self._rates_hz(axis, now_s)
-        if rates_hz != poller.rates_hz and poller.retime(rates_hz, now_s):
-            self.bus.add_poller(poller)
-
-    def _rates_hz(self, axis: AxisService, now_s: float) -> Mapping[TelemetryItem, float]:
-        """Return how often each item is asked for now: an axis at work is watched whoever takes its telemetry."""
-        rates = axis.config.rates
-        rates_hz = wanted_rates_hz(rates, adc=bool(axis.driver.adc_full_scale))
-        demand = self.demands.get(axis.config.name)
-        return rates_hz if demand is None or axis.at_work else demand.asked_hz(rates_hz, rates.idle, now_s)

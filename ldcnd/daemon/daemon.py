@@ -2,18 +2,14 @@
 
 import asyncio
 import contextlib
-from functools import partial
 
 from ldcnd.bus.capture import Capture
 from ldcnd.config import RigConfig
-from ldcnd.daemon.axis_service import AxisService
-from ldcnd.daemon.bus_service import BusService
 from ldcnd.daemon.capture_store import CaptureStore
 from ldcnd.daemon.capture_watch import CaptureWatch
 from ldcnd.daemon.captures import Run, capture_of, snapshot_of
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.control import Control
-from ldcnd.daemon.demand import DEMANDED_ITEMS
 from ldcnd.daemon.describing import Describing
 from ldcnd.daemon.health import EepromWrites, HealthWatch
 from ldcnd.daemon.loss_policies import LeaseWatch, apply_policy
@@ -27,7 +23,6 @@ from ldcnd.messaging.session import Declaration, Load, Session
 from ldcnd.model.axes import LinkState
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.samples import TelemetryItem
 from ldcnd.version import version
 
 log = get_logger("daemon")
@@ -158,11 +153,6 @@ class Daemon:
             await until_end(await session.serve(stop, requests.on_stop, complete=True, urgent=True))
         await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
         await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
-        for bus in self.rig.buses:
-            for axis in (axis for axis in bus.axes if axis.config.name in bus.demands):
-                for item in DEMANDED_ITEMS:
-                    key, told = keys.telemetry(axis.config.name, item), partial(_told, bus, axis, item)
-                    await until_end(await session.watch_subscribers(key, told))
         await until_end(await session.declare_token(keys.alive(self._run.instance)))
 
     def _load(self) -> Load:
@@ -231,10 +221,6 @@ def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:
         return None
     store = CaptureStore(directory, bounds.files, bounds.total_mb * 1_000_000)
     return CaptureWatch(daemon.rig, lambda: daemon.config, run, store)
-
-
-def _told(bus: BusService, axis: AxisService, item: TelemetryItem, present: bool) -> None:  # noqa: FBT001 - as above
-    bus.subscribed(axis, item, present=present)
 
 
 def _stop_bounds_s(plan: RigPlan) -> dict[str, float]:

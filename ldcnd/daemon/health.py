@@ -126,7 +126,6 @@ class HealthWatch:
             resent=statistics.resent,
             resynchronisations=statistics.resynchronisations,
             stray_bytes=statistics.stray_bytes,
-            taken_back=statistics.taken_back,
             losses=statistics.losses,
             lanes=tuple(_lane(service, lane) for lane in Lane),
             stop_wait=self._stop_wait(service),

@@ -123,10 +123,6 @@ class HostCapture(Poller[AxisReading]):
         """See `Poller`."""
         self.missed_polls += 1
 
-    def taken_back(self) -> None:
-        """See `Poller`."""
-        self.missed_polls += 1
-
     def fail(self, error: BusError) -> None:
         """There will be no more samples."""
         if not self.done.is_set():

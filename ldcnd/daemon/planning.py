@@ -65,7 +65,6 @@ def plan_bus(bus: BusConfig) -> BusPlan:
         mean_load=plan.mean_load,
         commands_per_s=plan.commands_per_s,
         stop_wait_s=plan.stop_wait_s,
-        stop_ahead_s=plan.stop_ahead_s,
         stop_s=plan.stop_s,
         stop_after_loss_s=plan.stop_after_loss_s,
         stop_probe_hz=bus.stop_probe_hz if by_deadline else 0.0,
@@ -165,7 +164,6 @@ def _urgent(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList])
         margin_s=bus.margin_ms / 1000,
         search_s=cost_of(_slowest(prices).probe, replace(timing, host_baud=RESET_BAUD, node_baud=RESET_BAUD)).longest_s,
         probe=_probe(bus, timing, prices),
-        pre_empts_polls=bus.pre_empt_polls,
     )
 
 

@@ -37,7 +37,7 @@ class ItemHealth(Frozen):
     item: str
     """Last chunk of its key."""
     asked_hz: float = Field(ge=0)
-    """How often the drive is asked for it now: as configured, or its idle rate while nobody takes it."""
+    """How often the drive is asked for it."""
     granted_hz: float = Field(ge=0)
     """How often it was published in the last period."""
 
@@ -103,8 +103,6 @@ class BusHealth(Frozen):
     """How often the line was fenced."""
     stray_bytes: int = Field(ge=0)
     """Bytes that nobody had asked for."""
-    taken_back: int = Field(default=0, ge=0)
-    """Replies to polls for which a stop did not wait (`pre_empt_polls` in the configuration)."""
     losses: int = Field(ge=0)
     """How often the port was lost."""
     lanes: tuple[LaneHealth, ...]

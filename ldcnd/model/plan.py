@@ -69,8 +69,6 @@ class BusPlan(Frozen):
     """So many evenly spaced commands fit in without making a poll miss its turn."""
     stop_wait_s: float
     """From a stop's arrival to its first bit, at the latest, while no reply is lost."""
-    stop_ahead_s: float | None = None
-    """The same behind a poll when it does not wait for the reply (`pre_empt_polls`); null when it does."""
     stop_s: float
     """From a stop's arrival to the end of the drive's reply."""
     stop_after_loss_s: float

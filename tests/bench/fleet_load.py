@@ -108,7 +108,7 @@ def demands(site: Site) -> tuple[Demand, ...]:
         Demand("each rig is watched at its own edge", everything, 1, 0.0, 0, "nothing: what nobody takes stays away"),
         Demand("one recorder of everything at the root", everything, 0, everything, 1, "-"),
         Demand("the same, and three displays of everything", everything, 0, everything, 4, "-"),
-        Demand("states and faults at the root", states, 0, states, 1, "a narrower subscription; `telemetry.on_demand`"),
+        Demand("states and faults at the root", states, 0, states, 1, "a narrower subscription"),
         Demand(
             "once a second at the root", everything, 0, once_a_second, 1, "`downsampling` at the edge, a rule a key"
         ),

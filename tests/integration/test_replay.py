@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.bus.capture import Capture, parse_capture
-from ldcnd.bus.pre_empting_line import AHEAD, NOT_BELIEVED
 from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.config import load_config
 from ldcnd.daemon.replaying import config_of
@@ -56,8 +55,6 @@ def test_the_captures_show_what_they_are_named_for():
     assert values(published["power_loss"], "x/state")[-1]["state"] == "disabled"
     assert ends["corrupted_line"]["status"] == "done"
     assert "is damaged" in {record.note for record in kept("corrupted_line")[0].records}
-    assert (ends["stop_ahead"]["verb"], ends["stop_ahead"]["status"]) == ("stop", "done")
-    assert {AHEAD, NOT_BELIEVED} < {record.note for record in kept("stop_ahead")[0].records}
 
 
 def spoilt(capture, number, **changes):

@@ -20,14 +20,12 @@ from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
 from ldcnd.sim.jumping_loop import JumpingLoop
 
 FOLDER = Path(__file__).parents[1] / "captures"
-NAMES = ("clean_start", "power_loss", "corrupted_line", "stop_ahead")
+NAMES = ("clean_start", "power_loss", "corrupted_line")
 EPOCH_NS = 1_700_000_000_000_000_000
 STARTS_AT_S = 86_400.25
 """The recorded machine was up for a day already."""
 POWERED_AT_S, MOVED_AT_S, LENGTH_S = 1.7503, 2.0007, 5.0
 """After the start of the daemon; what happens to the line in between is in the rigs' files."""
-STOPPED_AT_S = {"stop_ahead": 2.4325}
-"""When x is stopped, by the name of the capture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,7 @@ class Recording:
 
 
 def record(name: str) -> Recording:
-    """Run the rig on the jumping clock: switch x on, move it, and look on or stop it."""
+    """Run the rig on the jumping clock: switch x on, move it, and watch it."""
     with asyncio.Runner(loop_factory=lambda: JumpingLoop(STARTS_AT_S)) as runner:
         return runner.run(_record(name))
 
@@ -75,9 +73,6 @@ async def _record(name: str) -> Recording:
         await client.command("x", Verb.POWER, PowerRequest(on=True))
         await asyncio.sleep(STARTS_AT_S + MOVED_AT_S - loop.time())
         await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=15.0, client="bench"))
-        if name in STOPPED_AT_S:
-            await asyncio.sleep(STARTS_AT_S + STOPPED_AT_S[name] - loop.time())
-            await client.stop("x")
         await asyncio.sleep(STARTS_AT_S + LENGTH_S - loop.time())
         capture = daemon.capture("line0", "test data")
         kept = tuple(published)

@@ -82,9 +82,6 @@ class PlainUsers:
     def stop_waits(self) -> bool:
         return any(turn.lane is Lane.STOP for turn in self.waiting)
 
-    def stops(self) -> list[Turn]:
-        return [turn for turn in self.waiting if turn.lane is Lane.STOP]
-
     def failing(self) -> set[int]:
         return self.mute
 
@@ -93,9 +90,6 @@ class PlainUsers:
 
     def missed(self, turn: Turn, now_s: float) -> None:
         self.story.append(f"missed {turn.exchange.node}")
-
-    def taken_back(self, turn: Turn) -> None:
-        self.story.append(f"taken back {toy.number_of(turn.exchange.request)}")
 
     def again(self, turn: Turn) -> None:
         assert isinstance(turn, RecordingTurn)

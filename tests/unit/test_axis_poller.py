@@ -75,32 +75,6 @@ def test_items_that_are_switched_off_and_converters_that_do_not_exist_are_not_po
     assert wanted_rates_hz(rates, adc=True) == {POSITION: 10, ADC: 2, STATE: 5}
 
 
-def test_an_item_that_is_wanted_more_often_comes_within_its_new_period():
-    axis = poller({POSITION: 1.0, STATE: 5.0})
-    axis.next_exchange(0.0)
-
-    earlier = axis.retime({POSITION: 20.0, STATE: 5.0}, 0.02)
-
-    assert earlier
-    (first_s, first), (second_s, second), *_ = polls(axis, 1.0)
-    assert first_s == pytest.approx(0.07)
-    assert second_s == pytest.approx(0.12)
-    assert POSITION in first
-    assert POSITION in second
-
-
-def test_an_item_that_is_wanted_more_seldom_keeps_the_state_at_its_rate():
-    axis = poller({POSITION: 20.0, STATE: 5.0})
-    polls(axis, 1.0)
-
-    earlier = axis.retime({POSITION: 1.0, STATE: 5.0}, 1.0)
-
-    assert not earlier
-    asked = Counter(item for _, items in polls(axis, 11.0) for item in items)
-    assert asked[STATE] == pytest.approx(50, abs=2)
-    assert asked[POSITION] == pytest.approx(10, abs=1)
-
-
 def test_to_prepare_a_poll_changes_nothing_but_when_the_work_is_done():
     plain, prepared = (poller({POSITION: 20.0, ADC: 7.0, STATE: 3.0}) for _ in range(2))
 
@@ -123,28 +97,5 @@ def test_what_was_prepared_for_a_turn_that_has_passed_is_not_asked():
     assert axis.due_at_s == pytest.approx(1.1)
 
 
-def test_other_rates_forget_what_was_prepared():
-    axis = poller({POSITION: 10.0})
-    axis.next_exchange(0.0)
-    axis.prepare(0.1)
-
-    axis.retime({POSITION: 2.0}, 0.1)
-    axis.next_exchange(0.1)
-
-    assert axis.due_at_s == pytest.approx(0.6)
-
-
 def test_the_poll_of_an_axis_counts_as_much_work():
     assert poller({POSITION: 1.0}).laborious
-
-
-def test_an_item_that_was_the_fastest_and_is_not_any_more_keeps_to_its_new_rate():
-    axis = poller({POSITION: 20.0, STATE: 5.0, VELOCITY: 20.0})
-    polls(axis, 1.0)
-
-    axis.retime({POSITION: 2.0, STATE: 5.0, VELOCITY: 20.0}, 1.0)
-
-    asked = Counter(item for _, items in polls(axis, 11.0) for item in items)
-    assert asked[VELOCITY] == pytest.approx(200, abs=1)
-    assert asked[STATE] == pytest.approx(50, abs=1)
-    assert asked[POSITION] == pytest.approx(20, abs=1)

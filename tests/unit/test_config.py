@@ -136,3 +136,20 @@ def test_the_name_of_a_line_that_is_served_alone_must_fit_into_a_key(tmp_path):
 
     with pytest.raises(ConfigError, match="too long"):
         single_line(rig, "a")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ('address = 1\nmodle = "x"', r"bus\[0\].axis\[0\].modle: there is no such key; did you mean 'model'\?"),
+        ("address = 1\nzzz = 1", r"bus\[0\].axis\[0\].zzz: there is no such key$"),
+        ("address = 1\n[bus.axis.rates]\nidle = 2", r"rates.idle: no longer supported: .* delete this key"),
+    ],
+)
+def test_an_unknown_key_names_the_one_that_may_be_meant_and_a_removed_one_says_so(tmp_path, change, words):
+    text = GOOD.replace("counts_per_unit = 1000\n", "").replace('unit = "mm"\n', "")
+    text = text.replace("velocity = 10\nacceleration = 100\n", "").replace('model = "ls-182ap"\n', "")
+    text = text.replace("address = 1", 'model = "ls-182ap"\nvelocity = 10\nacceleration = 100\n' + change)
+
+    with pytest.raises(ConfigError, match=words):
+        load(tmp_path, text)

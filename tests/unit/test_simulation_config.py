@@ -35,7 +35,7 @@ def load(tmp_path, text):
     [
         ('[[module]]\nmodel = "ls999"', "module[0].model: no such simulated module; known are ls182ap"),
         ('[[module]]\nmodel = "picio"\nconditions = ["stalled"]', "module[0]: conditions: a picio has no motor"),
-        ('[[module]]\nmodel = "ls182ap"\nplant = { mass = 1 }', "module[0].plant.mass: Extra inputs"),
+        ('[[module]]\nmodel = "ls182ap"\nplant = { mass = 1 }', "module[0].plant.mass: there is no such key"),
         ('[[module]]\nmodel = "ls182ap"\n[[event]]\nat_s = 1\nmodule = 1', "event[0]: an event needs exactly one"),
         ('[[module]]\nmodel = "ls182ap"\n[[event]]\nat_s = 1\nmodule = 2\npower = "off"', "there is no module 2"),
         ('[[module]]\nmodel = "ls182ap"\n[[fault]]\nkind = "unplugged"', "fault[0]: unplugged needs longest_s"),

@@ -104,7 +104,7 @@ def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on(
         (health(17.0), None),  # a report may miss the sample at its edge
         (health(0.0, wanted_hz=1.0), None),
         (health(0.0, wanted_hz=2.0), "0.0 samples a second instead of 2.0"),
-        (health(1.0, asked_hz=1.0), None),  # nobody takes them: the drive is asked at its idle rate
+        (health(1.0, asked_hz=1.0), None),  # as often as the drive is asked
         (health(1.0, asked_hz=20.0), "1.0 samples a second instead of 20.0"),
     ],
 )

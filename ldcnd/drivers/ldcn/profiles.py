@@ -51,8 +51,6 @@ class Profile:
         current_limit: Set Gain's CL byte works.
         top_baud: the highest rate of Set Baud Rate.
         sc_extensions: Reset Position with data, output modes in command 0x8, path points and Hard Reset with data.
-        takes_back: what it sends ends as soon as it hears the host (PIC-SERVO manual, 4.1; the LS-182AP manual does not
-            say so).
         motion_lock_from: from this version on, Stop Motor bit 7 unlocks motion and aux bit 7 says that it is locked
             (after homing on a limit); None on devices without the lock.
     """
@@ -85,7 +83,6 @@ class Profile:
     current_limit: bool = True
     top_baud: int = 115_200
     sc_extensions: bool = False
-    takes_back: bool = False
     motion_lock_from: int | None = None
 
 
@@ -96,7 +93,6 @@ PIC_SERVO_V4 = Profile(
     range(4, 5),
     Support.FULL,
     limit_outputs=True,
-    takes_back=True,
 )
 PIC_SERVO_V3 = replace(
     PIC_SERVO_V4,
@@ -105,7 +101,6 @@ PIC_SERVO_V3 = replace(
     versions=range(3, 4),
     gain_bytes=13,
     limit_outputs=False,  # the manual describes version 4; for older ones nobody vouches for it, nor for the next
-    takes_back=False,
 )
 PIC_SERVO_V2 = replace(
     PIC_SERVO_V3,
