@@ -9,8 +9,10 @@ from ldcnd.axis_config import AxisConfig
 from ldcnd.config_names import DeviceIdentity, Name, refuse_duplicates
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.line import AdoptFallback, StartPolicy
+from ldcnd.drivers.smartstep.profiles import Wiring
 from ldcnd.model.frozen import Frozen
 from ldcnd.smartstep_config import SmartStepLineConfig
+from ldcnd.transport.line_discipline import LONGEST_RTS_DELAY_MS, Rs485
 
 BAUDS = (9600, 19_200, 57_600, 115_200, 230_400)
 
@@ -64,6 +66,21 @@ class RecorderConfig(Frozen):
     """The oldest packets go sooner when all take more; 16 MB are about 35000 exchanges."""
 
 
+class Rs485Config(Frozen):
+    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet."""
+
+    rts_on_send: bool = True
+    """RTS is on while sending and off otherwise; false for ports that are wired the other way round."""
+    before_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
+    """From switching the transmitter on to the first bit."""
+    after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
+    """From the last bit to switching the transmitter off."""
+    receive_own: bool = False
+    """The receiver stays on while sending: on two wires the host then hears itself, see `echo`."""
+    terminate: bool = False
+    """Switch on the terminating resistor of a port that has one."""
+
+
 class BusConfig(Frozen):
     """One line."""
 
@@ -79,8 +96,11 @@ class BusConfig(Frozen):
     """The working rate."""
     margin_ms: float = Field(default=5.0, gt=0, le=1000)
     """Added to every reply's deadline: host scheduling and adapter latency."""
+    rs485: Rs485Config | None = None
+    """Have the kernel switch the transmitter; left out where the adapter does it, or it stays on (four wires)."""
     adapter_latency_ms: float = Field(default=1.0, ge=0, le=100)
-    """What the adapter keeps each reply back, for the plan: 1 for FTDI in low-latency mode, 0 for a UART on board."""
+    """How long the adapter holds replies, for the plan: 1 for FTDI in low-latency mode, 0 for a UART on board if \
+`rx_trig_bytes` is 1, else the time of four characters."""
     overload: Literal["refuse", "skip"] | None = None
     """Rates that the line may not be able to keep: refused before anything is opened, or polls skip turns; left out: \
 refuse, and skip for smartstep, where the drives' speed only shows on site."""
@@ -105,6 +125,11 @@ None where polls would miss their turns for it."""
     """Axes that start and stop together."""
     recorder: RecorderConfig = RecorderConfig()
     """The flight recorder of the line."""
+
+    @property
+    def transmitter(self) -> Rs485 | None:
+        """Return how the kernel switches the transmitter, if it does."""
+        return Rs485(**self.rs485.model_dump()) if self.rs485 else None
 
     @property
     def skips(self) -> bool:
@@ -137,6 +162,17 @@ None where polls would miss their turns for it."""
                 raise ValueError(f"axis {axis.name}: a {axis.model} does not belong on a line of family {self.family}")
         if is_smartstep and len(self.axis) > 1 and any(axis.address == 0 for axis in self.axis):
             raise ValueError("unit 0 never releases its transmitter: it must be alone on its line")
+        return self
+
+    @model_validator(mode="after")
+    def _switched_transmitter(self) -> Self:
+        if self.rs485 is None:
+            return self
+        if not self.port.startswith("/"):
+            raise ValueError(f"rs485: only a serial port of this machine has RTS, {self.port} has not; leave it out")
+        echo = self.smartstep.echo == "expect"
+        if self.smartstep.wiring is Wiring.TWO_WIRE and echo is not self.rs485.receive_own:
+            raise ValueError('rs485: on two wires receive_own = true goes with echo = "expect", false with "none"')
         return self
 
     @model_validator(mode="after")

@@ -71,9 +71,9 @@ class Bus:
         """Run the exchange that tells the nodes to change their rate, then change ours before anything else is sent.
 
         Raises:
-            As `execute`; NotSupported when the transport cannot change its rate.
+            As `execute`; NotSupported when the transport cannot change to this rate.
         """
-        self._require_changeable()
+        self._require_changeable(baud)
         return await self._submit(exchange, Lane.COMMAND, then_baud=baud)
 
     async def execute_at(self, baud: int, exchange: Exchange[ReplyT]) -> ReplyT:
@@ -82,9 +82,9 @@ class Bus:
         For a node that may be at that rate; to the others it is noise.
 
         Raises:
-            As `execute`; NotSupported when the transport cannot change its rate.
+            As `execute`; NotSupported when the transport cannot change to this rate.
         """
-        self._require_changeable()
+        self._require_changeable(baud)
         return await self._submit(exchange, Lane.COMMAND, at_baud=baud)
 
     async def probe_stop_wait(self) -> None:
@@ -163,6 +163,10 @@ class Bus:
         """Whether the port cannot change its rate."""
         return self._line is not None and self._line.wire.fixed_baud
 
+    def offers(self, baud: int) -> bool:
+        """Tell whether the port can be set to a rate; without an open port nothing says that it cannot."""
+        return self._line is None or self._line.wire.offers(baud)
+
     async def wait_opened(self) -> None:
         """Return as soon as the line is open."""
         await self._opened.wait()
@@ -180,12 +184,14 @@ class Bus:
         byte_s = self.settings.bits_per_byte / self.baud
         return (len(exchange.request) + exchange.reply_bytes) * byte_s + exchange.response_s
 
-    def _require_changeable(self) -> None:
+    def _require_changeable(self, baud: int) -> None:
         if self.fixed_baud:
             raise NotSupported(
                 f"bus {self.settings.name}: the port cannot change its rate",
                 remedy="configure the rate the far end uses",
             )
+        if not self.offers(baud):
+            raise NotSupported(f"bus {self.settings.name}: the port does not make {baud} baud", value=baud)
 
     @property
     def fence_s(self) -> float:

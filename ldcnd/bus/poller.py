@@ -5,11 +5,14 @@ piles them up.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from enum import IntEnum
+from types import MappingProxyType
 from typing import Generic, TypeVar
 
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.model.samples import TelemetryItem
 
 ReplyT = TypeVar("ReplyT")
 
@@ -39,6 +42,7 @@ class Poller(ABC, Generic[ReplyT]):
         due_at_s: when it wants its next slot, in loop time; read by the bus after each slot.
         deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
         priority: how it fares while the line cannot carry all polls; does not change while it waits for a turn.
+        rates_hz: how often it asks for each telemetry item; empty for one that asks for none.
         laborious: much is done with each reply, so the request behind it is on its way first; see `Line`.
     """
 
@@ -46,6 +50,7 @@ class Poller(ABC, Generic[ReplyT]):
     due_at_s: float
     deadline_at_s: float = 0.0
     priority: Priority = Priority.NORMAL
+    rates_hz: Mapping[TelemetryItem, float] = MappingProxyType({})
     laborious: bool = False
 
     def prepare(self, at_s: float) -> None:

@@ -44,6 +44,10 @@ class Wire:
         """Return how long an exchange can take at the present rate, first bit to last, in seconds."""
         return (len(exchange.request) + exchange.reply_bytes) * self.byte_s + exchange.response_s
 
+    def offers(self, baud: int) -> bool:
+        """See `Transport`."""
+        return self._transport.offers(baud)
+
     def attach(self, receiver: Receiver) -> None:
         """See `Transport`."""
         self._transport.attach(receiver)

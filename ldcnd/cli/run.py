@@ -12,7 +12,7 @@ from ldcnd.config import RigConfig, load_config, single_line
 from ldcnd.daemon.assembly import open_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.planning import require_plan
-from ldcnd.daemon.process import held_awake, last_words, loop_factory, settle_heap
+from ldcnd.daemon.process import held_awake, last_words, loop_factory, require_writable, settle_heap
 from ldcnd.daemon.service import Service
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import configure_logging, get_logger
@@ -56,6 +56,7 @@ def command(
         return rig.model_copy(update={"zenoh": zenoh})
 
     rig = load()
+    require_writable(rig)
     with (
         held_awake(wanted=rig.daemon.hold_cpu_awake),
         asyncio.Runner(loop_factory=loop_factory(uvloop=rig.daemon.uvloop)) as runner,

@@ -166,7 +166,7 @@ def _line(settings: BusConfig) -> LineSpec:
 
 def _opener(config: RigConfig, settings: BusConfig, baud: int, chains: Mapping[str, Chain]) -> Opener:
     if not settings.port.startswith(SIMULATED):
-        return port_opener(settings.port, baud)
+        return port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.transmitter)
     name = settings.port.removeprefix(SIMULATED)
     chain = chains.get(name) or _chain(next(line for line in config.sim if line.name == name))
     return lambda: open_simulated_line(chain)

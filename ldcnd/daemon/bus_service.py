@@ -99,9 +99,9 @@ class BusService:
                 self._poll(axis, asyncio.get_running_loop().time())
 
     def asked_hz(self, axis: str) -> Mapping[TelemetryItem, float]:
-        """Return how often the items of an axis are asked for now; empty for a family that paces itself."""
+        """Return how often the items of an axis are asked for now."""
         poller = self._pollers.get(axis)
-        return poller.rates_hz if isinstance(poller, AxisPoller) else {}
+        return poller.rates_hz if poller else {}
 
     async def _supervise(self) -> None:
         retry_s = FIRST_RETRY_S

@@ -18,9 +18,34 @@ from ldcnd.model.samples import TelemetryItem
 EepromWrites = Callable[[AxisService], int | None]
 
 PERIOD_S = 1.0
+TURNS = 4
+"""A rate is told from so many turns at least: what comes every ten seconds is not there in most seconds."""
+CLOCK_S = 0.1
+"""Reports are no more punctual than this."""
 LAG_LOOKS = 10
 """So many times in a period a timer is looked at for how late it comes."""
 LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
+
+
+class _Rate:
+    """How often something is counted, over as long as it takes to tell."""
+
+    __slots__ = ("_count", "_hz", "_since_s")
+
+    def __init__(self, since_s: float, count: int) -> None:
+        self._since_s = since_s
+        self._count = count
+        self._hz = 0.0
+
+    def of(self, count: int, now_s: float, least_s: float) -> float:
+        """Return the rate since at least `least_s` ago; before that the one found last."""
+        elapsed_s = now_s - self._since_s
+        if elapsed_s >= least_s - CLOCK_S:
+            self._hz = max(0, count - self._count) / elapsed_s
+            self._since_s, self._count = now_s, count
+        elif not self._hz and elapsed_s > 0:
+            return (count - self._count) / elapsed_s
+        return self._hz
 
 
 class HealthWatch:
@@ -59,7 +84,7 @@ class HealthWatch:
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
-        self._published: dict[tuple[str, TelemetryItem], int] = {}
+        self._granted: dict[tuple[str, TelemetryItem], _Rate] = {}
 
     async def run(self) -> None:
         """Report each second until cancelled; then take the reports off the network."""
@@ -129,7 +154,7 @@ class HealthWatch:
             losses=statistics.losses,
             lanes=tuple(_lane(service, lane) for lane in Lane),
             stop_wait=self._stop_wait(service),
-            axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t, period_s) for axis in service.axes),
+            axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t) for axis in service.axes),
         )
 
     def _stop_wait(self, service: BusService) -> StopWaitHealth:
@@ -141,27 +166,28 @@ class HealthWatch:
             longest_s=waits.longest_s,
         )
 
-    def _axis(self, axis: AxisService, asked_hz: Mapping[TelemetryItem, float], t: int, period_s: float) -> AxisHealth:
+    def _axis(self, axis: AxisService, asked_hz: Mapping[TelemetryItem, float], t: int) -> AxisHealth:
         name = axis.config.name
+        granted_hz = {item: self._granted_hz(name, item, asked_hz.get(item, 0.0)) for item in TelemetryItem}
         last = self._publisher.last.get(self._keys.telemetry(name, TelemetryItem.POSITION))
         return AxisHealth(
             axis=name,
             link=axis.tracker.link,
             sample_age_s=max(0.0, (t - last.t) / 1e9) if last else None,
             rate_wanted_hz=axis.config.rates.position,
-            rate_hz=self._granted_hz(name, TelemetryItem.POSITION, period_s),
+            rate_hz=granted_hz[TelemetryItem.POSITION],
             faults=len(axis.tracker.active_faults),
             eeprom_writes=self._eeprom_writes(axis),
             items=tuple(
-                ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(name, item, period_s))
-                for item, hz in asked_hz.items()
+                ItemHealth(item=item.value, asked_hz=hz, granted_hz=granted_hz[item]) for item, hz in asked_hz.items()
             ),
         )
 
-    def _granted_hz(self, axis: str, item: TelemetryItem, period_s: float) -> float:
-        """Return how often an item was published since the last report."""
-        before = self._published.get((axis, item), 0)
-        return max(0, self._count(axis, item) - before) / period_s
+    def _granted_hz(self, axis: str, item: TelemetryItem, asked_hz: float) -> float:
+        """Return how often an item was published lately."""
+        now_s, count = self._clock.now_s(), self._count(axis, item)
+        rate = self._granted.setdefault((axis, item), _Rate(now_s, count))
+        return rate.of(count, now_s, TURNS / asked_hz if asked_hz else PERIOD_S)
 
     def _count(self, axis: str, item: TelemetryItem) -> int:
         """Return how many samples of an item were published so far."""
@@ -170,7 +196,6 @@ class HealthWatch:
 
     def _note_counters(self) -> None:
         self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}
-        self._published = {(axis, item): self._count(axis, item) for axis in self._rig.axes for item in TelemetryItem}
 
 
 def _lane(service: BusService, lane: Lane) -> LaneHealth:

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from ldcnd.config import RigConfig
+from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 
 log = get_logger("process")
@@ -30,6 +32,25 @@ def loop_factory(*, uvloop: bool) -> LoopFactory:
         else:
             return _finely_timed(fast.Loop)
     return asyncio.new_event_loop
+
+
+def require_writable(rig: RigConfig) -> None:
+    """Check that the daemon can keep what must outlive it, before anything is opened.
+
+    Raises:
+        ConfigError: it may not write where the configuration says; names where a service manager lets it.
+    """
+    for key, directory in (("state_dir", rig.state_dir), ("captures.directory", rig.captures.directory)):
+        if directory is None:
+            continue
+        there = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
+        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+            allowed = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+            raise ConfigError(
+                f"{key}: {directory} cannot be written by this user or service",
+                value=str(directory),
+                remedy=f'{key} = "{allowed}", where the service may write' if allowed else "choose a writable place",
+            )
 
 
 @contextmanager

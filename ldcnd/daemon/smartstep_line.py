@@ -22,6 +22,7 @@ from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.transport.port_url import port_opener
+from ldcnd.transport.serial_port import Framing as SerialFraming
 from ldcnd.transport.transport import Opener
 
 SIMULATED = "sim:"
@@ -112,8 +113,8 @@ def rates_hz(axis: AxisConfig) -> Mapping[Item, float]:
 
 def _opener(config: RigConfig, settings: BusConfig, profile: SmartStepProfile, chains: Mapping[str, Chain]) -> Opener:
     if not settings.port.startswith(SIMULATED):
-        framing = "7e1" if profile.framing is Framing.SEVEN_EVEN else "8n1"
-        return port_opener(settings.port, BAUD, framing)  # type: ignore[arg-type]  # mypy widens the two literals
+        framing: SerialFraming = "7e1" if profile.framing is Framing.SEVEN_EVEN else "8n1"
+        return port_opener(settings.port, BAUD, framing, rs485=settings.transmitter)
     name = settings.port.removeprefix(SIMULATED)
     chain = chains.get(name) or _chain(next(line for line in config.sim if line.name == name), profile)
     return lambda: open_simulated_line(chain)

@@ -7,12 +7,10 @@ else here reads a clock of the machine.
 On a busy machine raise its priority (nice -20 rather than a real-time class).
 """
 
-import fcntl
 import itertools
 import os
 import select
 import signal
-import struct
 import threading
 import time
 import tty
@@ -23,14 +21,12 @@ from types import FrameType
 from typing import Self
 
 from ldcnd.sim.chain import Chain
+from ldcnd.transport.line_discipline import actual_baud
 
 SPIN_S = 150e-6
 LONGEST_SLEEP_S = 0.05
 """How long a request to stop may stay unnoticed."""
 READ_BYTES = 4096
-TCGETS2 = 0x802C542A
-"""Linux `ioctl` that reads `struct termios2`, whose speed fields also hold rates without a constant."""
-TERMIOS2 = struct.Struct("4I20B2I")
 
 
 class PtyLine:
@@ -115,9 +111,7 @@ class PtyLine:
 
     def _host_baud(self) -> int:
         """Return the rate that the host has set; the master side of a terminal reports the slave's settings."""
-        answer = fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size))
-        speed: int = TERMIOS2.unpack(answer)[-1]
-        return speed
+        return actual_baud(self._master) or 0
 
 
 def serve_pty(

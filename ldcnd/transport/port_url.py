@@ -3,6 +3,7 @@
 from urllib.parse import urlsplit
 
 from ldcnd.errors import ConfigError
+from ldcnd.transport.line_discipline import Rs485
 from ldcnd.transport.serial_port import Framing, SerialSettings, open_serial_port
 from ldcnd.transport.tcp_port import open_tcp_port
 from ldcnd.transport.transport import Opener
@@ -10,19 +11,23 @@ from ldcnd.transport.transport import Opener
 SOCKET = "socket://"
 
 
-def port_opener(port: str, baud: int, framing: Framing = "8n1") -> Opener:
+def port_opener(
+    port: str, baud: int, framing: Framing = "8n1", *, working_baud: int | None = None, rs485: Rs485 | None = None
+) -> Opener:
     """Return what opens the port; nothing is opened yet.
 
     Args:
         port: a device path, or socket://host:port with an IPv6 address in brackets.
         baud: the rate of a device; a serial server keeps its own.
         framing: the framing of a device; a serial server keeps its own.
+        working_baud: the rate that a device is changed to later.
+        rs485: have the kernel switch the transmitter of a device.
 
     Raises:
         ConfigError: the port is neither.
     """
     if port.startswith("/"):
-        settings = SerialSettings(port, baud, framing)
+        settings = SerialSettings(port, baud, framing, working_baud=working_baud, rs485=rs485)
         return lambda: open_serial_port(settings)
     host, number = _socket_address(port)
     return lambda: open_tcp_port(host, number)

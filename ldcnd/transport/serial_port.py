@@ -6,8 +6,8 @@ is far smaller than the driver's buffer, so one that does not fit whole means th
 0.6 needs three system calls for each read and keeps every write for the next turn of the loop; the measurement is in
 docs/explanation/timing.md. Draining and opening may block and happen in a worker.
 
-The direction of the RS-485 driver is left to the adapter: after a driver has refused pyserial's `rs485_mode`, every
-later change of the rate fails too.
+The direction of an RS-485 transmitter is the adapter's business, or the kernel's (`Rs485`); pyserial's `rs485_mode` is
+not used: after a driver has refused it, every later change of the rate fails too.
 """
 
 import asyncio
@@ -25,6 +25,15 @@ import structlog
 
 from ldcnd.errors import TransportLost
 from ldcnd.transport.incoming import Incoming
+from ldcnd.transport.line_discipline import (
+    STANDARD_BAUDS,
+    PortFault,
+    Rs485,
+    actual_baud,
+    makes,
+    nearest,
+    switch_direction,
+)
 from ldcnd.transport.transport import Receiver, Transport
 
 log: structlog.typing.FilteringBoundLogger = structlog.get_logger("ldcnd.serial_port")
@@ -46,9 +55,6 @@ CONTROL_CHARACTERS = 6
 SETTINGS_BYTES = 64
 """More than `struct termios` has anywhere."""
 
-PortFault = (OSError, ValueError, OverflowError, termios.error)
-"""What pyserial lets through when a driver refuses; its own exception is an OSError, that of termios is not."""
-
 Framing = Literal["8n1", "7e1"]
 
 
@@ -62,6 +68,8 @@ class SerialSettings:
         framing: data bits, parity, stop bits.
         low_latency: ask the driver to pass bytes on at once; an FTDI adapter otherwise waits for up to 16 ms.
         exclusive: refuse the port to others, and refuse to share a port that is in use.
+        working_baud: the rate that the line will be changed to; a port that cannot make it does not open.
+        rs485: have the kernel switch the transmitter; None where the adapter does it, or where it stays on.
     """
 
     path: str
@@ -69,6 +77,21 @@ class SerialSettings:
     framing: Framing = "8n1"
     low_latency: bool = True
     exclusive: bool = True
+    working_baud: int | None = None
+    rs485: Rs485 | None = None
+
+
+class _Refused(Exception):
+    """The driver takes the port's settings otherwise than they were asked for.
+
+    Args:
+        what: it makes of them.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, what: str, remedy: str) -> None:
+        super().__init__(what)
+        self.remedy = remedy
 
 
 async def open_serial_port(settings: SerialSettings) -> Transport:
@@ -82,6 +105,9 @@ async def open_serial_port(settings: SerialSettings) -> Transport:
     try:
         async with asyncio.timeout(OPEN_TIME_S):
             port = await asyncio.shield(opening)
+    except _Refused as refused:
+        message = f"{settings.path} cannot be opened: {refused}; {refused.remedy}"
+        raise TransportLost(message, value=settings.path, remedy=refused.remedy) from None
     except TimeoutError:
         opening.add_done_callback(_close_unwanted)
         raise TransportLost(
@@ -104,7 +130,22 @@ async def open_serial_port(settings: SerialSettings) -> Transport:
 
 
 class _Serial(serial.Serial):
-    """A port that pyserial-asyncio can close without blocking the loop."""
+    """A port that pyserial-asyncio can close without blocking the loop.
+
+    Attributes:
+        bauds: the standard rates that the driver makes.
+    """
+
+    bauds: tuple[int, ...] = ()
+
+    def tune(self, baud: int) -> int | None:
+        """Change the rate; return the one that the driver makes of it, None where it does not say.
+
+        Raises:
+            PortFault: the driver refuses.
+        """
+        self.baudrate = baud
+        return actual_baud(self.fileno())
 
     def flush(self) -> None:
         """Do nothing: pyserial-asyncio would drain on the event loop; `SerialPort.close` has drained in a worker."""
@@ -132,6 +173,10 @@ class SerialPort(Transport):
         self._set_least_bytes()
         self._loop.add_reader(self._descriptor, self._readable)
 
+    def offers(self, baud: int) -> bool:
+        """See `Transport`: standard rates were tried when the port was opened, another one shows when it is set."""
+        return baud not in STANDARD_BAUDS or baud in self._port.bauds
+
     def attach(self, receiver: Receiver) -> None:
         """See `Transport`."""
         self.discard_input()
@@ -143,12 +188,18 @@ class SerialPort(Transport):
         except BlockingIOError:
             return
         except OSError as error:
-            self._give_up(str(error))
+            self._give_up(self._gone(str(error)))
             return
         if data:
             self._incoming.data_received(data)
         else:
-            self._give_up("the far end closed it")
+            self._give_up(self._gone("the driver hung it up"))
+
+    def _gone(self, what: str) -> str:
+        """Say who has gone: the kernel hangs a port up when its adapter leaves the USB, or a pty's far end closes."""
+        if self._is_usb:
+            return f"the USB adapter is gone, unplugged or reset ({what})"
+        return "the far end closed it" if self._is_pseudo else what
 
     def write(self, data: bytes) -> None:
         """See `Transport`."""
@@ -156,7 +207,7 @@ class SerialPort(Transport):
         try:
             written = os.write(self._descriptor, data)
         except OSError as error:
-            raise self._give_up(str(error)) from error
+            raise self._give_up(self._gone(str(error))) from error
         if written != len(data):
             raise self._give_up(f"it took {written} of {len(data)} bytes")
 
@@ -203,9 +254,11 @@ class SerialPort(Transport):
         """See `Transport`."""
         self._require_usable()
         try:
-            self._port.baudrate = baud
+            made = self._port.tune(baud)
         except PortFault as error:
             raise self._give_up(f"it refuses {baud} baud: {error}") from error
+        if not makes(baud, made):
+            raise self._give_up(f"it sends at {made} instead of {baud} baud")
         self._settings.clear()
         self._set_least_bytes()  # pyserial has undone it
 
@@ -261,12 +314,39 @@ def _open(settings: SerialSettings) -> _Serial:
         if settings.exclusive:
             # pyserial's lock binds only those who ask for it; this one refuses every other user's open
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+        _settle_rates(port, settings)
+        _settle_direction(port, settings)
         if settings.low_latency:
             _ask_for_low_latency(port)
     except BaseException:
         port.close()
         raise
     return port
+
+
+def _settle_rates(port: _Serial, settings: SerialSettings) -> None:
+    """Find out which rates the driver makes before a drive is told to change to one, and leave it at the first one.
+
+    Raises:
+        _Refused: not those that the line needs.
+    """
+    port.bauds = tuple(baud for baud in STANDARD_BAUDS if makes(baud, port.tune(baud)))
+    for baud in (settings.working_baud, settings.baud):
+        if baud and not makes(baud, made := port.tune(baud)):
+            raise _Refused(
+                f"it sends at {made} instead of {baud} baud, the nearest that it makes: {nearest(baud, port.bauds)}",
+                f"set a baud that it makes ({', '.join(map(str, port.bauds)) or 'none'}), or use another adapter",
+            )
+
+
+def _settle_direction(port: _Serial, settings: SerialSettings) -> None:
+    """Have the kernel switch the transmitter, where that is asked for.
+
+    Raises:
+        _Refused: its driver does not, or not so.
+    """
+    if settings.rs485 and (why := switch_direction(port.fileno(), settings.rs485)):
+        raise _Refused(why, "leave `rs485` out where the adapter switches its transmitter itself, or use another port")
 
 
 def _is_pseudo_terminal(path: str) -> bool:

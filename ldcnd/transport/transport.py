@@ -32,6 +32,10 @@ class Transport(ABC):
         """How much later than the line has it the next reply may come out of this pipe; known delays only."""
         return 0.0
 
+    def offers(self, baud: int) -> bool:  # noqa: ARG002 - the general answer
+        """Tell whether the pipe can be set to a rate, as far as is known before it is tried."""
+        return not self.fixed_baud
+
     @abstractmethod
     def attach(self, receiver: Receiver) -> None:
         """Deliver all further bytes to `receiver`; what came before is dropped. Called once, straight after opening."""
@@ -63,7 +67,7 @@ class Transport(ABC):
         """Change the rate of both directions at once; the caller has waited until everything written has left.
 
         Raises:
-            TransportLost: the pipe is gone.
+            TransportLost: the pipe is gone, or does not have this rate.
         """
 
     @abstractmethod

@@ -149,6 +149,22 @@ async def test_the_wear_of_an_eeprom_is_reported_for_the_drives_that_have_one(tm
         assert axes == {"x": None, "feed": 12, "spool": 0}
 
 
+async def test_rates_of_drives_that_pace_themselves_are_reported_like_those_of_others(tmp_path):
+    config = load_config(MIXED).model_copy(update={"state_dir": tmp_path})
+    async with running_rig(config) as rig:
+        await asyncio.sleep(60.0)
+        for _ in range(5):
+            await asyncio.sleep(1.0)
+            answers = await rig.session.query(Keys(config.rig).bus_health("*"))
+            reports = [decode_received(BusHealth, answer.payload, answer.encoding) for answer in answers]
+            (feed,) = [axis for report in reports for axis in report.axes if axis.axis == "feed"]
+
+            assert {item.item for item in feed.items} == {"position", "velocity", "state"}
+            assert feed.rate_hz == pytest.approx(feed.rate_wanted_hz, rel=0.1)
+            for item in feed.items:
+                assert item.granted_hz == pytest.approx(item.asked_hz, rel=0.1)
+
+
 async def test_reports_leave_the_network_with_the_daemon():
     deleted = []
     async with running_rig() as rig:

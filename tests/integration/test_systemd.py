@@ -189,6 +189,21 @@ def test_two_rigs_run_beside_each_other(service: Machine):
     service.must("systemctl", "stop", "ldcnd@cell")
 
 
+def test_rig_of_several_may_write_to_its_own_place_only(service: Machine):
+    beside = SIMULATED.replace('rig = "sim"', 'rig = "cell"\nstate_dir = "/var/lib/ldcnd"').replace("7447", "7448")
+    service.write("/etc/ldcnd/cell.toml", beside)
+
+    assert service.run("systemctl", "start", "ldcnd@cell").returncode != 0
+    refused = service.show("ldcnd@cell", "ExecMainStatus")
+    log = log_of(service, "ldcnd@cell")
+    service.write("/etc/ldcnd/cell.toml", beside.replace("/var/lib/ldcnd", "/var/lib/ldcnd/cell"))
+    service.must("systemctl", "start", "ldcnd@cell")
+
+    assert refused == "78"
+    assert 'state_dir = "/var/lib/ldcnd/cell", where the service may write' in log
+    service.must("systemctl", "stop", "ldcnd@cell")
+
+
 def test_realtime_drop_in_moves_only_the_event_loop_ahead(service: Machine):
     service.write(f"{DROP_INS}/realtime.conf", (DEPLOY / "drop-ins/realtime.conf").read_text(encoding="utf-8"))
     service.must("systemctl", "daemon-reload")

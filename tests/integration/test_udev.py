@@ -105,6 +105,19 @@ def test_ftdi_adapter_hands_over_replies_after_a_millisecond(machine: Machine):
     assert re.search(rf"ATTR '/sys{PORT}/latency_timer' writing '1'", report)
 
 
+def test_uart_on_board_hands_over_replies_after_each_byte(machine: Machine):
+    port = "/devices/platform/serial8250/tty/ttyS1"
+    machine.write(
+        "/root/uart.umockdev",
+        f"P: {port}\nN: ttyS1\nE: DEVNAME=/dev/ttyS1\nE: MAJOR=4\nE: MINOR=65\nE: SUBSYSTEM=tty\nA: rx_trig_bytes=8\n",
+    )
+    trial = f"udevadm test --action=add {port} 2>&1"
+
+    report = machine.must("umockdev-run", "--device", "/root/uart.umockdev", "--", "sh", "-c", trial)
+
+    assert re.search(rf"ATTR '/sys{port}/rx_trig_bytes' writing '1'", report)
+
+
 @pytest.mark.parametrize("adapter", [CP210X, MODEM])
 def test_other_chips_are_left_as_they_are(machine: Machine, adapter: Adapter):
     report = tried(machine, adapter, PORT)

@@ -190,20 +190,24 @@ class LineRate:
 
     Attributes:
         working: where all modules should be.
-        candidates: where they may be, the most unlikely first, `RESET_BAUD` last.
         groups: the group addresses in use.
     """
 
     def __init__(self, bus: Bus, working: int, codes: BaudCodes, groups: tuple[int, ...], *, fastest: bool) -> None:
         self.working = working
-        self.candidates: tuple[int, ...] = COMMON_BAUDS
+        self._possible: tuple[int, ...] = COMMON_BAUDS
         if fastest:
-            self.candidates = (FASTEST_BAUD, *COMMON_BAUDS)
+            self._possible = (FASTEST_BAUD, *COMMON_BAUDS)
         if working == FASTEST_BAUD:
-            self.candidates = (FASTEST_BAUD, round(actual_baud(baud_divisor(working, codes))), *COMMON_BAUDS)
+            self._possible = (FASTEST_BAUD, round(actual_baud(baud_divisor(working, codes))), *COMMON_BAUDS)
         self.groups = groups
         self._bus = bus
         self._codes = codes
+
+    @property
+    def candidates(self) -> tuple[int, ...]:
+        """Where they may be and the port can go, the most unlikely first, `RESET_BAUD` last."""
+        return tuple(baud for baud in self._possible if self._bus.fixed_baud or self._bus.offers(baud))
 
     @property
     def changeable(self) -> bool:
@@ -214,7 +218,7 @@ class LineRate:
         """Clear the line at the present rate and change ours; tell whether it is the wanted one now."""
         if self._bus.baud == baud:
             await self._bus.execute(nulls(NULLS_SETTLE_S))
-        elif self._bus.fixed_baud:
+        elif not self._bus.offers(baud):
             return False
         else:
             await self._bus.change_baud(nulls(NULLS_SETTLE_S), baud)

@@ -116,6 +116,8 @@ class UnitPoller(Poller[int | Refusal]):
         self._profile = profile
         self._listeners = listeners
         self._periods_s: dict[Item, float] = {item: 1.0 / rate for item, rate in rates_hz.items() if rate > 0}
+        periods_s = self._periods_s
+        self.rates_hz = {item: 1.0 / periods_s[basic] for basic, item in PUBLISHED.items() if basic in periods_s}
         self._due_s: dict[Item, float] = dict.fromkeys(self._periods_s, start_at_s)
         self._due_s[Basic.IDENTITY] = start_at_s
         self._words: dict[int, int] = {}

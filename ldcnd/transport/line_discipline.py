@@ -1,0 +1,114 @@
+"""Settings of a Linux serial port that Python's `termios` cannot read or make: the rate it really has, and RS-485.
+
+Sources: Linux, include/uapi/asm-generic/termbits.h and ioctls.h, include/uapi/linux/serial.h, Documentation/driver-api/
+serial/serial-rs485.rst.
+"""
+
+import contextlib
+import errno
+import fcntl
+import struct
+import termios
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+TCGETS2 = 0x802C542A
+"""Reads `struct termios2`, whose speeds also hold rates without a constant of their own."""
+TERMIOS2 = struct.Struct("4I20B2I")
+TIOCGRS485 = 0x542E
+TIOCSRS485 = 0x542F
+SERIAL_RS485 = struct.Struct("3I5I")
+
+ENABLED, RTS_ON_SEND, RTS_AFTER_SEND, RX_DURING_TX, TERMINATE_BUS = 1, 2, 4, 16, 32
+"""Flags of `struct serial_rs485`."""
+LONGEST_RTS_DELAY_MS = 100
+"""The kernel's serial core shortens longer ones."""
+
+STANDARD_BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400)
+RATE_TOLERANCE = 0.02
+"""The kernel calls a rate by the name of its neighbour within so much (drivers/tty/tty_baudrate.c); two clocks that
+differ by no more still read each other's bytes."""
+
+PortFault = (OSError, ValueError, OverflowError, termios.error)
+"""What a driver's refusal is raised as; that of `termios` is no OSError."""
+
+
+def actual_baud(descriptor: int) -> int | None:
+    """Return the rate at which the driver says the port sends; None where it does not say.
+
+    A driver that cannot make a rate sets another one and reports no error: the 8250 keeps the one before, or 9600.
+    """
+    with contextlib.suppress(OSError):
+        speed: int = TERMIOS2.unpack(fcntl.ioctl(descriptor, TCGETS2, bytes(TERMIOS2.size)))[-1]
+        return speed or None
+    return None
+
+
+def makes(asked: int, made: int | None) -> bool:
+    """Tell whether a port that says it sends at `made` can be heard at `asked`."""
+    return made is None or abs(made - asked) <= RATE_TOLERANCE * asked
+
+
+def nearest(asked: int, available: Sequence[int]) -> str:
+    """Return the two rates next to the one asked for, in words."""
+    below = [baud for baud in available if baud < asked]
+    above = [baud for baud in available if baud > asked]
+    return " and ".join(str(baud) for baud in (*below[-1:], *above[:1])) or "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Rs485:
+    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet.
+
+    Attributes:
+        rts_on_send: RTS is on while sending, and off otherwise; False for the inverse.
+        before_ms: from switching the transmitter on to the first bit.
+        after_ms: from the last bit to switching the transmitter off.
+        receive_own: the receiver stays on while sending, so that the host hears itself.
+        terminate: switch the port's own terminating resistor on.
+    """
+
+    rts_on_send: bool = True
+    before_ms: int = 0
+    after_ms: int = 0
+    receive_own: bool = False
+    terminate: bool = False
+
+    @property
+    def flags(self) -> int:
+        """As in `struct serial_rs485`."""
+        flags = ENABLED | (RTS_ON_SEND if self.rts_on_send else RTS_AFTER_SEND)
+        flags |= RX_DURING_TX if self.receive_own else 0
+        return flags | (TERMINATE_BUS if self.terminate else 0)
+
+
+def switch_direction(descriptor: int, wanted: Rs485) -> str:
+    """Have the kernel switch the transmitter; return why it will not as wanted, empty when it does.
+
+    A driver may take less than it was asked for without an error, so what it took is read back.
+    """
+    request = SERIAL_RS485.pack(wanted.flags, wanted.before_ms, wanted.after_ms, *bytes(5))
+    try:
+        fcntl.ioctl(descriptor, TIOCSRS485, request)
+        flags, before_ms, after_ms, *_ = SERIAL_RS485.unpack(fcntl.ioctl(descriptor, TIOCGRS485, bytes(len(request))))
+    except OSError as error:
+        if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EOPNOTSUPP):
+            return "its driver cannot switch the transmitter of an RS-485 line"
+        return f"its driver refuses to switch the transmitter: {error}"
+    return _difference(wanted, flags, before_ms, after_ms)
+
+
+def _difference(wanted: Rs485, flags: int, before_ms: int, after_ms: int) -> str:
+    if not flags & ENABLED:
+        return "its driver cannot switch the transmitter of an RS-485 line"
+    if (flags ^ wanted.flags) & (RTS_ON_SEND | RTS_AFTER_SEND):
+        return f"its driver cannot have RTS {'on' if wanted.rts_on_send else 'off'} while sending"
+    if (flags ^ wanted.flags) & RX_DURING_TX:
+        return f"its driver cannot have the receiver {'on' if wanted.receive_own else 'off'} while sending"
+    if wanted.terminate and not flags & TERMINATE_BUS:
+        return "its port has no terminating resistor that can be switched on"
+    if (before_ms, after_ms) != (wanted.before_ms, wanted.after_ms):
+        return (
+            f"its driver makes pauses of {before_ms} and {after_ms} ms of {wanted.before_ms} and {wanted.after_ms} ms"
+        )
+    return ""
