@@ -5,7 +5,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from ldcnd.drivers.smartstep.profiles import EepromWrite, Framing, Standing, Wiring
+from ldcnd.drivers.smartstep.profiles import EepromWrite, Framing, Verification, Wiring
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.monitors import MonitorName
 from ldcnd.smartstep_trace_config import SmartStepTraceConfig
@@ -63,8 +63,15 @@ class SmartStepUnitConfig(Frozen):
     """/ALM is 1 in alarm."""
     trace: SmartStepTraceConfig = SmartStepTraceConfig()
     """How its recorder is taken to work."""
-    settled: Mapping[str, Standing] = {}
-    """What a bench has said about the doubts of the profile, by their keys."""
+    verified: Mapping[str, Verification] = {}
+    """What a test on the drive has said about the assumptions of its profile, by their keys."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, document: object) -> object:
+        if isinstance(document, dict) and "settled" in document:
+            raise ValueError('settled: the key is called verified now, and its value "bench_verified" is "verified"')
+        return document
 
     @model_validator(mode="after")
     def _rates(self) -> Self:

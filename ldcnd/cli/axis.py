@@ -181,7 +181,7 @@ def reset(target: Target, axis: str) -> None:
 @click.argument("axis")
 @with_target
 def profile(target: Target, axis: str) -> None:
-    """Show how the drive of AXIS is taken to behave, doubtful items with their standing."""
+    """Show how the drive of AXIS is taken to behave, assumptions with their verification."""
     reply = target.run(lambda client: client.command(axis, Verb.READ_PROFILE, ReadProfileRequest()))
     if not isinstance(reply, DriveProfile):
         raise NotSupported(f"axis {axis} has no profile", axis=axis)
@@ -189,9 +189,9 @@ def profile(target: Target, axis: str) -> None:
     target.show(reply, f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}")
     if target.as_json:
         return
-    for doubt in reply.doubts:
-        setting = f" = {doubt.setting}" if doubt.setting else ""
-        print(f"  {doubt.standing:14} [{doubt.confidence:6}] {doubt.key}{setting}: {doubt.question}")
+    for each in reply.assumptions:
+        setting = f" = {each.setting}" if each.setting else ""
+        print(f"  {each.verification:14} [{each.confidence:6}] {each.key}{setting}: {each.question}")
 
 
 @command.command()

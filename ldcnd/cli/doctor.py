@@ -39,8 +39,8 @@ def smartstep(config: Path, name: str, *, as_json: bool) -> None:
     def show(finding: Finding) -> None:
         nonlocal wrong
         wrong = wrong or finding.verdict is Verdict.WRONG
-        doubt = f"  [{finding.settles}]" if finding.settles else ""
-        text = f"{finding.axis:8} {finding.verdict:5} {finding.what:16} {finding.text}{doubt}"
+        assumption = f"  [{finding.verifies}]" if finding.verifies else ""
+        text = f"{finding.axis:8} {finding.verdict:5} {finding.what:16} {finding.text}{assumption}"
         print(finding.model_dump_json() if as_json else text, flush=True)
 
     asyncio.run(examine_line(rig, settings, show))

@@ -161,12 +161,12 @@ def _summary(trace: Trace) -> list[str]:
     if header.drive:
         lines.append(f"words taken as {header.drive.word_layout}, {header.drive.byte_order} byte first")
         lines += [
-            f"assumed [{doubt.confidence}]: {doubt.question}"
-            for doubt in header.drive.assumptions
-            if doubt.standing == "assumed"
+            f"assumed [{assumption.confidence}]: {assumption.question}"
+            for assumption in header.drive.assumptions
+            if assumption.verification == "assumed"
         ]
     if header.problem:
-        lines.append(f"doubtful: {header.problem}")
+        lines.append(f"uncertain: {header.problem}")
     return lines
 
 

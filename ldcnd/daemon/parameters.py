@@ -83,7 +83,7 @@ class Parameters:
                     model=self._driver.spec.model,
                     identity=self._driver.identity,
                     self_hearing=access.self_hearing,
-                    doubts=access.doubts(),
+                    assumptions=access.assumptions(),
                 )
             case _:
                 raise NotSupported(f"axis {axis}: {verb} is not for parameters", axis=axis, value=verb.value)

@@ -94,8 +94,8 @@ def _profile(settings: BusConfig, axis: AxisConfig) -> SmartStepProfile:
         alarm_output_high=unit.alarm_output_high,
     )
     profile = unit.trace.assumed_of(profile)
-    for key, standing in unit.settled.items():
-        profile = profile.settled(key, standing)
+    for key, verification in unit.verified.items():
+        profile = profile.verified(key, verification)
     return profile
 
 

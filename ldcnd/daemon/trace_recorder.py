@@ -201,7 +201,7 @@ class TraceRecorder:
         """Publish the samples, then the header that says that they are there."""
         header = trace.header
         t, t_error_ns = self._clock.stamp_between(recorded.zero_from_s, recorded.zero_until_s)
-        quality = Quality.UNCERTAIN if recorded.doubts else Quality.GOOD
+        quality = Quality.UNCERTAIN if recorded.problems else Quality.GOOD
         size = _samples_per_chunk(len(recorded.values) + len(recorded.raw))
         firsts = range(0, len(recorded.offsets_ns), size)
         for index, first in enumerate(firsts):
@@ -225,7 +225,7 @@ class TraceRecorder:
             "t_error_ns": t_error_ns,
             "quality": quality,
             "phase": TracePhase.COMPLETE,
-            "problem": "; ".join(recorded.doubts) or None,
+            "problem": "; ".join(recorded.problems) or None,
             "samples": len(recorded.offsets_ns),
             "trigger_index": recorded.trigger_index,
             "missed": recorded.missed,

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from ldcnd.model.parameters import AlarmEntry, CounterName, DoubtInfo, ParameterInfo, ParameterValue
+from ldcnd.model.parameters import AlarmEntry, AssumptionInfo, CounterName, ParameterInfo, ParameterValue
 from ldcnd.model.requests import WriteParameterRequest
 
 
@@ -69,7 +69,7 @@ class ParameterAccess(ABC):
         """Read the present alarm and the history."""
 
     @abstractmethod
-    def doubts(self) -> tuple[DoubtInfo, ...]:
+    def assumptions(self) -> tuple[AssumptionInfo, ...]:
         """Return what is not certain about the drive."""
 
     @property

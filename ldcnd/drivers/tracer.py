@@ -69,7 +69,7 @@ class Recorded:
         trigger_index: the sample that fired the trigger; None without one.
         missed: polls that brought no sample.
         drive: settings and assumptions of a drive's own recorder.
-        doubts: what makes the values doubtful.
+        problems: why the values are uncertain; empty when they are good.
     """
 
     offsets_ns: tuple[int, ...]
@@ -80,7 +80,7 @@ class Recorded:
     trigger_index: int | None = None
     missed: int = 0
     drive: DriveTraceInfo | None = None
-    doubts: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
 
 
 class ArmedTrace(ABC):

@@ -153,5 +153,5 @@ class Finding(Frozen):
     """What the result means."""
     text: str
     """The result, for a person."""
-    settles: str | None = None
-    """The doubt of the drive's profile that it says something about."""
+    verifies: str | None = None
+    """The assumption of the drive's profile that it says something about."""

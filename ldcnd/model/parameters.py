@@ -37,7 +37,7 @@ class ParameterInfo(Frozen):
     name: str
     """The manual's name."""
     unit: str | None
-    """Null where it has none, or nobody knows."""
+    """Null where it has none, or it is not known."""
     lowest: int | None
     """Lower end of the range; a hint, the drive itself refuses what it does not take."""
     highest: int | None
@@ -47,7 +47,7 @@ class ParameterInfo(Frozen):
     digits: bool
     """Four separate settings, to be read as hexadecimal digits."""
     power_cycle: bool | None
-    """A change takes effect at the next power-on only; null where nobody knows."""
+    """A change takes effect at the next power-on only; null where it is not known."""
     confidence: str | None
     """Where range and unit come from: S the manual, X a related drive, M recollection; null where nothing is known."""
 
@@ -126,7 +126,7 @@ class AlarmReport(CommandReply):
     """Ten entries, the newest first as far as is known."""
 
 
-class DoubtInfo(Frozen):
+class AssumptionInfo(Frozen):
     """Something about a drive that its manual leaves open."""
 
     key: str
@@ -135,8 +135,8 @@ class DoubtInfo(Frozen):
     """What is assumed or asked."""
     confidence: str
     """Where the assumption comes from, by the marks of the reference page."""
-    standing: str
-    """What a bench has said: assumed, bench_verified or contradicted."""
+    verification: str
+    """What a test on the drive has said: assumed, verified or contradicted."""
     setting: str | None
     """What the profile assumes; null where it has no switch for it."""
 
@@ -150,7 +150,7 @@ class DriveProfile(CommandReply):
     """What the drive said it is; null while it has not answered."""
     self_hearing: bool
     """The drive takes its own replies for commands: nothing may be written on such wires."""
-    doubts: tuple[DoubtInfo, ...]
+    assumptions: tuple[AssumptionInfo, ...]
     """All that is not certain."""
 
 
@@ -229,7 +229,7 @@ class ReadAlarms(AxisCommand[AlarmReport]):
 
 
 class ReadProfile(AxisCommand[DriveProfile]):
-    """Tell how the drive is taken to behave, doubts included; asks nothing of the drive."""
+    """Tell how the drive is taken to behave, assumptions included; asks nothing of the drive."""
 
     verb = Verb.READ_PROFILE
     effect = Effect.QUESTION

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Verb
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.parameters import DoubtInfo
+from ldcnd.model.parameters import AssumptionInfo
 from ldcnd.model.samples import Sample
 
 MOST_CHANNELS = 8
@@ -131,8 +131,8 @@ class DriveTraceInfo(Frozen):
     """Where the bits of 5004H come from: none or configured."""
     command_pulse_gear: str
     """Which way command pulses were taken to be geared."""
-    assumptions: tuple[DoubtInfo, ...]
-    """The doubts of the drive's profile that bear on a trace."""
+    assumptions: tuple[AssumptionInfo, ...]
+    """The assumptions of the drive's profile that bear on a trace."""
 
 
 class TraceHeader(Sample):
@@ -147,7 +147,7 @@ class TraceHeader(Sample):
     phase: TracePhase
     """How far it is."""
     problem: str | None = None
-    """Why it was not completed, or what makes its values doubtful."""
+    """Why it was not completed, or why its values are uncertain."""
     channels: tuple[TraceChannel, ...]
     """The columns of `values` in each chunk."""
     interval_s: float = Field(ge=0)

@@ -17,7 +17,7 @@ PAGES = {
     "scope": "Live",
     "trace/sim/x": "Record x",
     "tuning/sim/x": "Test move",
-    "parameters/mixed/feed": "Alarms and doubts",
+    "parameters/mixed/feed": "Alarms and assumptions",
     "network": "sim · line0",
     "events": "Commands and how they ended",
 }

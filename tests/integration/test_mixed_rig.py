@@ -208,13 +208,13 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
     assert position.counts == 0
 
 
-async def test_the_profile_tells_its_doubts(tmp_path):
+async def test_the_profile_lists_its_assumptions(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         reply = await rig.client.command("feed", Verb.READ_PROFILE, ReadProfileRequest())
 
     assert isinstance(reply, DriveProfile)
-    doubts = {doubt.key: doubt for doubt in reply.doubts}
-    assert (doubts["run_active_low"].standing, doubts["run_active_low"].setting) == ("assumed", "True")
+    assumptions = {assumption.key: assumption for assumption in reply.assumptions}
+    assert (assumptions["run_active_low"].verification, assumptions["run_active_low"].setting) == ("assumed", "True")
 
 
 async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):

@@ -86,7 +86,9 @@ def check_against_record(trace, points, layout):
     assert trace.values[0][99] < 100.0 <= trace.values[0][100]
     assert {later - earlier for earlier, later in pairwise(trace.offsets_ns)} == {4_000_000}
     assert info.word_layout == layout.value
-    assert {"trace_word_layout", "trace_byte_order", "trigger_word"} <= {doubt.key for doubt in info.assumptions}
+    assert {"trace_word_layout", "trace_byte_order", "trigger_word"} <= {
+        assumption.key for assumption in info.assumptions
+    }
 
 
 @pytest.mark.parametrize(
@@ -157,7 +159,7 @@ async def test_unknown_layout_leaves_words_undecoded():
     assert trace.header.channels[0].unit == ""
 
 
-async def test_values_that_cannot_be_make_the_layout_doubtful():
+async def test_values_that_cannot_be_make_the_layout_uncertain():
     async with trace_rig(assumed={"word_layout": TraceWordLayout.LSB_IO_SHIFT}) as under_test:
         under_test.pulses(-8_000.0)
         trace = await take_trace(under_test.rig.client, "feed", TraceRequest(channels=("speed_feedback",)), within_s=60)

@@ -2,35 +2,35 @@ import dataclasses
 
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import DOUBTS, SMARTSTEP, Doubt, SmartStepProfile, Standing
+from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, SMARTSTEP, Assumption, SmartStepProfile, Verification
 from ldcnd.errors import ConfigError
 
 WITHOUT_SWITCH = {"unit_digit", "switches_rule", "untriggered_start", "alarm_history_order"}
 
 
-def test_every_doubt_starts_as_an_assumption_under_its_own_key():
-    assert all(doubt.standing is Standing.ASSUMED for doubt in DOUBTS)
-    assert len({doubt.key for doubt in DOUBTS}) == len(DOUBTS)
+def test_every_assumption_starts_unverified_under_its_own_key():
+    assert all(assumption.verification is Verification.ASSUMED for assumption in ASSUMPTIONS)
+    assert len({assumption.key for assumption in ASSUMPTIONS}) == len(ASSUMPTIONS)
 
 
-def test_every_doubt_with_a_switch_is_a_field_of_the_profile():
+def test_every_assumption_with_a_switch_is_a_field_of_the_profile():
     fields = {field.name for field in dataclasses.fields(SmartStepProfile)}
 
-    assert {doubt.key for doubt in DOUBTS} - fields == WITHOUT_SWITCH
+    assert {assumption.key for assumption in ASSUMPTIONS} - fields == WITHOUT_SWITCH
 
 
-def standing_of(profile: SmartStepProfile, key: str) -> Doubt:
-    return next(doubt for doubt in profile.doubts if doubt.key == key)
+def assumption_of(profile: SmartStepProfile, key: str) -> Assumption:
+    return next(assumption for assumption in profile.assumptions if assumption.key == key)
 
 
-def test_bench_settles_one_doubt_and_leaves_the_others():
-    profile = SMARTSTEP.settled("trace_word_layout", Standing.BENCH_VERIFIED)
+def test_verifying_one_assumption_leaves_the_others():
+    profile = SMARTSTEP.verified("trace_word_layout", Verification.VERIFIED)
 
-    assert standing_of(profile, "trace_word_layout").standing is Standing.BENCH_VERIFIED
-    assert standing_of(profile, "string_checksum").standing is Standing.ASSUMED
-    assert standing_of(SMARTSTEP, "trace_word_layout").standing is Standing.ASSUMED
+    assert assumption_of(profile, "trace_word_layout").verification is Verification.VERIFIED
+    assert assumption_of(profile, "string_checksum").verification is Verification.ASSUMED
+    assert assumption_of(SMARTSTEP, "trace_word_layout").verification is Verification.ASSUMED
 
 
-def test_unknown_doubt_is_refused_with_the_known_ones():
+def test_unknown_assumption_is_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match="string_checksum"):
-        SMARTSTEP.settled("weather", Standing.CONTRADICTED)
+        SMARTSTEP.verified("weather", Verification.CONTRADICTED)

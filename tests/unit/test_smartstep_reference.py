@@ -9,7 +9,7 @@ from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
 from ldcnd.drivers.smartstep.monitors import ALARMS, MONITORS
 from ldcnd.drivers.smartstep.packet import ResponseStatus
 from ldcnd.drivers.smartstep.parameters import PARAMETERS, Fact, Parameter
-from ldcnd.drivers.smartstep.profiles import DOUBTS, Confidence
+from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Confidence
 from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject
 
 ROOT = Path(__file__).parents[2]
@@ -89,9 +89,9 @@ def test_page_lists_the_trace_code(code):
     assert has_row(f"{code.value:02X}H", code.name)
 
 
-@pytest.mark.parametrize("doubt", DOUBTS, ids=lambda doubt: doubt.key)
-def test_page_lists_the_doubt_with_its_confidence(doubt):
-    assert has_row(doubt.key, doubt.question, doubt.confidence.value)
+@pytest.mark.parametrize("assumption", ASSUMPTIONS, ids=lambda assumption: assumption.key)
+def test_page_lists_the_assumption_with_its_confidence(assumption):
+    assert has_row(assumption.key, assumption.question, assumption.confidence.value)
 
 
 def test_every_row_of_every_table_names_its_test():

@@ -81,7 +81,7 @@ def test_half_a_word_is_bad():
         split_words(b"\x00\x01\x02", ByteOrder.BIG)
 
 
-def test_value_beyond_full_scale_makes_the_layout_doubtful():
+def test_value_beyond_full_scale_makes_the_layout_uncertain():
     assert not is_beyond_full_scale([TracePoint(15_000, None), TracePoint(-15_000, None)])
     assert is_beyond_full_scale([TracePoint(-15_001, None)])
 

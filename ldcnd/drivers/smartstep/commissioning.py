@@ -1,4 +1,4 @@
-"""Examining one drive by reading only: is it alive, what is it, how are its wires, which doubts can be settled.
+"""Examining one drive by reading only: is it alive, what is it, how are its wires, which assumptions can be verified.
 
 Reads at even addresses and even counts only: what a drive does with odd ones is not known. Run it with RUN off.
 Source: manual 2 to 6; the order goes from what no drive can take amiss to what asks most of it.
@@ -63,9 +63,9 @@ class Examination:
         self._unit = unit
         self._words = unit.words
 
-    def finding(self, what: str, verdict: Verdict, text: str, settles: str | None = None) -> Finding:
+    def finding(self, what: str, verdict: Verdict, text: str, verifies: str | None = None) -> Finding:
         """Return a finding about this drive."""
-        return Finding(axis=self._unit.spec.name, what=what, verdict=verdict, text=text, settles=settles)
+        return Finding(axis=self._unit.spec.name, what=what, verdict=verdict, text=text, verifies=verifies)
 
     async def alive(self) -> Finding:
         """Ask for an address that never exists: the known error reply proves drive, line and unit number."""

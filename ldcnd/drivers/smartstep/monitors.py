@@ -145,17 +145,17 @@ def driver_type(word: int) -> DriverType | int:
 
 
 def run_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
-    """Tell whether RUN asks for servo-on; which level does is a doubt of the profile."""
+    """Tell whether RUN asks for servo-on; which level does is an assumption of the profile."""
     return bool(levels & InputSignal.RUN) is not profile.run_active_low
 
 
 def reset_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
-    """Tell whether RESET asks for an alarm reset; which level does is a doubt of the profile."""
+    """Tell whether RESET asks for an alarm reset; which level does is an assumption of the profile."""
     return bool(levels & InputSignal.RESET) is not profile.reset_active_low
 
 
 def alarm_is_out(profile: SmartStepProfile, levels: OutputSignal) -> bool:
-    """Tell whether /ALM says alarm; which level does is a doubt of the profile."""
+    """Tell whether /ALM says alarm; which level does is an assumption of the profile."""
     return bool(levels & OutputSignal.ALM) is profile.alarm_output_high
 
 

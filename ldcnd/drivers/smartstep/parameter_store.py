@@ -23,7 +23,7 @@ from ldcnd.drivers.smartstep.parameters import (
     unit_number,
     unlisted_parameter,
 )
-from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile, doubt_info
+from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile, assumption_info
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.errors import (
     AddressRefused,
@@ -37,7 +37,7 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.log import get_logger
-from ldcnd.model.parameters import AlarmEntry, CounterName, DoubtInfo, Memory, ParameterInfo, ParameterValue
+from ldcnd.model.parameters import AlarmEntry, AssumptionInfo, CounterName, Memory, ParameterInfo, ParameterValue
 from ldcnd.model.requests import WriteParameterRequest
 
 log = get_logger("smartstep")
@@ -301,9 +301,9 @@ class UnitParameters(ParameterAccess):
         history = [_entry(await self._words.read(Register.ALARM_HISTORY + place)) for place in range(HISTORY_LENGTH)]
         return present, tuple(history)
 
-    def doubts(self) -> tuple[DoubtInfo, ...]:
+    def assumptions(self) -> tuple[AssumptionInfo, ...]:
         """See `ParameterAccess`."""
-        return tuple(doubt_info(self._profile, doubt) for doubt in self._profile.doubts)
+        return tuple(assumption_info(self._profile, each) for each in self._profile.assumptions)
 
 
 def _entry(word: int) -> AlarmEntry:

@@ -1,17 +1,15 @@
-"""What is not certain about a SmartStep, as switches, and how certain each default is.
+"""What the manual leaves open about a SmartStep: assumptions as switches, with the confidence of each default.
 
-The manual lost its figures and has misprints; a profile says how one drive is taken to behave, and each switch that
-rests on inference is listed as a doubt, to be settled on a bench.
+The manual lost its figures and has misprints. A profile says how one drive is taken to behave; each switch that rests
+on inference is an assumption with a name, a default, and a way to verify it on the drive.
 Source: manual, all chapters; where it is silent, public manuals of related drives.
-
-Doubts about a drive, as clients see them.
 """
 
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum
 
 from ldcnd.errors import ConfigError
-from ldcnd.model.parameters import DoubtInfo
+from ldcnd.model.parameters import AssumptionInfo
 
 
 class Confidence(Enum):
@@ -31,11 +29,11 @@ class Confidence(Enum):
     OPEN = "?"
 
 
-class Standing(StrEnum):
-    """What a bench has said about a doubt."""
+class Verification(StrEnum):
+    """What a test on the drive has said about an assumption."""
 
     ASSUMED = "assumed"
-    BENCH_VERIFIED = "bench_verified"
+    VERIFIED = "verified"
     CONTRADICTED = "contradicted"
 
 
@@ -136,7 +134,7 @@ class TriggerMap:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class Assumption:
     """One uncertain item.
 
     Attributes:
@@ -147,33 +145,33 @@ class Doubt:
     key: str
     question: str
     confidence: Confidence
-    standing: Standing = Standing.ASSUMED
+    verification: Verification = Verification.ASSUMED
 
 
-DOUBTS: tuple[Doubt, ...] = (
-    Doubt("framing", "does the adapter make 7E1 characters, or ldcnd", Confidence.STATED),
-    Doubt("wiring", "four wires; does a drive on two hear itself", Confidence.STATED),
-    Doubt("echo", "does the host hear its own characters", Confidence.INFERRED_HIGH),
-    Doubt(
+ASSUMPTIONS: tuple[Assumption, ...] = (
+    Assumption("framing", "does the adapter make 7E1 characters, or ldcnd", Confidence.STATED),
+    Assumption("wiring", "four wires; does a drive on two hear itself", Confidence.STATED),
+    Assumption("echo", "does the host hear its own characters", Confidence.INFERRED_HIGH),
+    Assumption(
         "first_character_s", "0.2 s run from the command's CR to the first reply character", Confidence.INFERRED_MEDIUM
     ),
-    Doubt("string_checksum", "the header alone is covered", Confidence.INFERRED_MEDIUM),
-    Doubt("string_count_unit", "the count counts bytes of memory", Confidence.INFERRED_HIGH),
-    Doubt("trace_chunk_bytes", "the longest string is not given", Confidence.OPEN),
-    Doubt("trace_word_layout", "bit 15 is the I/O bit, the value has 15 bits", Confidence.INFERRED_MEDIUM),
-    Doubt("trace_byte_order", "the high byte comes first", Confidence.INFERRED_HIGH),
-    Doubt("trigger_word", "0000H means no trigger; other bits unknown", Confidence.INFERRED_HIGH),
-    Doubt("command_pulse_gear", "numerator over denominator", Confidence.INFERRED_MEDIUM),
-    Doubt("encoder_counts_per_rev", "8000, from the printed speed formula", Confidence.STATED),
-    Doubt("run_active_low", "RUN is on while its bit is 0", Confidence.INFERRED_MEDIUM),
-    Doubt("reset_active_low", "RESET is on while its bit is 0", Confidence.INFERRED_MEDIUM),
-    Doubt("alarm_output_high", "/ALM is 1 in alarm", Confidence.INFERRED_MEDIUM),
-    Doubt("eeprom_changes_ram", "does an EEPROM write change the RAM value at once", Confidence.OPEN),
-    Doubt("unit_digit", "Pn000.2 is bits 11 to 8", Confidence.INFERRED_HIGH),
-    Doubt("switches_rule", "switch 6 off: switches overrule parameters", Confidence.RECOLLECTED),
-    Doubt("atomic_counter", "a string reference reads both counter halves at one instant", Confidence.OPEN),
-    Doubt("untriggered_start", "an untriggered trace starts at point 0", Confidence.INFERRED_HIGH),
-    Doubt("alarm_history_order", "history entry 0 is the newest", Confidence.INFERRED_MEDIUM),
+    Assumption("string_checksum", "the header alone is covered", Confidence.INFERRED_MEDIUM),
+    Assumption("string_count_unit", "the count counts bytes of memory", Confidence.INFERRED_HIGH),
+    Assumption("trace_chunk_bytes", "the longest string is not given", Confidence.OPEN),
+    Assumption("trace_word_layout", "bit 15 is the I/O bit, the value has 15 bits", Confidence.INFERRED_MEDIUM),
+    Assumption("trace_byte_order", "the high byte comes first", Confidence.INFERRED_HIGH),
+    Assumption("trigger_word", "0000H means no trigger; other bits unknown", Confidence.INFERRED_HIGH),
+    Assumption("command_pulse_gear", "numerator over denominator", Confidence.INFERRED_MEDIUM),
+    Assumption("encoder_counts_per_rev", "8000, from the printed speed formula", Confidence.STATED),
+    Assumption("run_active_low", "RUN is on while its bit is 0", Confidence.INFERRED_MEDIUM),
+    Assumption("reset_active_low", "RESET is on while its bit is 0", Confidence.INFERRED_MEDIUM),
+    Assumption("alarm_output_high", "/ALM is 1 in alarm", Confidence.INFERRED_MEDIUM),
+    Assumption("eeprom_changes_ram", "does an EEPROM write change the RAM value at once", Confidence.OPEN),
+    Assumption("unit_digit", "Pn000.2 is bits 11 to 8", Confidence.INFERRED_HIGH),
+    Assumption("switches_rule", "switch 6 off: switches overrule parameters", Confidence.RECOLLECTED),
+    Assumption("atomic_counter", "a string reference reads both counter halves at one instant", Confidence.OPEN),
+    Assumption("untriggered_start", "an untriggered trace starts at point 0", Confidence.INFERRED_HIGH),
+    Assumption("alarm_history_order", "history entry 0 is the newest", Confidence.INFERRED_MEDIUM),
 )
 
 
@@ -219,32 +217,34 @@ class SmartStepProfile:
     alarm_output_high: bool = True
     atomic_counter: bool = False
     eeprom_changes_ram: bool | None = None
-    doubts: tuple[Doubt, ...] = DOUBTS
+    assumptions: tuple[Assumption, ...] = ASSUMPTIONS
 
-    def settled(self, key: str, standing: Standing) -> "SmartStepProfile":
-        """Return this profile with a bench's verdict on one doubt.
+    def verified(self, key: str, verification: Verification) -> "SmartStepProfile":
+        """Return this profile with the result of a test on the drive.
 
         Raises:
-            ConfigError: no doubt has this key.
+            ConfigError: no assumption has this key.
         """
-        if all(doubt.key != key for doubt in self.doubts):
-            known = ", ".join(doubt.key for doubt in self.doubts)
-            raise ConfigError(f"there is no doubt {key!r}; there are {known}", value=key)
-        doubts = tuple(replace(doubt, standing=standing) if doubt.key == key else doubt for doubt in self.doubts)
-        return replace(self, doubts=doubts)
+        if all(assumption.key != key for assumption in self.assumptions):
+            known = ", ".join(assumption.key for assumption in self.assumptions)
+            raise ConfigError(f"there is no assumption {key!r}; there are {known}", value=key)
+        assumptions = tuple(
+            replace(each, verification=verification) if each.key == key else each for each in self.assumptions
+        )
+        return replace(self, assumptions=assumptions)
 
 
 SMARTSTEP = SmartStepProfile()
 
 
-def doubt_info(profile: SmartStepProfile, doubt: Doubt) -> DoubtInfo:
-    """Describe one doubt and what the profile assumes."""
-    return DoubtInfo(
-        key=doubt.key,
-        question=doubt.question,
-        confidence=doubt.confidence.value,
-        standing=doubt.standing.value,
-        setting=_setting(profile, doubt.key),
+def assumption_info(profile: SmartStepProfile, assumption: Assumption) -> AssumptionInfo:
+    """Describe one assumption and what the profile assumes."""
+    return AssumptionInfo(
+        key=assumption.key,
+        question=assumption.question,
+        confidence=assumption.confidence.value,
+        verification=assumption.verification.value,
+        setting=_setting(profile, assumption.key),
     )
 
 

@@ -85,7 +85,7 @@ def join_words(words: Sequence[int], order: ByteOrder) -> bytes:
 
 
 def is_beyond_full_scale(points: Sequence[TracePoint]) -> bool:
-    """Tell whether torque or speed points are larger than the drive can mean: the assumed layout is doubtful."""
+    """Tell whether torque or speed points are larger than the drive can mean: then the assumed layout is wrong."""
     return any(abs(point.value) > FULL_SCALE for point in points)
 
 

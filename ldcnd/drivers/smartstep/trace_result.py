@@ -15,7 +15,7 @@ from ldcnd.drivers.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
     TriggerWordSource,
-    doubt_info,
+    assumption_info,
 )
 from ldcnd.drivers.smartstep.trace_data import (
     FULL_SCALE,
@@ -151,7 +151,7 @@ BEARING = (
     "encoder_counts_per_rev",
     "untriggered_start",
 )
-"""The doubts that bear on a trace."""
+"""The assumptions that bear on a trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +227,7 @@ def recorded(
         raw=words,
         trigger_index=None if memory.trigger_address is None else zero,
         drive=_info(profile, constants, assignment, settings, memory),
-        doubts=tuple(_doubts(profile, assignment, points)),
+        problems=tuple(_problems(profile, assignment, points)),
     )
 
 
@@ -240,7 +240,9 @@ def _column(
     return tuple(point.value * factor for point in points)
 
 
-def _doubts(profile: SmartStepProfile, assignment: Assignment, points: tuple[tuple[TracePoint, ...], ...]) -> list[str]:
+def _problems(
+    profile: SmartStepProfile, assignment: Assignment, points: tuple[tuple[TracePoint, ...], ...]
+) -> list[str]:
     """Say what cannot be if the words are laid out as assumed."""
     if profile.trace_word_layout is TraceWordLayout.RAW:
         return []
@@ -280,5 +282,5 @@ def _info(
         string_count_unit=profile.string_count_unit.value,
         trigger_word_source=memory.trigger_word_source.value,
         command_pulse_gear=profile.command_pulse_gear.value,
-        assumptions=tuple(doubt_info(profile, doubt) for doubt in profile.doubts if doubt.key in BEARING),
+        assumptions=tuple(assumption_info(profile, each) for each in profile.assumptions if each.key in BEARING),
     )

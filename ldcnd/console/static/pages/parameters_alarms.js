@@ -12,12 +12,12 @@ const LEVELS = { alarm: "bad", warning: "warn", unknown: "warn" };
 export function AlarmPanel({ axis }) {
   const [report, setReport] = useState(null);
   const [profile, setProfile] = useState(null);
-  return html`<${Panel} title="Alarms and doubts">
+  return html`<${Panel} title="Alarms and assumptions">
     <p class="row">
       <${Action} act=${() => command(axis, "read_alarms")} onDone=${setReport}
         obstacle=${obstacle(axis, "parameters")}>Read alarms<//>
       <${Action} act=${() => command(axis, "read_profile")} onDone=${setProfile}
-        obstacle=${obstacle(axis, "none")}>Show doubts<//>
+        obstacle=${obstacle(axis, "none")}>Show assumptions<//>
     </p>
     ${
       report &&
@@ -31,11 +31,11 @@ export function AlarmPanel({ axis }) {
     }
     ${
       profile &&
-      html`<${Table} label="Doubts" head=${["Doubt", "What is assumed or asked", "Assumed", "From", "Standing"]}
-      rows=${profile.doubts.map(
-        (doubt) => html`<tr>
-        <th scope="row">${words(doubt.key)}</th><td>${doubt.question}</td><td>${doubt.setting ?? "–"}</td><td>${doubt.confidence}</td>
-        <td><${Mark} level=${doubt.standing === "contradicted" ? "bad" : ""}>${words(doubt.standing)}<//></td></tr>`,
+      html`<${Table} label="Assumptions" head=${["Assumption", "What is assumed or asked", "Assumed", "From", "Verification"]}
+      rows=${profile.assumptions.map(
+        (assumption) => html`<tr>
+        <th scope="row">${words(assumption.key)}</th><td>${assumption.question}</td><td>${assumption.setting ?? "–"}</td><td>${assumption.confidence}</td>
+        <td><${Mark} level=${assumption.verification === "contradicted" ? "bad" : ""}>${words(assumption.verification)}<//></td></tr>`,
       )} />`
     }
   <//>`;
