@@ -4,12 +4,15 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from itertools import count
+from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError, LeaseExpired, OutcomeUnknown, SessionError
+from ldcnd.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError
 from ldcnd.model.authority import AcquireRequest, LeaseReply, LeaseRequest
 from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import Request, Verb
+
+RequestT = TypeVar("RequestT", bound=Request)
 
 RENEWALS_PER_LEASE = 4
 """So many renewals may be lost before a lease ends."""
@@ -36,27 +39,38 @@ class Control:
             LeaseExpired: the lease was lost.
             LdcndError: as the daemon refused it.
         """
+        return await self._client.command(axis, verb, self.stamped(request, axis), timeout_s)
+
+    def stamped(self, request: RequestT, axis: str) -> RequestT:
+        """Return a request for an axis under the lease, with the next sequence number.
+
+        Raises:
+            LeaseExpired: the lease was lost.
+        """
         if self.lost:
             raise LeaseExpired(f"control was lost: {self.lost.message}", axis=axis, remedy="acquire it again")
-        stamped = request.model_copy(update={"lease": self.lease.lease, "sequence": next(self._sequence)})
-        return await self._client.command(axis, verb, stamped, timeout_s)
+        return request.model_copy(update={"lease": self.lease.lease, "sequence": next(self._sequence)})
 
     async def keep(self) -> None:
-        """Renew until cancelled or until the daemon says that the lease has ended."""
+        """Renew until cancelled or until the lease has ended: by the daemon's word, or unrenewed for its duration."""
+        loop, lease_s = asyncio.get_running_loop(), self.lease.lease_s
+        until_s = loop.time() + lease_s
         while self.lost is None:
-            await asyncio.sleep(self.lease.lease_s / RENEWALS_PER_LEASE)
+            await asyncio.sleep(lease_s / RENEWALS_PER_LEASE)
+            asked_at_s = loop.time()
             try:
-                await self._client.rig_command(
-                    "renew", LeaseRequest(lease=self.lease.lease), LeaseReply, self.lease.lease_s
-                )
-            except LeaseExpired as error:
+                await self._client.rig_command("renew", LeaseRequest(lease=self.lease.lease), LeaseReply, lease_s)
+            except (LeaseExpired, LeaseUnknown) as error:
                 self.lost = error
-            except LdcndError:
-                continue  # an answer was lost; the next renewal is due soon
+            except LdcndError as error:
+                if loop.time() >= until_s:  # until then an answer may have been lost; the next renewal is due soon
+                    self.lost = LeaseExpired(f"it could not be renewed for {lease_s:g} s: {error.message}")
+            else:
+                until_s = asked_at_s + lease_s
 
     async def release(self) -> None:
         """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told."""
-        with contextlib.suppress(LeaseExpired, OutcomeUnknown, SessionError):
+        with contextlib.suppress(LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError):
             await self._client.rig_command("release", LeaseRequest(lease=self.lease.lease), LeaseReply)
 
 

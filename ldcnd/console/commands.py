@@ -11,20 +11,22 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from ldcnd.client.rig_client import RigClient
+from ldcnd.console.control import PAGE_HEADER, page_of
 from ldcnd.console.errors import answering_errors
+from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
+from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
-from ldcnd.errors import LdcndError, MalformedRequest, PayloadTooLarge, UnknownVerb
-from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, decode, error_reply
+from ldcnd.errors import LdcndError, UnknownVerb
+from ldcnd.messaging.codec import Encoding, decode, error_reply
 from ldcnd.model.errors import ErrorReply
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.group_moves import AxisMove, MoveTogetherRequest
 from ldcnd.model.replies import StopReply
 from ldcnd.model.requests import REQUEST_MODELS, Verb
-from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
+from ldcnd.model.verbs import ACQUIRE, AXIS_QUESTIONS, RELEASE, RENEW, RIG_VERBS
+from ldcnd.model.why import WhyRequest
 
-BODY_TIME_S = 5.0
-"""A page has so long to send what it asks."""
 ANSWER_TIME_S = 5.0
 SLOW_VERBS_S: Mapping[str, float] = MappingProxyType(
     {
@@ -39,6 +41,8 @@ SLOW_VERBS_S: Mapping[str, float] = MappingProxyType(
 )
 """What takes many words with a slow drive."""
 STOP_TIME_S = 3.0
+LEASE_VERBS = frozenset({ACQUIRE, RENEW, RELEASE})
+"""A lease that no open page renews would let axes move unwatched; pages take control by `/api/rigs/RIG/control`."""
 
 
 class StopScope(Frozen):
@@ -78,43 +82,55 @@ class Envelope:
         return {name: value for name, value in written.items() if name in request or name in model.model_fields}
 
 
-def command_routes(rigs: Rigs) -> list[Route]:
+def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
     """Return what pages may POST."""
 
     async def axis_command(request: Request) -> Response:
         rig, axis, verb = (request.path_params[name] for name in ("rig", "axis", "verb"))
         client = rigs.client(rig)
-        body = await _body(request)
+        body = await body_of(request)
+        page = page_of(request, pages) if PAGE_HEADER in request.headers else None
         if verb in AXIS_QUESTIONS:
             asked = decode(AXIS_QUESTIONS[verb].request, body, Encoding.JSON)
-            return _json(await client.axis_question(axis, verb, asked, AXIS_QUESTIONS[verb].reply))
+            if isinstance(asked, WhyRequest) and page:
+                asked = asked.model_copy(update={"lease": page.lease(rig, axis)})
+            return json_reply(await client.axis_question(axis, verb, asked, AXIS_QUESTIONS[verb].reply))
         if verb not in set(Verb):
             raise _unknown(verb)
         model = REQUEST_MODELS[Verb(verb)]
-        envelope = Envelope(request.state.visitor.client, rigs.instance(rig))
+        envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
         meant = decode(model, envelope.around(body, model), Encoding.JSON)
-        return _json(await client.command(axis, Verb(verb), meant, SLOW_VERBS_S.get(verb, ANSWER_TIME_S)))
+        timeout_s = SLOW_VERBS_S.get(verb, ANSWER_TIME_S)
+        if page:
+            return json_reply(await page.command(rig, axis, Verb(verb), meant, timeout_s))
+        refuse_unwatched(axis, Verb(verb))
+        return json_reply(await client.command(axis, Verb(verb), meant, timeout_s))
 
     async def rig_command(request: Request) -> Response:
         rig, verb = (request.path_params[name] for name in ("rig", "verb"))
         client = rigs.client(rig)
-        if verb not in RIG_VERBS:
+        if verb not in RIG_VERBS or verb in LEASE_VERBS:
             raise _unknown(verb)
         models = RIG_VERBS[verb]
-        envelope = Envelope(request.state.visitor.client, rigs.instance(rig))
-        body = envelope.around(await _body(request), models.request)
-        return _json(await client.rig_command(verb, decode(models.request, body, Encoding.JSON), models.reply))
+        page = page_of(request, pages) if PAGE_HEADER in request.headers else None
+        envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
+        asked = decode(models.request, envelope.around(await body_of(request), models.request), Encoding.JSON)
+        if isinstance(asked, MoveTogetherRequest):
+            if page is None:
+                raise control_needed(asked.moves[0].axis)
+            return json_reply(await page.move_together(rig, asked))
+        return json_reply(await client.rig_command(verb, asked, models.reply))
 
     async def stop(request: Request) -> Response:
         client = rigs.client(request.path_params["rig"])
-        scope = decode(StopScope, await _body(request), Encoding.JSON)
-        return _json(await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client))
+        scope = decode(StopScope, await body_of(request), Encoding.JSON)
+        return json_reply(await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client))
 
     async def stop_all(request: Request) -> Response:
         who = request.state.visitor.client
         async with asyncio.TaskGroup() as group:
             stops = {rig: group.create_task(_stopped(rigs.client(rig), who), name=f"stop {rig}") for rig in rigs.names}
-        return _json(StopsReply(rigs={rig: task.result() for rig, task in stops.items()}))
+        return json_reply(StopsReply(rigs={rig: task.result() for rig, task in stops.items()}))
 
     routes = {
         "/api/stop": stop_all,
@@ -132,30 +148,5 @@ async def _stopped(client: RigClient, who: str) -> StopReply | ErrorReply:
         return error_reply(error)
 
 
-async def _body(request: Request) -> bytes:
-    """Return what a page has sent.
-
-    Raises:
-        PayloadTooLarge: it is longer than any request.
-        MalformedRequest: it did not come in time.
-    """
-    body = b""
-    try:
-        async with asyncio.timeout(BODY_TIME_S):
-            async for part in request.stream():
-                body += part
-                if len(body) > MAX_PAYLOAD_BYTES:
-                    raise PayloadTooLarge(
-                        f"the request has more than {MAX_PAYLOAD_BYTES} bytes", limit=MAX_PAYLOAD_BYTES
-                    )
-    except TimeoutError:
-        raise MalformedRequest(f"the request did not come within {BODY_TIME_S:g} s") from None
-    return body
-
-
 def _unknown(verb: str) -> UnknownVerb:
     return UnknownVerb(f"there is no command {verb[:40]!r}", value=verb[:40], remedy="see `commands` of the rig")
-
-
-def _json(reply: Frozen) -> Response:
-    return Response(reply.model_dump_json(), media_type="application/json")

@@ -51,6 +51,11 @@ class RigWatch:
         """The run of its daemon that was described last."""
         return self._reply.daemon.instance if self._reply.daemon else None
 
+    @property
+    def axes(self) -> frozenset[str]:
+        """The names of its axes, as it described itself last."""
+        return frozenset(each.axis for each in self._reply.axes)
+
     def daemon(self, instance: str, *, alive: bool) -> None:
         """Learn that a run of the daemon has come or gone."""
         (self._instances.add if alive else self._instances.discard)(instance)

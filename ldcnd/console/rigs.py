@@ -71,6 +71,10 @@ class Rigs:
         """Return the run of a rig's daemon that the console shows, or None before it was there."""
         return self._watch(rig).instance
 
+    def axes(self, rig: str) -> frozenset[str]:
+        """Return the names of a rig's axes, as it described itself last."""
+        return self._watch(rig).axes
+
     async def described(self) -> tuple[RigReply, ...]:
         """Return what the rigs are, by name; a wanted one that was never there too."""
         async with asyncio.TaskGroup() as group:

@@ -18,9 +18,11 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from ldcnd.console.commands import command_routes
+from ldcnd.console.control import control_routes
 from ldcnd.console.feed import Feed
 from ldcnd.console.gate import Gate
 from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.pages import Pages
 from ldcnd.console.reading import STATIC, reading_routes
 from ldcnd.console.replies import LinkReply
 from ldcnd.console.rigs import Rigs
@@ -37,7 +39,10 @@ SENT_BYTES = 64 * 1024
 UNREAD_MS = 30_000
 """The kernel gives up a page that takes nothing for so long."""
 LONGEST_MESSAGE_BYTES = 1024
-"""Pages have nothing to say on their WebSocket."""
+"""Pages have nothing to say on their web sockets."""
+PING_EACH_S = 1.0
+PONG_TIME_S = 4.0
+"""A browser answers for hidden pages, too; of one that does not answer for so long the pages are gone."""
 
 
 def build_app(
@@ -48,10 +53,12 @@ def build_app(
     async def link(_: Request) -> Response:
         return Response(LinkReply(link=new_link()).model_dump_json(), media_type="application/json")
 
+    pages = Pages(rigs)
     routes = [
         *reading_routes(rigs, feed, visitors),
+        *control_routes(pages),
         Route("/api/link", link, methods=["POST"]),
-        *command_routes(rigs),
+        *command_routes(rigs, pages),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
     return Gate(Starlette(routes=routes), visitors, settings.scheme, settings.known_hosts)
@@ -109,6 +116,8 @@ def _config(app: ASGIApp, settings: ConsoleSettings) -> uvicorn.Config:
         ws="websockets-sansio",
         ws_max_size=LONGEST_MESSAGE_BYTES,
         ws_per_message_deflate=False,
+        ws_ping_interval=PING_EACH_S,
+        ws_ping_timeout=PONG_TIME_S,
         lifespan="off",
         log_config=None,
         access_log=False,

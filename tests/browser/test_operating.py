@@ -1,5 +1,7 @@
 """What an operator does in the browser; each result is asked of the daemon, too."""
 
+import re
+
 import pytest
 
 from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply
@@ -36,9 +38,10 @@ async def test_an_axis_is_taken_enabled_and_moved_and_its_number_arrives(house):
         await desk.button("Enable").click()
         await house.sim.until("x", lambda state: state.enabled)
 
+        before = await house.sim.position("x")
         await desk.panel("Move").get_by_label("Position mm").fill("10")
         await expect(desk.panel("Move")).to_contain_text("Ends at 10.000 mm")
-        assert await house.sim.position("x") == pytest.approx(0, abs=0.05)  # a preview moves nothing
+        assert await house.sim.position("x") == pytest.approx(before, abs=0.05)  # a preview moves nothing
         await desk.button("Move").click()
 
         await expect(desk.page.get_by_label("Position", exact=True)).to_have_text("10.000")
@@ -146,15 +149,16 @@ async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
         await desk.button("Take control").click()
         await expect(desk.panel("Control")).to_contain_text("Held by this page")
 
-        taken = AcquireRequest(client="somebody else", axes=("c",), lease_s=60, force=True)
+        taken = AcquireRequest(client="another operator", axes=("c",), lease_s=60, force=True)
         lease = await house.sim.rig.rig_command("acquire", taken, LeaseReply)
 
-        await expect(desk.page.get_by_text("Control of c was lost")).to_be_visible()
-        await expect(desk.panel("Control")).to_contain_text("Held by somebody else")
+        await expect(desk.page.get_by_text("Control of c is lost")).to_be_visible()
+        await expect(desk.page).to_have_title(re.compile("^Control lost . Axis c"))
+        await expect(desk.panel("Control")).to_contain_text("Held by another operator")
         await expect(desk.button("Enable")).to_be_disabled()
-        await expect(desk.panel("Control")).to_contain_text("Control is held by somebody else")
+        await expect(desk.panel("Control")).to_contain_text("Control is held by another operator")
 
-        await desk.page.get_by_label("Take it from somebody else").check()
+        await desk.page.get_by_label("Take it from another operator").check()
         await desk.button("Take control").click()
         await expect(desk.panel("Control")).to_contain_text("Held by this page")
         assert (await holder(house.sim, "c")).startswith("console-")

@@ -10,7 +10,7 @@ from ldcnd.console import reading
 from ldcnd.model.axes import AxisState
 from ldcnd.model.events import EventList, EventsRequest
 from ldcnd.model.requests import TraceRequest
-from tests.support.console_rig import running_console
+from tests.support.console_rig import open_page, running_console
 
 X = "/api/rigs/sim/axes/x"
 RIG = "/api/rigs/sim/rig"
@@ -23,11 +23,13 @@ async def console():
 
 
 async def test_an_axis_is_powered_moved_and_arrives(console):
-    powered = await console.browser.post(f"{X}/power", {"on": True})
-    await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-    moved = await console.browser.post(f"{X}/move_absolute", {"position": 2.5})
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        powered = await page.post(f"{X}/power", {"on": True})
+        await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        moved = await page.post(f"{X}/move_absolute", {"position": 2.5})
 
-    arrived = await console.rig.client.wait_for_end("x", moved.document["command_id"])
+        arrived = await console.rig.client.wait_for_end("x", moved.document["command_id"])
 
     assert (powered.status, moved.status) == (200, 200)
     assert moved.document["position"] == 2.5
@@ -44,22 +46,23 @@ async def test_questions_about_an_axis_are_answered(console):
 
 
 async def test_commands_go_under_the_visitor_s_name_whatever_they_say(console):
-    await console.browser.post(f"{X}/power", {"on": True, "client": "somebody else"})
-    lease = await console.browser.post(f"{RIG}/acquire", {"client": "somebody else", "lease_s": 5})
+    await console.browser.post(f"{X}/power", {"on": True, "client": "another"})
 
     events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
     assert {event.client for event in events} == {"console-1"}
-    assert lease.document["client"] == "console-1"
 
 
-async def test_moves_together_go_under_the_visitor_s_name(console):
-    moves = [{"axis": axis, "position": 1.0, "client": "somebody else"} for axis in "xy"]
+async def test_moves_together_go_under_the_page_s_name_and_leases(console):
+    moves = [{"axis": axis, "position": 1.0, "client": "another"} for axis in "xy"]
 
-    await console.browser.post(f"{RIG}/move_together", {"moves": moves})
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x", "y")
+        answer = await page.post(f"{RIG}/move_together", {"moves": moves})
 
-    events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
+        events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
+    assert answer.document["code"] == "wrong_state"  # as the daemon says: nothing is enabled
     assert {event.axis for event in events} == {"x", "y"}
-    assert {event.client for event in events} == {"console-1"}
+    assert {event.client for event in events} == {page.client}
 
 
 async def test_a_command_is_meant_for_the_daemon_that_the_page_has_seen(console):
@@ -70,33 +73,17 @@ async def test_a_command_is_meant_for_the_daemon_that_the_page_has_seen(console)
     assert fresh.status == 200
 
 
-async def test_control_that_is_not_renewed_is_lost(console):
-    lease = (await console.browser.post(f"{RIG}/acquire", {"lease_s": 5})).document["lease"]
-    other = await console.enter()
-    meanwhile = await other.post(f"{X}/power", {"on": True})
-    renewed = await console.browser.post(f"{RIG}/renew", {"lease": lease})
-    await asyncio.sleep(6)
-
-    late = await console.browser.post(f"{RIG}/renew", {"lease": lease})
-    afterwards = await other.post(f"{X}/power", {"on": True})
-
-    assert (meanwhile.status, meanwhile.document["code"]) == (409, "lease_held")
-    assert renewed.status == 200
-    assert (late.status, late.document["code"]) == (409, "lease_expired")
-    assert afterwards.status == 200
-
-
 async def test_stops_need_no_lease_and_latch(console):
-    other = await console.enter()
-    await other.post(f"{RIG}/acquire", {"lease_s": 60})
+    async with open_page(console.app, await console.enter()) as other:
+        await other.take("sim", *"xyzc")
 
-    one = await console.browser.post("/api/rigs/sim/stop", {"axis": "x"})
-    every = await console.browser.post("/api/stop")
+        one = await console.browser.post("/api/rigs/sim/stop", {"axis": "x"})
+        every = await console.browser.post("/api/stop")
+        told = await latest_events(console.rig.client, 5)
 
     assert one.document["axes"] == ["x"]
     assert set(every.document["rigs"]["sim"]["axes"]) == {"x", "y", "z", "c"}
     assert (await console.rig.client.state("z")).stop_latched
-    told = await latest_events(console.rig.client, 5)
     assert [(event.axis, event.verb) for event in told] == [(axis, "stop") for axis in "xxyzc"]
     assert {event.client for event in told} == {"console-1"}
 
@@ -132,7 +119,7 @@ async def test_a_stop_overtakes_the_commands_before_it(console):
         ("/api/rigs/sim/axes/w/halt", b"{}", 404, "unknown_axis"),
         ("/api/rigs/none/axes/x/halt", b"{}", 404, "unknown_axis"),
         ("/api/rigs/none/stop", b"{}", 404, "unknown_axis"),
-        (f"{X}/move_absolute", b'{"position": 1.0}', 409, "wrong_state"),
+        (f"{X}/move_absolute", b'{"position": 1.0}', 409, "lease_required"),
         (f"{X}/read_alarms", b"{}", 409, "not_supported"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 from ldcnd.console import reading
 from ldcnd.console.feed import Feed
 from ldcnd.model.axes import AxisState
-from tests.support.console_rig import page, running_console
+from tests.support.console_rig import open_page, page, running_console
 
 
 @pytest.fixture
@@ -34,10 +34,14 @@ async def test_a_page_sees_rig_health_and_axes_at_once(console):
 
 
 async def test_a_page_sees_a_move_and_who_made_it(console):
-    async with page(console.app, console.browser, "?rate=20&stream=sim/x/position") as socket:
-        await console.browser.post("/api/rigs/sim/axes/x/power", {"on": True})
+    async with (
+        page(console.app, console.browser, "?rate=20&stream=sim/x/position") as socket,
+        open_page(console.app, console.browser) as mover,
+    ):
+        await mover.take("sim", "x")
+        await mover.post("/api/rigs/sim/axes/x/power", {"on": True})
         await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-        moved = (await console.browser.post("/api/rigs/sim/axes/x/move_absolute", {"position": 2.0})).document
+        moved = (await mover.post("/api/rigs/sim/axes/x/move_absolute", {"position": 2.0})).document
         seen = []
         async with asyncio.timeout(60):
             while not any(
@@ -48,7 +52,7 @@ async def test_a_page_sees_a_move_and_who_made_it(console):
 
     numbers = [sample["seq"] for path, sample in seen if path == "sim/tele/x/position"][1:]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-    assert {sample["client"] for path, sample in seen if path.endswith("event")} == {"console-1"}
+    assert {sample["client"] for path, sample in seen if path.endswith("event")} == {mover.client}
 
 
 async def test_a_page_that_says_anything_is_closed(console):

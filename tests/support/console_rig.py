@@ -1,6 +1,7 @@
 """A console in this process, in front of a daemon in this process: no HTTP, no Zenoh, on the jumping clock."""
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from ldcnd.console.visitors import Visitors
 from ldcnd.listen_address import ListenAddress
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from tests.support.browser import Browser, WebAnswer, WebQuestion, web_answer
+from tests.support.browser import Browser, JsonObject, WebAnswer, WebQuestion, web_answer
 from tests.support.rig import EPOCH_NS, RunningRig, running_rig
 
 ORIGIN = "http://127.0.0.1:8470"
@@ -98,7 +99,7 @@ class PageSocket:
                 self._answered.set()
             case "websocket.send":
                 await self._reads.wait()
-                self._frames.put_nowait(message["bytes"])
+                self._frames.put_nowait(message.get("bytes") or message["text"].encode())
             case "websocket.http.response.start":
                 self.status = message["status"]
             case "websocket.http.response.body":
@@ -109,12 +110,12 @@ class PageSocket:
 
 
 @asynccontextmanager
-async def page(app: ASGIApp, browser: Browser, query: str = "") -> AsyncIterator[PageSocket]:
+async def page(app: ASGIApp, browser: Browser, query: str = "", path: str = "/api/feed") -> AsyncIterator[PageSocket]:
     """Open a page's WebSocket; returns once it was let in or not."""
     socket = PageSocket()
     headers = browser.headers({"origin": browser.origin})
     scope = {
-        **_scope("websocket", f"/api/feed{query}", headers),
+        **_scope("websocket", f"{path}{query}", headers),
         "subprotocols": [],
         "extensions": {"websocket.http.response": {}},
     }
@@ -123,6 +124,44 @@ async def page(app: ASGIApp, browser: Browser, query: str = "") -> AsyncIterator
         await socket.answered()
         yield socket
         socket.leave()
+
+
+@dataclass(frozen=True, slots=True)
+class OpenPage:
+    """A page that can control axes.
+
+    Attributes:
+        name: what its commands carry.
+        client: who it is to the daemon.
+    """
+
+    name: str
+    client: str
+    socket: PageSocket
+    browser: Browser
+
+    async def post(self, path: str, body: JsonObject | bytes | None = None) -> WebAnswer:
+        """POST as this page."""
+        return await self.browser.forging(x_ldcnd_page=self.name).post(path, body)
+
+    async def take(self, rig: str, *axes: str) -> None:
+        """Take control."""
+        answer = await self.post(f"/api/rigs/{rig}/control", {"axes": list(axes)})
+        assert answer.status == 200, answer.document
+
+    async def told(self) -> JsonObject:
+        """Return the next message on its web socket."""
+        message = json.loads(await self.socket.frame())
+        assert isinstance(message, dict)
+        return message
+
+
+@asynccontextmanager
+async def open_page(app: ASGIApp, browser: Browser) -> AsyncIterator[OpenPage]:
+    """Open a page that can control axes; it has given up control when the context has ended."""
+    async with page(app, browser, path="/api/page") as socket:
+        hello = json.loads(await socket.frame())
+        yield OpenPage(hello["page"], hello["client"], socket, browser)
 
 
 @asynccontextmanager

@@ -12,7 +12,7 @@ import { TuningPage } from "./pages/tuning.js";
 import { problems } from "./parts/problems.js";
 import { Mark } from "./parts/state.js";
 import { StopAll } from "./parts/stop_all.js";
-import { controlled, keepControl, lost } from "./session/control.js";
+import { controlled, dismissLost, keepControl, lost } from "./session/control.js";
 import { feed } from "./session/feed.js";
 import { failure, rigs, useRigs, watch } from "./session/rigs.js";
 
@@ -55,7 +55,8 @@ function Summary() {
 function Notices() {
   return html`<div role="alert">
     ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
-    ${lost && html`<p class="notice mark" data-level="warn">${lost}</p>`}
+    ${lost && html`<p class="notice mark" data-level="bad">${lost}
+      <button type="button" class="plain" onClick=${dismissLost}>Dismiss</button></p>`}
   </div>`;
 }
 
@@ -81,8 +82,9 @@ function Console() {
   }, []);
   const [, title, Page] = PAGES.find(([page]) => page === at.page) ?? ["axis", at.axis ?? "Axis", AxisPage];
   useEffect(() => {
-    document.title = `${at.page === "axis" ? `Axis ${at.axis}` : title} – ldcnd`;
-  }, [at.page, at.axis]);
+    const place = at.page === "axis" ? `Axis ${at.axis}` : title;
+    document.title = `${lost ? "Control lost – " : ""}${place} – ldcnd`;
+  }, [at.page, at.axis, lost]);
 
   return html`<a class="skip" href="#main" onClick=${(event) => {
     event.preventDefault();

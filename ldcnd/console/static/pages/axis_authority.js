@@ -12,13 +12,13 @@ export function AuthorityPanel({ axis }) {
   const [force, setForce] = useState(false);
   const others = !mine && axis.holder;
   return html`<${Panel} title="Control">
-    <p>Held by <${HolderWord} axis=${axis} />${mine ? "; it ends by itself when this page goes." : "."}</p>
+    <p>Held by <${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
     <p class="row">
       ${
         mine
-          ? html`<${Action} act=${() => release(axis)}>Release control<//>`
-          : html`<${Action} act=${() => take(axis, force)} kind="main"
-            obstacle=${obstacle(axis, "none") ?? (others && !force ? `${axis.holder} has it: tick to take it away.` : null)}>Take control<//>`
+          ? html`<${Action} act=${() => release([axis])} title="An axis that moves is halted first">Release control<//>`
+          : html`<${Action} act=${() => take([axis], force)} kind="main"
+            obstacle=${obstacle(axis, "none") ?? (others && !force ? `Control is held by ${axis.holder}: tick to take it from there.` : null)}>Take control<//>`
       }
       ${others && html`<${Tick} label=${`Take it from ${axis.holder}`} checked=${force} onChange=${setForce} />`}
     </p>

@@ -4,7 +4,7 @@ import { html, useEffect, useState } from "../html.js";
 import { Action, Panel, RefusalText } from "../parts/controls.js";
 import { clock, words } from "../parts/format.js";
 import { faultPage, Mark } from "../parts/state.js";
-import { command, leaseOf, question } from "../session/control.js";
+import { command, controls, question } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 
 export function FaultPanel({ axis }) {
@@ -44,7 +44,7 @@ export function WhyPanel({ axis }) {
   const [why, setWhy] = useState(null);
   const [refusal, setRefusal] = useState(null);
   const { state } = axis;
-  const lease = leaseOf(axis);
+  const mine = controls(axis);
   const situation = JSON.stringify([
     state?.state,
     state?.link,
@@ -53,12 +53,12 @@ export function WhyPanel({ axis }) {
     state?.enabled,
     axis.faults.map((each) => each.code),
     axis.holder,
-    lease,
+    mine,
     axis.rig.connected,
   ]);
   useEffect(() => {
     let wanted = true;
-    question(axis, "why", { lease }).then(
+    question(axis, "why").then(
       (reply) => wanted && (setWhy(reply), setRefusal(null)),
       (error) => wanted && setRefusal(error),
     );

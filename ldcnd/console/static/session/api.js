@@ -1,8 +1,15 @@
 /** Questions and commands to the console process: JSON by POST, with the token that proves they come from this page. */
 
 const PATIENCE_MS = 15_000;
-/** A browser keeps six connections to a host; three are left for renewals and stops, which wait for nothing. */
+/** A browser keeps six connections to a host; three are left for stops, which wait for nothing. */
 const MOST_AT_ONCE = 3;
+
+let page = null;
+
+/** Say which page sends what is asked from now on: what it may move depends on it. */
+export function nameThisPage(name) {
+  page = name;
+}
 
 /** What a question was refused with: the daemon's error reply, or what came instead of one. */
 export class Refusal extends Error {
@@ -31,11 +38,15 @@ export async function ask(path, body = {}, patienceMs = PATIENCE_MS) {
   }
 }
 
-/** Ask past all others: stops and the renewal of leases. */
+/** Ask past all others: stops. */
 export function askAtOnce(path, body = {}, { patienceMs = PATIENCE_MS, keepalive = false } = {}) {
   return answer(path, {
     method: "POST",
-    headers: { "Content-Type": "application/json", "X-Ldcnd-Csrf": cookie("ldcnd_csrf") },
+    headers: {
+      "Content-Type": "application/json",
+      "X-Ldcnd-Csrf": cookie("ldcnd_csrf"),
+      ...(page && { "X-Ldcnd-Page": page }),
+    },
     body: JSON.stringify(body),
     priority: "high",
     keepalive,

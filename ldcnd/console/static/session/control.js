@@ -1,68 +1,68 @@
-/** Control over axes: leases that live as long as this page renews them, and commands under them. */
+/** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
-import { ask, askAtOnce, axisPath, rigPath } from "./api.js";
+import { ask, axisPath, nameThisPage, rigPath } from "./api.js";
+import { moves } from "./obstacles.js";
 import { askHolders, changed, rigs } from "./rigs.js";
 
-const LEASE_S = 5;
-const RENEWED_EACH_MS = 1_500;
-const RENEWAL_PATIENCE_MS = 4_000;
-const ENDED = new Set(["lease_expired", "lease_unknown", "lease_held"]);
+const OPEN_AGAIN_MS = 1_000;
+const MOTIONS = new Set([
+  "move_absolute",
+  "move_relative",
+  "move_velocity",
+  "move_analog",
+  "set_pwm",
+  "track",
+  "home",
+]);
 
-/** Control of one axis. */
-class Lease {
-  sequence = 0;
-  renewing = false;
-  renewedAtMs = performance.now();
-
-  constructor(rig, axis, token) {
-    Object.assign(this, { rig, axis, token });
-  }
-
-  get body() {
-    return { lease: this.token };
-  }
-}
-
+/** The axes that this page controls, by key; true once it has moved them. */
 const held = new Map();
+
+/** The name under which this page controls axes; null while it is not connected. */
+export let client = null;
 
 /** Why control was lost last, for people; null when it was not. */
 export let lost = null;
 
+/** Forget what was lost: the operator has seen it. */
+export function dismissLost() {
+  lost = null;
+  changed();
+}
+
 /** Whether this page controls the axis. */
 export function controls(axis) {
-  return held.has(key(axis));
+  return held.has(axis);
 }
 
 /** The axes that this page controls. */
 export function controlled() {
-  return [...held.values()].map((lease) => lease.axis);
+  return [...held.keys()];
 }
 
-/** Take control of an axis; `force` takes it from whoever has it. */
-export async function take(axis, force = false) {
-  const body = { client: "console", axes: [axis.name], lease_s: LEASE_S, force };
-  const reply = await ask(`${rigPath(axis.rig.name)}/rig/acquire`, body);
-  held.set(key(axis), new Lease(axis.rig, axis, reply.lease));
+/** Take control of axes of one rig; `force` takes them from their holders. */
+export async function take(axes, force = false) {
+  const body = { axes: axes.map((axis) => axis.name), force };
+  await ask(`${rigPath(axes[0].rig.name)}/control`, body);
+  for (const axis of axes) held.set(axis, false);
   lost = null;
   askHolders();
   changed();
 }
 
-/** Give control back. */
-export async function release(axis) {
-  const lease = held.get(key(axis));
-  held.delete(key(axis));
-  changed();
-  await ask(`${rigPath(axis.rig.name)}/rig/release`, lease.body);
+/** Give up control of axes of one rig; what moves is halted before. */
+export async function release(axes) {
+  await ask(`${rigPath(axes[0].rig.name)}/release`, { axes: axes.map((axis) => axis.name) });
+  for (const axis of axes) held.delete(axis);
   askHolders();
+  changed();
 }
 
-/** Send a command once, under the lease if there is one, meant for this run of the daemon. */
+/** Send a command once, under this page's control if it has it, meant for this run of the daemon. */
 export function command(axis, verb, body = {}, patienceMs = undefined) {
-  const lease = held.get(key(axis));
-  const authority = lease ? { lease: lease.token, sequence: ++lease.sequence } : {};
+  if (MOTIONS.has(verb)) noteMoved(axis);
   const instance = rigs.get(axis.rig.name)?.daemon?.instance;
-  const envelope = { ...authority, ...(instance && { instance }), command_id: crypto.randomUUID() };
+  const envelope = { ...(instance && { instance }), command_id: crypto.randomUUID() };
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, { ...given(body), ...envelope }, patienceMs);
 }
 
@@ -71,52 +71,52 @@ export function question(axis, verb, body = {}) {
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, given(body));
 }
 
-/** The lease of an axis, for `why`. */
-export function leaseOf(axis) {
-  return held.get(key(axis))?.token ?? null;
+/** Note that this page has set an axis in motion. */
+export function noteMoved(axis) {
+  if (held.has(axis)) held.set(axis, true);
 }
 
-/** Renew while the page lives, and give everything back when it goes. */
+/** Connect, again whenever the connection is lost; warn before a page goes whose axes move. */
 export function keepControl() {
-  setInterval(renewAll, RENEWED_EACH_MS);
-  addEventListener("pagehide", () => {
-    for (const { rig, body } of held.values()) {
-      askAtOnce(`${rigPath(rig.name)}/rig/release`, body, { keepalive: true }).catch(() => {}); // nobody is left to tell
-    }
-    held.clear();
+  open();
+  addEventListener("beforeunload", (event) => {
+    if ([...held].some(([axis, moved]) => moved && moves(axis))) event.preventDefault();
   });
 }
 
-function renewAll() {
-  for (const lease of held.values()) if (!lease.renewing) renew(lease);
+function open() {
+  const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/api/page`);
+  socket.onmessage = ({ data }) => {
+    const told = JSON.parse(data);
+    if (told.page) {
+      client = told.client;
+      nameThisPage(told.page);
+    } else if (told.lost) forget(told.lost);
+    changed();
+  };
+  socket.onclose = () => {
+    client = null;
+    nameThisPage(null);
+    if (held.size) {
+      lost = `Control of ${names([...held.keys()])} is lost: this page has lost its connection to the console. What it moved is halted.`;
+      held.clear();
+    }
+    changed();
+    setTimeout(open, OPEN_AGAIN_MS);
+  };
 }
 
-async function renew(lease) {
-  const askedAtMs = performance.now();
-  lease.renewing = true;
-  try {
-    await askAtOnce(`${rigPath(lease.rig.name)}/rig/renew`, lease.body, { patienceMs: RENEWAL_PATIENCE_MS });
-    lease.renewedAtMs = askedAtMs;
-  } catch (error) {
-    const outlived = performance.now() - lease.renewedAtMs > LEASE_S * 1e3;
-    if (ENDED.has(error.code) || outlived) forget(lease, error);
-  } finally {
-    lease.renewing = false;
-  }
+function forget({ rig, axis: name, message }) {
+  const axis = rigs.get(rig)?.axes.get(name);
+  if (!held.delete(axis)) return;
+  lost = `Control of ${name} is lost: ${message}`;
 }
 
-function forget(lease, error) {
-  if (held.get(key(lease.axis)) !== lease) return;
-  held.delete(key(lease.axis));
-  lost = `Control of ${lease.axis.name} was lost: ${error.message}`;
-  changed();
+function names(axes) {
+  return axes.map((axis) => axis.name).join(", ");
 }
 
 /** Return the fields that have a value: what is left empty is left to the configuration. */
 function given(body) {
   return Object.fromEntries(Object.entries(body).filter(([, value]) => value !== null && value !== undefined));
-}
-
-function key(axis) {
-  return `${axis.rig.name}/${axis.name}`;
 }

@@ -1,0 +1,300 @@
+"""Open pages and the axes that they control: control lasts as long as the web socket of the page that took it.
+
+Browsers slow the timers of hidden pages and run nothing in pages that are gone. So this process renews the leases, and
+it is here that the end of a page is noticed: whatever ended it, what it may have set in motion is halted before its
+control is given up.
+"""
+
+import asyncio
+import secrets
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager
+from dataclasses import dataclass
+
+from ldcnd.client.lease import Control
+from ldcnd.client.rig_client import RigClient
+from ldcnd.console.rigs import Rigs
+from ldcnd.console.visitors import Visitor
+from ldcnd.errors import LdcndError, LeaseExpired, LeaseRequired, NotSupported, TooManyRequests, UnknownAxis
+from ldcnd.log import get_logger
+from ldcnd.model.authority import AcquireRequest, LeaseReply
+from ldcnd.model.axes import Moving
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.group_moves import MoveTogetherReply, MoveTogetherRequest
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import HaltRequest, Request, Verb
+from ldcnd.model.verbs import ACQUIRE, MOVE_TOGETHER
+
+log = get_logger("console")
+
+LEASE_S = 3.0
+"""The daemon acts so soon when this process dies."""
+HALT_TIME_S = 3.0
+REST_TIME_S = 15.0
+"""An axis that a page leaves behind has so long to come to rest; then its lease ends by itself, and `loss.client` of
+its configuration decides."""
+LOOK_EACH_S = 0.05
+MOST_PAGES = 64
+TOKEN_BYTES = 16
+MOTIONS = frozenset(
+    {
+        Verb.MOVE_ABSOLUTE,
+        Verb.MOVE_RELATIVE,
+        Verb.MOVE_VELOCITY,
+        Verb.MOVE_ANALOG,
+        Verb.SET_PWM,
+        Verb.TRACK,
+        Verb.HOME,
+    }
+)
+
+
+class Lost(Frozen):
+    """Control that a page had."""
+
+    rig: str
+    """The rig."""
+    axis: str
+    """The axis."""
+    message: str
+    """Why it has no control any more."""
+
+
+class ToPage(Frozen):
+    """One message to a page on its web socket; the first has `page` and `client`, the others have `lost`."""
+
+    page: str | None = None
+    """What its commands carry as `X-Ldcnd-Page`."""
+    client: str | None = None
+    """The name under which its commands go."""
+    lost: Lost | None = None
+    """Control that it does not have any more."""
+
+
+@dataclass(slots=True, eq=False)
+class _Hold:
+    """Control of one axis.
+
+    Attributes:
+        control: the lease.
+        keeping: renews it.
+        moved: a motion was commanded under it.
+        sending: how many commands have no answer yet.
+    """
+
+    client: RigClient
+    axis: str
+    control: Control
+    keeping: asyncio.Task[None]
+    moved: bool = False
+    sending: int = 0
+
+    @contextmanager
+    def in_flight(self, *, moves: bool) -> Iterator[None]:
+        """Count a command until it is answered."""
+        self.moved |= moves
+        self.sending += 1
+        try:
+            yield
+        finally:
+            self.sending -= 1
+
+
+class PageControl:
+    """The axes that one open page controls; made by `Pages.open`.
+
+    Attributes:
+        token: what its commands carry; known to the page alone.
+        client: the name under which it holds control.
+    """
+
+    def __init__(self, client: str, rigs: Rigs, tell: Callable[[ToPage], None], group: asyncio.TaskGroup) -> None:
+        self.token = secrets.token_urlsafe(TOKEN_BYTES)
+        self.client = client
+        self._rigs = rigs
+        self._tell = tell
+        self._group = group
+        self._held: dict[tuple[str, str], _Hold] = {}
+        self._gone = False
+
+    async def take(self, rig: str, axis: str, *, force: bool) -> None:
+        """Take control of an axis, from its holder too with `force`.
+
+        Raises:
+            UnknownAxis: the rig has no such axis.
+            LeaseHeld: another page or program controls it.
+            LeaseExpired: the page has gone meanwhile.
+        """
+        client = self._rigs.client(rig)
+        if axis not in self._rigs.axes(rig):
+            raise UnknownAxis(f"rig {rig} has no axis {axis[:64]!r}", axis=axis[:64], value=axis[:64])
+        request = AcquireRequest(client=self.client, axes=(axis,), lease_s=LEASE_S, force=force)
+        control = Control(client, await client.rig_command(ACQUIRE, request, LeaseReply))
+        if self._gone:
+            await control.release()
+            raise _page_gone()
+        if before := self._held.get((rig, axis)):
+            before.keeping.cancel()  # the daemon has put the new lease in its place
+        keeping = self._group.create_task(self._keep(rig, axis, control), name=f"lease of {self.client} on {axis}")
+        self._held[rig, axis] = _Hold(client, axis, control, keeping)
+
+    async def release(self, rig: str, axis: str) -> None:
+        """Give up control of an axis; one that may move is halted before."""
+        if hold := self._held.pop((rig, axis), None):
+            await _give_up(hold, self.client)
+
+    async def command(self, rig: str, axis: str, verb: Verb, request: Request, timeout_s: float) -> CommandReply:
+        """Send one command, under the page's lease where it has one.
+
+        Raises:
+            LeaseRequired: it would move an axis that this page does not control.
+            LdcndError: as the daemon refused it.
+        """
+        hold = self._held.get((rig, axis))
+        if hold is None:
+            refuse_unwatched(axis, verb)
+            return await self._rigs.client(rig).command(axis, verb, request, timeout_s)
+        with hold.in_flight(moves=verb in MOTIONS):
+            return await hold.control.command(axis, verb, request, timeout_s)
+
+    async def move_together(self, rig: str, request: MoveTogetherRequest) -> MoveTogetherReply:
+        """Start the moves of a group under the page's leases.
+
+        Raises:
+            LeaseRequired: this page does not control one of the axes.
+            LdcndError: as the daemon refused it.
+        """
+        with ExitStack() as sending:
+            moves = []
+            for move in request.moves:
+                hold = self._held.get((rig, move.axis))
+                if hold is None:
+                    raise control_needed(move.axis)
+                sending.enter_context(hold.in_flight(moves=True))
+                moves.append(hold.control.stamped(move, move.axis))
+            together = request.model_copy(update={"moves": tuple(moves)})
+            return await self._rigs.client(rig).rig_command(MOVE_TOGETHER, together, MoveTogetherReply)
+
+    def lease(self, rig: str, axis: str) -> str | None:
+        """Return the lease of an axis, for questions."""
+        hold = self._held.get((rig, axis))
+        return hold.control.lease.lease if hold else None
+
+    async def leave(self) -> None:
+        """Give up everything: halt what may move, then release it. Nothing more is sent for this page."""
+        self._gone = True
+        holds, self._held = list(self._held.values()), {}
+        async with asyncio.TaskGroup() as group:
+            for hold in holds:
+                group.create_task(_give_up(hold, self.client), name=f"{self.client} leaves {hold.axis}")
+
+    async def _keep(self, rig: str, axis: str, control: Control) -> None:
+        await control.keep()
+        hold = self._held.get((rig, axis))
+        if hold and hold.control is control:
+            del self._held[rig, axis]
+            why = control.lost.message if control.lost else ""
+            log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
+            self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=why)))
+
+
+class Pages:
+    """All open pages, by what their commands carry."""
+
+    def __init__(self, rigs: Rigs) -> None:
+        self._rigs = rigs
+        self._open: dict[str, tuple[Visitor, PageControl]] = {}
+        self._count = 0
+
+    @asynccontextmanager
+    async def open(self, visitor: Visitor, tell: Callable[[ToPage], None]) -> AsyncIterator[PageControl]:
+        """Let a page control axes for as long as the context lasts.
+
+        Raises:
+            TooManyRequests: there are too many pages.
+        """
+        if len(self._open) >= MOST_PAGES:
+            raise TooManyRequests(f"{MOST_PAGES} pages are open", limit=MOST_PAGES, remedy="close some of them")
+        self._count += 1
+        async with asyncio.TaskGroup() as group:
+            page = PageControl(f"{visitor.client}.{self._count}", self._rigs, tell, group)
+            self._open[page.token] = (visitor, page)
+            try:
+                yield page
+            finally:
+                del self._open[page.token]
+                await page.leave()
+
+    def of(self, token: str, visitor: Visitor) -> PageControl:
+        """Return the visitor's page that sends a command.
+
+        Raises:
+            LeaseExpired: its web socket has closed.
+        """
+        owner, page = self._open.get(token, (None, None))
+        if page is None or owner is not visitor:
+            raise _page_gone()
+        return page
+
+
+def refuse_unwatched(axis: str, verb: Verb) -> None:
+    """Refuse a motion that no open page is responsible for.
+
+    Raises:
+        LeaseRequired: it is one.
+    """
+    if verb in MOTIONS:
+        raise control_needed(axis)
+
+
+def control_needed(axis: str) -> LeaseRequired:
+    """Return the refusal of a motion that no open page is responsible for."""
+    return LeaseRequired(
+        f"axis {axis[:64]}: through the console it moves only while a page controls it",
+        axis=axis[:64],
+        remedy="take control of it first",
+    )
+
+
+def _page_gone() -> LeaseExpired:
+    return LeaseExpired("this page has lost its connection to the console", remedy="load the page again")
+
+
+async def _give_up(hold: _Hold, client: str) -> None:
+    """Halt an axis that may move, and release it when it stands.
+
+    One that does not come to rest is not released: its lease ends unrenewed, and the daemon does what it is configured
+    to do then.
+    """
+    try:
+        async with asyncio.timeout(REST_TIME_S):
+            await _bring_to_rest(hold, client)
+    except (TimeoutError, LdcndError) as error:
+        log.warning("axis not at rest, its lease is left to end", client=client, axis=hold.axis, reason=str(error))
+        hold.keeping.cancel()
+        return
+    hold.keeping.cancel()
+    await hold.control.release()
+
+
+async def _bring_to_rest(hold: _Hold, client: str) -> None:
+    """Halt, and once more whenever a command was answered meanwhile: a move may have waited for the end of this one."""
+    while True:
+        in_flight = hold.sending
+        if not hold.moved and await _stands(hold):
+            return
+        try:
+            await hold.client.command(hold.axis, Verb.HALT, HaltRequest(client=client), HALT_TIME_S)
+        except NotSupported:
+            return  # no command of ours moves it
+        stands = False
+        while hold.sending == in_flight and not (stands and not in_flight):
+            await asyncio.sleep(LOOK_EACH_S)
+            stands = await _stands(hold)
+        if stands and not hold.sending:
+            return
+
+
+async def _stands(hold: _Hold) -> bool:
+    state = await hold.client.state(hold.axis)
+    return state is not None and state.moving is Moving.NO

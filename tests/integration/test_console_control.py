@@ -1,0 +1,144 @@
+"""Control through the console lasts as long as the web socket of its page; then what the page moved is halted."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply
+from ldcnd.model.axes import AxisState, Moving
+from tests.support.console_rig import open_page, running_console
+
+X = "/api/rigs/sim/axes/x"
+RIG = "/api/rigs/sim"
+
+
+@pytest.fixture
+async def console():
+    async with running_console() as running:
+        yield running
+
+
+async def holder(console, axis):
+    told = await console.rig.client.rig_command("holders", HoldersRequest(), HolderList)
+    return next(each.client for each in told.holders if each.axis == axis)
+
+
+async def running_at(console, page, velocity):
+    """Let the page jog x."""
+    await page.take("sim", "x")
+    assert (await page.post(f"{X}/power", {"on": True})).status == 200
+    await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+    moved = await page.post(f"{X}/move_velocity", {"velocity": velocity})
+    assert moved.status == 200, moved.document
+    await console.rig.until("x", lambda state: state.moving is Moving.YES)
+
+
+async def stands(console, axis):
+    return (await console.rig.client.state(axis)).moving is Moving.NO
+
+
+async def test_a_page_that_goes_halts_what_it_moved_and_gives_up_control(console):
+    async with open_page(console.app, console.browser) as page:
+        await running_at(console, page, 1.0)
+        assert await holder(console, "x") == page.client
+
+    assert await stands(console, "x")
+    position = await console.rig.client.last("x", "position")
+    await asyncio.sleep(5)
+    assert (await console.rig.client.last("x", "position")).value == pytest.approx(position.value, abs=0.01)
+    assert (await console.rig.client.state("x")).state is AxisState.STANDSTILL  # halted, not latched
+    assert await holder(console, "x") is None
+
+
+async def test_control_lasts_in_a_page_that_says_nothing(console):
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        await asyncio.sleep(20)
+        assert await holder(console, "x") == page.client
+        assert (await page.post(f"{X}/power", {"on": True})).status == 200
+
+
+async def test_a_move_that_still_waits_when_its_page_goes_does_not_run_on(console):
+    async with open_page(console.app, console.browser) as page:
+        await running_at(console, page, 1.0)
+        waiting = asyncio.create_task(
+            page.post(f"{X}/move_relative", {"distance": 20.0, "velocity": 1.0, "buffer_mode": "buffered"})
+        )
+        await asyncio.sleep(0.5)
+    await waiting
+
+    await asyncio.sleep(1)
+    assert await stands(console, "x")
+    position = await console.rig.client.last("x", "position")
+    await asyncio.sleep(5)
+    assert (await console.rig.client.last("x", "position")).value == pytest.approx(position.value, abs=0.01)
+
+
+async def test_releasing_a_moving_axis_halts_it_first(console):
+    async with open_page(console.app, console.browser) as page:
+        await running_at(console, page, 1.0)
+        released = await page.post(f"{RIG}/release", {"axes": ["x"]})
+
+        assert released.status == 200
+        assert await stands(console, "x")
+        assert await holder(console, "x") is None
+
+
+async def test_nothing_moves_through_the_console_without_a_page_that_has_control(console):
+    await console.browser.post(f"{X}/power", {"on": True})
+    await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+    bare = await console.browser.post(f"{X}/move_absolute", {"position": 1.0})
+    moves = [{"axis": axis, "position": 1.0} for axis in "xy"]
+    together = await console.browser.post(f"{RIG}/rig/move_together", {"moves": moves})
+    async with open_page(console.app, console.browser) as page:
+        untaken = await page.post(f"{X}/move_absolute", {"position": 1.0})
+    gone = await page.post(f"{X}/move_absolute", {"position": 1.0})
+    leases = [
+        await console.browser.post(f"{RIG}/rig/{verb}", {"lease_s": 5}) for verb in ("acquire", "renew", "release")
+    ]
+
+    assert [answer.document["code"] for answer in (bare, together, untaken)] == ["lease_required"] * 3
+    assert gone.document["code"] == "lease_expired"
+    assert {answer.status for answer in leases} == {404}
+    assert await stands(console, "x")
+
+
+async def test_a_page_is_told_when_its_control_is_lost(console):
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        force = AcquireRequest(client="another", axes=("x",), lease_s=60, force=True)
+        await console.rig.client.rig_command("acquire", force, LeaseReply)
+
+        told = await page.told()
+        refused = await page.post(f"{X}/move_absolute", {"position": 1.0})
+
+    assert (told["lost"]["rig"], told["lost"]["axis"]) == ("sim", "x")
+    assert told["lost"]["message"]
+    assert refused.document["code"] == "lease_required"
+
+
+async def test_two_pages_of_one_browser_do_not_take_from_each_other_unasked(console):
+    async with open_page(console.app, console.browser) as one, open_page(console.app, console.browser) as other:
+        await one.take("sim", "x")
+        refused = await other.post(f"{RIG}/control", {"axes": ["x"]})
+        taken = await other.post(f"{RIG}/control", {"axes": ["x"], "force": True})
+
+    assert (refused.status, refused.document["code"]) == (409, "lease_held")
+    assert taken.status == 200
+    assert one.client != other.client
+
+
+async def test_the_name_of_a_page_is_worth_nothing_to_another_visitor(console):
+    stranger = await console.enter()
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        stolen = await stranger.forging(x_ldcnd_page=page.name).post(f"{X}/power", {"on": True})
+
+    assert stolen.document["code"] == "lease_expired"
+
+
+async def test_control_is_of_axes_not_of_what_else_has_a_name(console):
+    async with open_page(console.app, console.browser) as page:
+        answers = [await page.post(f"{RIG}/control", {"axes": axes}) for axes in (["w"], ["*"], [""], [])]
+
+    assert [answer.status for answer in answers] == [404, 404, 404, 400]
