@@ -26,6 +26,8 @@ fix: .venv/ready
 	.venv/bin/ldcnd schema write
 	.venv/bin/ldcnd schema configuration
 	.venv/bin/ldcnd schema cli
+	.venv/bin/ldcnd schema keys docs/reference/keys.md
+	.venv/bin/ldcnd schema errors docs/reference/errors.md
 
 # the site in build/docs, warnings as errors
 docs: .venv/ready

@@ -4,8 +4,12 @@ Families: `BusError` (the line), `DriveFault` (the drive), `RequestRefused` (the
 configuration). A message says what happened, to whom, with which value and which limit, and what to do.
 """
 
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
+from types import MappingProxyType
 from typing import ClassVar
+
+from ldcnd.fault_pages import page_of
 
 
 class ErrorCode(StrEnum):
@@ -74,7 +78,11 @@ class LdcndError(Exception):
     """
 
     code: ClassVar[ErrorCode] = ErrorCode.INTERNAL
+    """What the wire calls it."""
     retryable: ClassVar[bool] = False
+    """The same request may be sent again without harm and may then succeed."""
+    way_out: ClassVar[str] = "see the message"
+    """What to do about errors of this class; `remedy` is what to do about this very one."""
 
     def __init__(
         self,
@@ -94,6 +102,11 @@ class LdcndError(Exception):
         self.nearest = nearest
         self.remedy = remedy
 
+    @property
+    def page(self) -> str | None:
+        """Where its page is, below a console or the documentation: what to check, how to clear it."""
+        return page_of(self.code)
+
 
 class BusError(LdcndError):
     """Something went wrong between the host and a node."""
@@ -104,6 +117,7 @@ class ReplyTimeout(BusError):
 
     code = ErrorCode.REPLY_TIMEOUT
     retryable = True
+    way_out = "check power, address and cable of the drive"
 
 
 class BadReply(BusError):
@@ -111,6 +125,7 @@ class BadReply(BusError):
 
     code = ErrorCode.BAD_REPLY
     retryable = True
+    way_out = "check cable, termination and baud rate; another master on the line?"
 
 
 class PacketRejected(BusError):
@@ -118,12 +133,14 @@ class PacketRejected(BusError):
 
     code = ErrorCode.PACKET_REJECTED
     retryable = True
+    way_out = "check cable, termination and baud rate"
 
 
 class OutcomeUnknown(BusError):
     """The reply to a packet that must not be repeated was lost: it may or may not have been executed."""
 
     code = ErrorCode.OUTCOME_UNKNOWN
+    way_out = "look where the axis is before anything else is sent"
 
 
 class BusDown(BusError):
@@ -131,6 +148,7 @@ class BusDown(BusError):
 
     code = ErrorCode.BUS_DOWN
     retryable = True
+    way_out = "check the adapter and its cable; the line is opened again by itself"
 
 
 class BusBusy(BusError):
@@ -138,12 +156,14 @@ class BusBusy(BusError):
 
     code = ErrorCode.BUS_BUSY
     retryable = True
+    way_out = "send commands more slowly"
 
 
 class NetworkMismatch(BusError):
     """The modules found on the line are not those of the configuration."""
 
     code = ErrorCode.NETWORK_MISMATCH
+    way_out = "correct the wiring or the configuration; the message lists every difference"
 
 
 class TransportLost(BusError):
@@ -151,12 +171,19 @@ class TransportLost(BusError):
 
     code = ErrorCode.BUS_DOWN
     retryable = True
+    way_out = "check the adapter and its cable; the line is opened again by itself"
 
 
 class DriveFault(LdcndError):
     """The drive reports a fault that forbids the request."""
 
     code = ErrorCode.DRIVE_FAULT
+    way_out = "remove the cause, then send `reset`"
+
+    @property
+    def page(self) -> str | None:
+        """The page of the fault that `value` names, or that of the error."""
+        return (page_of(self.value) if isinstance(self.value, str) else None) or super().page
 
 
 class AddressRefused(DriveFault):
@@ -192,36 +219,42 @@ class MalformedRequest(RequestRefused):
     """The payload is not what the verb takes."""
 
     code = ErrorCode.MALFORMED_REQUEST
+    way_out = "correct the payload; the message names the field and what is allowed"
 
 
 class PayloadTooLarge(RequestRefused):
     """The payload is larger than any request can be."""
 
     code = ErrorCode.PAYLOAD_TOO_LARGE
+    way_out = "send less than 16 KiB"
 
 
 class WildcardRefused(RequestRefused):
     """A command names exactly one axis and one verb."""
 
     code = ErrorCode.WILDCARD_REFUSED
+    way_out = "send one command for each axis"
 
 
 class UnknownVerb(RequestRefused):
     """There is no such command."""
 
     code = ErrorCode.UNKNOWN_VERB
+    way_out = "see `meta/commands`"
 
 
 class UnknownAxis(RequestRefused):
     """There is no such axis on this rig."""
 
     code = ErrorCode.UNKNOWN_AXIS
+    way_out = "see `meta/daemon`"
 
 
 class NotSupported(RequestRefused):
     """This drive family or model cannot do that."""
 
     code = ErrorCode.NOT_SUPPORTED
+    way_out = "see the capabilities in `meta/axes/<axis>`"
 
 
 class EepromBudgetSpent(RequestRefused):
@@ -234,42 +267,49 @@ class ValueOutOfRange(RequestRefused):
     """A value does not fit its register or its documented range."""
 
     code = ErrorCode.VALUE_OUT_OF_RANGE
+    way_out = "use the nearest value of the reply"
 
 
 class PositionLimit(RequestRefused):
     """The target is outside the software limits."""
 
     code = ErrorCode.POSITION_LIMIT
+    way_out = "use the nearest value of the reply, or change the limits"
 
 
 class VelocityLimit(RequestRefused):
     """The velocity is above the axis limit."""
 
     code = ErrorCode.VELOCITY_LIMIT
+    way_out = "use the nearest value of the reply, or change the limits"
 
 
 class AccelerationLimit(RequestRefused):
     """The acceleration is above the axis limit."""
 
     code = ErrorCode.ACCELERATION_LIMIT
+    way_out = "use the nearest value of the reply, or change the limits"
 
 
 class WrongState(RequestRefused):
     """The axis state does not allow the command."""
 
     code = ErrorCode.WRONG_STATE
+    way_out = "the reply says which command leads out of the state"
 
 
 class NotReferenced(RequestRefused):
     """The axis does not know where it is."""
 
     code = ErrorCode.NOT_REFERENCED
+    way_out = "send `home` or `set_position`"
 
 
 class StopLatched(RequestRefused):
     """A stop is latched; `reset` clears it."""
 
     code = ErrorCode.STOP_LATCHED
+    way_out = "send `reset`"
 
 
 class AxisUnreachable(RequestRefused):
@@ -277,6 +317,7 @@ class AxisUnreachable(RequestRefused):
 
     code = ErrorCode.AXIS_UNREACHABLE
     retryable = True
+    way_out = "check power of the drive and the line"
 
 
 class TooManyRequests(RequestRefused):
@@ -284,6 +325,7 @@ class TooManyRequests(RequestRefused):
 
     code = ErrorCode.TOO_MANY_REQUESTS
     retryable = True
+    way_out = "wait for replies before sending more"
 
 
 class DuplicateDaemon(RequestRefused):
@@ -291,6 +333,7 @@ class DuplicateDaemon(RequestRefused):
 
     code = ErrorCode.DUPLICATE_DAEMON
     retryable = True
+    way_out = "end one of the two daemons"
 
 
 class ShuttingDown(RequestRefused):
@@ -298,12 +341,14 @@ class ShuttingDown(RequestRefused):
 
     code = ErrorCode.SHUTTING_DOWN
     retryable = True
+    way_out = "wait until the daemon is back"
 
 
 class LeaseRequired(RequestRefused):
     """This rig moves only for those who hold a lease, and the command carries none."""
 
     code = ErrorCode.LEASE_REQUIRED
+    way_out = "send `acquire` first"
 
 
 class LeaseHeld(RequestRefused):
@@ -311,54 +356,63 @@ class LeaseHeld(RequestRefused):
 
     code = ErrorCode.LEASE_HELD
     retryable = True
+    way_out = "wait until it is released, or acquire it with `force`"
 
 
 class LeaseExpired(RequestRefused):
     """The lease has ended; what was sent under it is stale."""
 
     code = ErrorCode.LEASE_EXPIRED
+    way_out = "acquire a new lease; do not send the old command again unless it is still wanted"
 
 
 class LeaseUnknown(RequestRefused):
     """There was never such a lease."""
 
     code = ErrorCode.LEASE_UNKNOWN
+    way_out = "send `acquire` first"
 
 
 class StaleSequence(RequestRefused):
     """The command is not newer than the last one under its lease."""
 
     code = ErrorCode.STALE_SEQUENCE
+    way_out = "number commands upwards"
 
 
 class CommandExpired(RequestRefused):
     """The command arrived after the instant until which its sender wanted it."""
 
     code = ErrorCode.COMMAND_EXPIRED
+    way_out = "send it again, with a new id, if it is still wanted"
 
 
 class CommandIdReused(RequestRefused):
     """The command id belongs to another command."""
 
     code = ErrorCode.COMMAND_ID_REUSED
+    way_out = "give every command an id of its own"
 
 
 class UnknownCommand(RequestRefused):
     """No such command is remembered."""
 
     code = ErrorCode.UNKNOWN_COMMAND
+    way_out = "look at the events"
 
 
 class NotPermitted(RequestRefused):
     """Whoever asks is not known, or asks from where nobody may; the console says so to browsers."""
 
     code = ErrorCode.NOT_PERMITTED
+    way_out = "open the console with the link that it prints"
 
 
 class ConfigError(LdcndError):
     """The configuration cannot work; nothing was opened."""
 
     code = ErrorCode.CONFIG_INVALID
+    way_out = "correct the configuration; the message names file, key and what is allowed"
 
 
 class SessionError(LdcndError):
@@ -366,15 +420,42 @@ class SessionError(LdcndError):
 
     code = ErrorCode.SESSION_FAILED
     retryable = True
+    way_out = "check the endpoint, and that the daemon runs"
 
 
 class ReplayDeviation(LdcndError):
     """The daemon that a capture is played to does not send what was sent when the capture was made."""
 
     code = ErrorCode.REPLAY_DEVIATION
+    way_out = (
+        "the message names the packet; play it with the configuration and the version of ldcnd that it was "
+        "made with, or find out which change it was"
+    )
 
 
 class InternalError(LdcndError):
     """A bug in ldcnd; the log has the traceback."""
 
     code = ErrorCode.INTERNAL
+    way_out = "report it, with the log"
+
+
+def _classes(root: type[LdcndError] = LdcndError) -> Iterator[type[LdcndError]]:
+    for derived in root.__subclasses__():
+        yield derived
+        yield from _classes(derived)
+
+
+ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
+    {code: next(error for error in _classes() if vars(error).get("code") is code) for code in ErrorCode}
+)
+"""What an error reply is rebuilt to: the class of each code, the first one where two share a code."""
+
+
+def as_markdown() -> str:
+    """Return all codes as one Markdown table."""
+    lines = ["| code | what it means | what to do | retryable |", "|---|---|---|---|"]
+    for code, error in ERRORS.items():
+        meaning = " ".join((error.__doc__ or "").split())
+        lines.append(f"| `{code}` | {meaning} | {error.way_out} | {'yes' if error.retryable else 'no'} |")
+    return "\n".join(lines) + "\n"

@@ -7,7 +7,6 @@ from typing import NoReturn
 import click
 
 from ldcnd.errors import ConfigError, LdcndError, SessionError
-from ldcnd.fault_pages import page_of_error
 
 EXIT_FAILED = 1
 """The daemon refused, or something failed; the message says what."""
@@ -92,7 +91,7 @@ def main() -> NoReturn:
         print(f"{error.message} [{error.code}]", file=sys.stderr)
         if error.remedy:
             print(f"  {error.remedy}", file=sys.stderr)
-        if page := page_of_error(error):
+        if page := error.page:
             print(f"  more: ldcnd fault {page.rpartition('/')[2]}", file=sys.stderr)
         sys.exit(EXIT_UNREACHABLE if isinstance(error, SessionError) else EXIT_FAILED)
     sys.exit(0)

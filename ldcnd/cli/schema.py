@@ -10,6 +10,7 @@ from ldcnd.config_reference import config_reference
 from ldcnd.daemon.asyncapi import asyncapi_text
 from ldcnd.daemon.contract import all_schemas, as_markdown
 from ldcnd.errors import ConfigError
+from ldcnd.errors import as_markdown as errors_as_markdown
 
 
 @click.group()
@@ -80,11 +81,21 @@ def asyncapi() -> None:
 @click.argument("page", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=False)
 def keys(page: Path | None) -> None:
     """Print all keys as a Markdown table, or renew the table at the end of PAGE (docs/reference/keys.md)."""
-    table = as_markdown()
+    _print_or_renew(as_markdown(), page)
+
+
+@command.command("errors")
+@click.argument("page", type=click.Path(path_type=Path, exists=True, dir_okay=False), required=False)
+def error_codes(page: Path | None) -> None:
+    """Print all error codes as a Markdown table, or renew the table at the end of PAGE (docs/reference/errors.md)."""
+    _print_or_renew(errors_as_markdown(), page)
+
+
+def _print_or_renew(table: str, page: Path | None) -> None:
     if page is None:
         click.echo(table, nl=False)
         return
     before, found, _ = page.read_text(encoding="utf-8").partition(table.partition("\n")[0])
     if not found:
-        raise ConfigError(f"{page}: has no table of keys")
+        raise ConfigError(f"{page}: has no such table")
     page.write_text(before + table, encoding="utf-8")

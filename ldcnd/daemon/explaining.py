@@ -5,7 +5,6 @@ from collections.abc import Callable
 from ldcnd.daemon import guards
 from ldcnd.daemon.axis_tracker import AxisTracker
 from ldcnd.errors import DriveFault, LdcndError
-from ldcnd.fault_pages import page_of_error
 from ldcnd.model.samples import FaultEntry
 from ldcnd.model.why import Cause, WhyReply
 
@@ -35,9 +34,7 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         try:
             check()
         except LdcndError as error:
-            causes.append(
-                Cause(code=error.code.value, text=error.message, remedy=error.remedy, page=page_of_error(error))
-            )
+            causes.append(Cause(code=error.code.value, text=error.message, remedy=error.remedy, page=error.page))
     first = tracker.first_fault
     return WhyReply(
         axis=view.name,

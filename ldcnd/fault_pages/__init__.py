@@ -7,8 +7,6 @@ documentation has them under the same name, and every fault and every error repl
 from functools import cache
 from pathlib import Path
 
-from ldcnd.errors import DriveFault, LdcndError
-
 FOLDER = Path(__file__).parent
 UNLISTED_ALARM = "alarm_unlisted"
 """The page of all SmartStep alarms that no manual lists."""
@@ -25,13 +23,6 @@ def page_of(code: str) -> str | None:
     if code in codes():
         return f"faults/{code}"
     return f"faults/{UNLISTED_ALARM}" if code.startswith("alarm_") else None
-
-
-def page_of_error(error: LdcndError) -> str | None:
-    """Return the page of an error; of a drive fault that names what the drive complains about, the page of that."""
-    if isinstance(error, DriveFault) and isinstance(error.value, str) and (page := page_of(error.value)):
-        return page
-    return page_of(error.code)
 
 
 def page_text(code: str) -> str | None:

@@ -7,19 +7,15 @@ schema.
 
 import math
 import sys
-from collections.abc import Mapping
 from enum import StrEnum
 from functools import cache, lru_cache
-from types import MappingProxyType
 from typing import TypeVar
 
 import msgpack
 import pydantic
 import pydantic_core
 
-from ldcnd import errors
-from ldcnd.errors import LdcndError, MalformedRequest, PayloadTooLarge
-from ldcnd.fault_pages import page_of_error
+from ldcnd.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge
 from ldcnd.model.errors import ErrorReply, ReceivedError
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.schemas import schema_name
@@ -43,58 +39,6 @@ class Encoding(StrEnum):
 
     JSON = "application/json"
     MSGPACK = "application/msgpack"
-
-
-_ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
-    {
-        error.code: error
-        for error in (
-            errors.ReplyTimeout,
-            errors.BadReply,
-            errors.PacketRejected,
-            errors.OutcomeUnknown,
-            errors.BusDown,
-            errors.BusBusy,
-            errors.NetworkMismatch,
-            errors.DriveFault,
-            errors.AddressRefused,
-            errors.DataRefused,
-            errors.ByteCountRefused,
-            errors.BusyTracing,
-            errors.MalformedRequest,
-            errors.PayloadTooLarge,
-            errors.WildcardRefused,
-            errors.UnknownVerb,
-            errors.UnknownAxis,
-            errors.NotSupported,
-            errors.EepromBudgetSpent,
-            errors.ValueOutOfRange,
-            errors.PositionLimit,
-            errors.VelocityLimit,
-            errors.AccelerationLimit,
-            errors.WrongState,
-            errors.NotReferenced,
-            errors.StopLatched,
-            errors.AxisUnreachable,
-            errors.TooManyRequests,
-            errors.DuplicateDaemon,
-            errors.ShuttingDown,
-            errors.LeaseRequired,
-            errors.LeaseHeld,
-            errors.LeaseExpired,
-            errors.LeaseUnknown,
-            errors.StaleSequence,
-            errors.CommandExpired,
-            errors.CommandIdReused,
-            errors.UnknownCommand,
-            errors.NotPermitted,
-            errors.ConfigError,
-            errors.SessionError,
-            errors.ReplayDeviation,
-            errors.InternalError,
-        )
-    }
-)
 
 
 def to_json(model: Frozen, *, exclude_defaults: bool = False) -> bytes:
@@ -188,13 +132,13 @@ def error_reply(error: LdcndError) -> ErrorReply:
         limit=_finite(error.limit),
         nearest=error.nearest if error.nearest is None or math.isfinite(error.nearest) else None,
         remedy=error.remedy,
-        page=page_of_error(error),
+        page=error.page,
     )
 
 
 def rebuild_error(reply: ReceivedError) -> LdcndError:
     """Return the error that a reply tells of, of the class that has its code; the root when no class has it."""
-    known = _ERRORS.get(reply.code)
+    known = ERRORS.get(reply.code)
     return (known or LdcndError)(
         reply.message if known else f"{reply.message} ({reply.code}, an error code newer than this client)",
         axis=reply.axis,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd import errors
-from ldcnd.errors import ErrorCode, LdcndError
+from ldcnd.errors import ERRORS, ErrorCode, LdcndError, as_markdown
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "errors.md").read_text()
@@ -24,6 +24,19 @@ def test_every_code_has_a_row_with_its_meaning_and_the_way_out(code):
 
     assert row, f"docs/reference/errors.md has no row for {code.value}"
     assert row[3] == ("yes" if _class(code).retryable else "no")
+
+
+def test_the_page_is_made_of_the_classes():
+    assert PAGE.endswith(as_markdown())
+
+
+@pytest.mark.parametrize("code", list(ErrorCode))
+def test_every_code_has_one_class_that_says_what_to_do(code):
+    error = ERRORS[code]
+
+    assert error.code is code
+    assert error.way_out
+    assert error("something happened").page == f"faults/{code}"
 
 
 @pytest.mark.parametrize("code", list(ErrorCode))
