@@ -13,7 +13,7 @@ from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
-from ldcnd.daemon.replaying import config_of
+from ldcnd.daemon.process.replay import config_of
 from ldcnd.drivers.transcript import Describe, describer
 
 TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")

@@ -7,10 +7,10 @@ from pathlib import Path
 import click
 
 from ldcnd.config import load_config
-from ldcnd.daemon.assembly import session_settings
-from ldcnd.daemon.planning import require_plan
+from ldcnd.daemon.process.assembly import session_settings
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.zenoh_config import zenoh_config
+from ldcnd.planning.plan import require_plan
 
 
 @click.command()

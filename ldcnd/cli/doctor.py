@@ -10,7 +10,7 @@ import click
 from ldcnd.bus.bus import Bus
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.smartstep_line import build_line
+from ldcnd.daemon.line.smartstep_line import build_line
 from ldcnd.drivers.smartstep.commissioning import examine
 from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.errors import BusDown, ConfigError

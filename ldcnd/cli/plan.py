@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from ldcnd.config import load_config
-from ldcnd.daemon.planning import plan_rig
 from ldcnd.model.plan import BusPlan
+from ldcnd.planning.plan import plan_rig
 
 EXIT_OVERFULL = 1
 

@@ -7,7 +7,7 @@ import click
 
 from ldcnd.bus.capture import Capture, CaptureHeader, parse_capture
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.replaying import Played, Take, config_of, play, published_line, virtual_time
+from ldcnd.daemon.process.replay import Played, Take, config_of, play, published_line, virtual_time
 from ldcnd.log import configure_logging
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import EVENT

@@ -9,15 +9,14 @@ from pathlib import Path
 import click
 
 from ldcnd.config import RigConfig, load_config, single_line
-from ldcnd.daemon.assembly import open_daemon
-from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.planning import require_plan
-from ldcnd.daemon.process import held_awake, last_words, loop_factory, require_writable, settle_heap
-from ldcnd.daemon.service import Service
-from ldcnd.daemon.systemd import Notifier
+from ldcnd.daemon.process.assembly import open_daemon
+from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.daemon.process.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
+from ldcnd.daemon.process.systemd import Notifier
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.messaging.zenoh_threads import senders_wait
 from ldcnd.model.frozen import build_models
+from ldcnd.planning.plan import require_plan
 
 log = get_logger("run")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ldcnd.daemon.process import held_awake
+from ldcnd.daemon.process.service import held_awake
 from tests.bench.processes import (
     PIC_SERVO,
     SUBJECT_CPU,

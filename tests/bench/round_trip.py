@@ -17,7 +17,7 @@ import structlog
 
 from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.config import RigConfig
-from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.messaging.session import Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from ldcnd.daemon.publishing import Publisher
+from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.zenoh_session import open_zenoh_session

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.wire_log import WireEvent, WireRecord
-from ldcnd.daemon.process import settle_heap
+from ldcnd.daemon.process.service import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES

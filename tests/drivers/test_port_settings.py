@@ -12,7 +12,7 @@ import pytest
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.process import require_writable
+from ldcnd.daemon.process.service import require_writable
 from ldcnd.drivers.ldcn.addressing import LineRate, nulls
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.errors import ConfigError, NotSupported, TransportLost

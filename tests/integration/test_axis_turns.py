@@ -6,8 +6,8 @@ from typing import Any
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import load_config
-from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.axis_turns import QUEUED_COMMANDS
+from ldcnd.daemon.axis.axis import QUEUED_COMMANDS
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import StopLatched, TooManyRequests
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import EVENT, Keys

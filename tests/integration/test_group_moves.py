@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.daemon.group_moves import move_together
+from ldcnd.daemon.command.dispatch import move_together
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import MalformedRequest, NotSupported, PositionLimit, StopLatched, UnknownAxis
 from ldcnd.model.axes import AxisState, LinkState

@@ -11,7 +11,6 @@ from click.testing import CliRunner
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.cli.main import cli
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.planning import plan_rig, require_plan
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl
@@ -20,6 +19,7 @@ from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import decode
 from ldcnd.model.health import BusHealth
 from ldcnd.model.plan import RigPlan
+from ldcnd.planning.plan import plan_rig, require_plan
 from tests.bench.virtual_time import smartsteps_busy
 from tests.support.rig import SIMULATED, running_rig
 

@@ -7,8 +7,8 @@ import pytest
 
 from ldcnd.bus.exchange_queue import Lane
 from ldcnd.config import RigConfig
-from ldcnd.daemon.planning import require_plan
 from ldcnd.model.plan import BusPlan
+from ldcnd.planning.plan import require_plan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import rig_on
 from tests.support.late_host import open_late_host

@@ -8,7 +8,6 @@ from click.testing import CliRunner
 from ldcnd.cli.main import cli
 from ldcnd.client.traces import arm_trace
 from ldcnd.config import RigConfig
-from ldcnd.daemon.planning import plan_rig
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
@@ -17,6 +16,7 @@ from ldcnd.messaging.codec import decode
 from ldcnd.model.axes import AxisInfo
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.requests import TraceRequest
+from ldcnd.planning.plan import plan_rig
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.priority_rig import Asked, granted, ranked_config

@@ -8,7 +8,7 @@ import pytest
 from ldcnd.bus.capture import Capture, parse_capture
 from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.config import load_config
-from ldcnd.daemon.replaying import config_of
+from ldcnd.daemon.process.replay import config_of
 from ldcnd.errors import ConfigError, MalformedRequest, ReplayDeviation
 from tests.support.captures import FOLDER, NAMES, record, replayed
 

@@ -11,7 +11,7 @@ import pytest
 
 from ldcnd.client.rig_client import RigClient, Samples, find_rigs
 from ldcnd.config import load_config
-from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session

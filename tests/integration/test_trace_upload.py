@@ -3,9 +3,9 @@
 import pytest
 
 from ldcnd.config import load_config
-from ldcnd.daemon.planning import plan_rig
 from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP
+from ldcnd.planning.plan import plan_rig
 from tests.bench.trace_upload import AS_A_RULE_BYTES, MEMORIES, READINGS, SHARE, limit_s, share_of_limit
 from tests.support.trace_rig import MIXED
 

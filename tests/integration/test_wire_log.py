@@ -8,7 +8,7 @@ from ldcnd.bus.wire_log import WireEvent, parse_records
 from ldcnd.bus_config import RecorderConfig
 from ldcnd.client.wire_log import fetch_wire_log
 from ldcnd.config import load_config
-from ldcnd.daemon.wire_dumps import LONGEST_DATA_BYTES
+from ldcnd.daemon.capture.flight_recorder import LONGEST_DATA_BYTES
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.wire_log import WireLogReply, WireLogRequest
 from tests.support.rig import SIMULATED, running_rig

@@ -15,7 +15,7 @@ import pytest
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import load_config
-from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import ErrorCode, ValueOutOfRange
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys

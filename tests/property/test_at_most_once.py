@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig
-from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import LdcndError, RequestRefused
 from ldcnd.messaging.memory_session import MemoryBroker

@@ -11,9 +11,9 @@ from pathlib import Path
 from ldcnd.bus.capture import Capture
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.captures import lines_of
-from ldcnd.daemon.replaying import config_of, overheard, play, published_line, virtual_time
+from ldcnd.daemon.capture.captures import lines_of
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.process.replay import config_of, overheard, play, published_line, virtual_time
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
 from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb

@@ -10,8 +10,8 @@ from types import MappingProxyType
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig
-from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.bus_service import BusService
+from ldcnd.daemon.line.line import BusService
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain

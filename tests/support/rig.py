@@ -9,8 +9,8 @@ from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.model.samples import StateSample
 from ldcnd.sim.chain import Chain

@@ -12,7 +12,7 @@ from ldcnd.axis_config import AxisConfig, RatesConfig
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.smartstep.parameters import PN000
 from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession

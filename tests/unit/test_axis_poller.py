@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from ldcnd.axis_config import RatesConfig
-from ldcnd.daemon.axis_poller import AxisPoller, wanted_rates_hz
+from ldcnd.daemon.axis.polling import AxisPoller
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.planning.plan import wanted_rates_hz
 
 POSITION, VELOCITY, ADC, STATE = (
     TelemetryItem.POSITION,

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis_tracker import MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
+from ldcnd.daemon.axis.state import MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 from ldcnd.model.axes import AxisState, LinkState, Moving, Quality

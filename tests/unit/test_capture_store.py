@@ -2,7 +2,7 @@ from structlog.testing import capture_logs
 
 from ldcnd.bus.capture import Capture, parse_capture
 from ldcnd.bus.wire_log import WireEvent, WireRecord
-from ldcnd.daemon.capture_store import CaptureStore
+from ldcnd.daemon.capture.captures import CaptureStore
 from tests.unit.test_capture import HEADER, RECORDS
 
 

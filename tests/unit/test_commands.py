@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.daemon.contract import all_schemas
+from ldcnd.daemon.publish.contract import all_schemas
 from ldcnd.messaging.codec import Encoding, decode, encode
 from ldcnd.model.catalogue import AXIS_COMMANDS, AXIS_QUESTIONS, COMMANDS, RIG_COMMANDS, verbs_for
 from ldcnd.model.commands import About, AxisCommand, Capability, Command, CommandReply, Effect, Ends, Verb

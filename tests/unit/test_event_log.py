@@ -4,9 +4,9 @@ import asyncio
 from unittest.mock import Mock
 
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.event_log import PAGE_BYTES, TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
-from ldcnd.daemon.ledger import Entry
-from ldcnd.daemon.publishing import Publisher
+from ldcnd.daemon.command.events import PAGE_BYTES, TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
+from ldcnd.daemon.command.ledger import Entry
+from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import BusDown, SessionError
 from ldcnd.messaging.codec import to_json
 from ldcnd.model.events import CommandStatus, EventsRequest

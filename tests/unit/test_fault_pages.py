@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from ldcnd import errors
 from ldcnd.cli.main import cli, main
-from ldcnd.daemon.axis_tracker import LINK_LOST, LOOP_OPENED, AxisTracker
+from ldcnd.daemon.axis.state import LINK_LOST, LOOP_OPENED, AxisTracker
 from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
 from ldcnd.drivers.smartstep.monitors import ALARMS, AlarmKind
 from ldcnd.errors import DriveFault, ErrorCode, LdcndError

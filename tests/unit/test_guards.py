@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon import guards
-from ldcnd.daemon.guards import AxisView
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.guards import AxisView
 from ldcnd.errors import (
     AccelerationLimit,
     AxisUnreachable,

@@ -4,7 +4,7 @@ import pytest
 from pydantic import ValidationError
 
 from ldcnd.axis_config import AxisConfig
-from ldcnd.daemon.homing import plan_search
+from ldcnd.daemon.axis.procedures.home import plan_search
 from ldcnd.drivers.driver import StopMode
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.daemon.ledger import REMEMBERED, Entry, Ledger
+from ldcnd.daemon.command.ledger import REMEMBERED, Entry, Ledger
 from ldcnd.errors import CommandIdReused, StopLatched, UnknownCommand
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.replies import CommandReply

@@ -1,4 +1,4 @@
-from ldcnd.daemon.observed_tracker import ObservedTracker
+from ldcnd.daemon.axis.state import ObservedTracker
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 from ldcnd.model.axes import AxisState, LinkState, Moving

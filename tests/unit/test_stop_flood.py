@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from ldcnd.daemon.requests import STOPS_AT_ONCE, Requests
+from ldcnd.daemon.command.requests import STOPS_AT_ONCE, Requests
 from ldcnd.errors import InternalError
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Answer, Query

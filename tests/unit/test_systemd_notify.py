@@ -13,10 +13,10 @@ from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.line_phase import Phase
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
-from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.service import Service, describe
-from ldcnd.daemon.systemd import Notifier, reloading, status
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.daemon.process.service import Service, describe
+from ldcnd.daemon.process.systemd import Notifier, reloading, status
 from ldcnd.errors import ConfigError, VelocityLimit
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.axes import AxisState

@@ -7,8 +7,8 @@ from contextlib import asynccontextmanager
 import pytest
 
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.publishing import Publisher
-from ldcnd.daemon.trace_recorder import TraceRecorder
+from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.tracer import ArmedTrace, Granted, Recorded, Tracer
 from ldcnd.errors import OutcomeUnknown
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, encode

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.daemon.trace_trigger import TriggerWatch
+from ldcnd.daemon.trace.host_tracer import TriggerWatch
 from ldcnd.model.traces import TraceTrigger, TriggerKind
 
 

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
-from ldcnd.daemon.asyncapi import asyncapi_document, asyncapi_text
-from ldcnd.daemon.contract import Kind, all_schemas, as_markdown, channels
+from ldcnd.daemon.publish.asyncapi import asyncapi_document, asyncapi_text
+from ldcnd.daemon.publish.contract import Kind, all_schemas, as_markdown, channels
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding
 from ldcnd.messaging.keys import Keys, matches
 from ldcnd.model.frozen import Frozen

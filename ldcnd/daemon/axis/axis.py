@@ -1,0 +1,389 @@
+"""One axis at work: takes commands in turn, lets stops overtake them, digests readings, publishes.
+
+Commands of one axis run one after another: one that finds the axis free in the task of its caller, who then does not
+wait for another one, those that had to wait in the axis's own. A stop never waits for them: it withdraws what is still
+queued, and whatever a command does next finds that the epoch has moved on.
+"""
+
+import asyncio
+import contextlib
+import math
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from ldcnd.axis_config import AxisConfig
+from ldcnd.bus.bus import Bus
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.commands import AxisCommands
+from ldcnd.daemon.axis.motion import AxisMotion, preview
+from ldcnd.daemon.axis.parameters import Parameters
+from ldcnd.daemon.axis.procedure import Turn
+from ldcnd.daemon.axis.state import AxisTracker, Ended, ObservedTracker
+from ldcnd.daemon.axis.telemetry import AxisTelemetry
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
+from ldcnd.daemon.trace.recorder import TRACE_VERBS, TraceRecorder
+from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.scaling import Scale
+from ldcnd.errors import BusError, LdcndError, NotSupported, ShuttingDown, StopLatched, TooManyRequests
+from ldcnd.exchange import Timing
+from ldcnd.log import get_logger
+from ldcnd.model.axes import Moving
+from ldcnd.model.preview import PlanReply, PlanRequest
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import BufferMode, Request, Verb
+from ldcnd.model.samples import TelemetryItem
+
+log = get_logger("axis")
+
+QUEUED_COMMANDS = 8
+STOP_ROUNDS = 5
+"""Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
+
+
+Obey = Callable[[Turn, Request], Awaitable[CommandReply]]
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingCommand:
+    """A command that found the axis at work, and the caller who waits for its answer."""
+
+    turn: Turn
+    request: Request
+    future: "asyncio.Future[CommandReply]"
+
+    async def carry_out(self, obey: Obey) -> None:
+        """Let it have its turn, unless it was answered meanwhile or its caller has gone."""
+        if self.future.done():
+            return
+        try:
+            reply = await obey(self.turn, self.request)
+        except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
+            self.refuse(error)
+            return
+        if not self.future.done():
+            self.future.set_result(reply)
+
+    def refuse(self, error: Exception) -> None:
+        """Give the caller an error, unless it has an answer or has gone."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+
+class AxisTurns:
+    """Who has one axis.
+
+    Attributes:
+        at_work: held by whoever carries out a command or a step.
+    """
+
+    def __init__(self, axis: str) -> None:
+        self.at_work = asyncio.Lock()
+        self._axis = axis
+        self._waiting: deque[WaitingCommand] = deque()
+        self._woken = asyncio.Event()
+
+    @property
+    def free(self) -> bool:
+        """Whether a command that comes now need not wait for another one, or for a step."""
+        return not (self._waiting or self.at_work.locked())
+
+    async def wait(self, turn: Turn, request: Request) -> CommandReply:
+        """Wait behind all others; return the answer.
+
+        Raises:
+            TooManyRequests: too many wait already.
+            LdcndError: as the command itself, or as those that wait were refused.
+        """
+        if len(self._waiting) >= QUEUED_COMMANDS:
+            raise TooManyRequests(
+                f"axis {self._axis}: {QUEUED_COMMANDS} commands wait already",
+                axis=self._axis,
+                limit=QUEUED_COMMANDS,
+                remedy="wait for a reply before sending the next command",
+            )
+        future: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
+        self._waiting.append(WaitingCommand(turn, request, future))
+        self.wake()
+        return await future
+
+    def take(self) -> WaitingCommand | None:
+        """Remove and return the command that has waited longest, or None when none does."""
+        return self._waiting.popleft() if self._waiting else None
+
+    def refuse(self, error: LdcndError) -> None:
+        """Refuse all commands that wait."""
+        while waiting := self.take():
+            waiting.refuse(error)
+
+    def wake(self) -> None:
+        """Have the axis look whether there is something to do."""
+        self._woken.set()
+
+    async def woken(self, deadline_s: float) -> None:
+        """Return when a command waits, when the axis was woken, or at the deadline, in loop time."""
+        if self._waiting:
+            return
+        self._woken.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
+                await self._woken.wait()
+
+
+class AxisService:
+    """The commands, the state and the telemetry of one axis."""
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        bus: Bus,
+        driver: AxisDriver,
+        publisher: Publisher,
+        clock: Clock,
+        next_command_id: Callable[[], str],
+        ended: Ended,
+    ) -> None:
+        self.config = config
+        self.driver = driver
+        self.scale = Scale(config.counts_per_unit or 1.0, reverse=config.direction == "reverse")
+        self.stoppable = Verb.STOP in driver.capabilities
+        tracker = AxisTracker if self.stoppable else ObservedTracker
+        self.tracker = tracker(config.name, config.unit, ended)
+        self.telemetry = AxisTelemetry(
+            publisher,
+            self.tracker,
+            self.scale,
+            adc_full_scale=driver.adc_full_scale,
+            adc_volts=config.adc_volts,
+        )
+        self._bus = bus
+        self._clock = clock
+        self._next_command_id = next_command_id
+        self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
+        self._commands = AxisCommands(self._motion)
+        self._turns = AxisTurns(config.name)
+        self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
+        channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
+        tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
+        self.traces = TraceRecorder(config.name, tracer, publisher, clock)
+        self._successors = asyncio.Lock()
+        self._changed = asyncio.Event()
+        self._epoch = 0
+        self._closed = False
+
+    # -- life --------------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Carry out commands, one after another, until cancelled; then every caller has its answer."""
+        waiting = None
+        try:
+            while True:
+                if not self._commands.step_due:
+                    await self._turns.woken(self._commands.deadline_s)
+                async with self._turns.at_work:
+                    waiting = self._turns.take()
+                    if waiting:
+                        await waiting.carry_out(self._obey)
+                    else:
+                        await self._step()
+        finally:
+            self._closed = True
+            self._epoch += 1
+            self._changed.set()
+            if waiting:
+                waiting.refuse(self._ending())
+            self._turns.refuse(self._ending())
+
+    def reconfigure(self, config: AxisConfig) -> None:
+        """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
+        self.config = config
+        self._motion.reconfigure(config)
+
+    def connected(self, *, referenced: bool) -> None:
+        """The line came up; `referenced` when the drive's position is known to be right."""
+        self.tracker.referenced = referenced
+        if referenced:
+            self.telemetry.origin_counts = 0.0
+
+    def disconnected(self) -> None:
+        """The line is gone."""
+        self.traces.disconnected()
+        self.tracker.disconnected(self._clock.now_ns())
+        self.telemetry.stale(self._clock.now_ns())
+
+    def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
+        """Take a reading from the poller."""
+        was_referenced = self.tracker.referenced
+        self.tracker.observed(reading, timing, self._clock.now_ns())
+        if was_referenced and not self.tracker.referenced:
+            log.warning("reference lost", axis=self.config.name, faults=[fault.code for fault in reading.faults])
+        self._changed.set()
+        self._commands.observed(reading, timing)
+        if self._commands.step_due:
+            self._turns.wake()
+        t, t_error_ns = self._clock.stamp(timing)
+        self.telemetry.reading(reading, asked, t, t_error_ns)
+
+    def missed(self, _error: BusError) -> None:
+        """Take note that a poll brought nothing."""
+        before = self.tracker.link
+        self.tracker.missed(self._clock.now_ns())
+        if self.tracker.link is not before:
+            log.warning("drive does not answer", axis=self.config.name, link=self.tracker.link.value)
+            self.telemetry.stale(self._clock.now_ns())
+
+    def monitored(self, value: MonitorValue, timing: Timing) -> None:
+        """Take a monitor from the family's own poller."""
+        t, t_error_ns = self._clock.stamp(timing)
+        self.telemetry.monitor(value, t, t_error_ns)
+
+    @property
+    def at_work(self) -> bool:
+        """Whether it carries out a command, moves, or may move for all that is known."""
+        return self.tracker.command is not None or self.tracker.moving is not Moving.NO
+
+    # -- commands ----------------------------------------------------------------------------------------------------
+
+    async def execute(self, verb: Verb, request: Request, command_id: str | None = None) -> CommandReply:
+        """Carry out a command in its turn; returns once the drive has acknowledged it.
+
+        Args:
+            verb: what to do.
+            request: with which values.
+            command_id: names the command; one is made when it is missing.
+
+        Raises:
+            RequestRefused: it cannot be done; nothing was sent.
+            BusError: the line failed; `OutcomeUnknown` when the drive may have started.
+        """
+        command_id = command_id or self._next_command_id()
+        if verb in (Verb.STOP, Verb.QUICK_STOP) and self.stoppable:
+            await self.stop(StopMode.SMOOTH if verb is Verb.STOP else StopMode.ABRUPT)
+            return CommandReply(command_id=command_id, axis=self.config.name, verb=verb)
+        if verb not in self.driver.capabilities:
+            raise NotSupported(
+                f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
+            )
+        if self._closed:
+            raise self._ending()
+        turn = self._turn(command_id, verb)
+        if not self._turns.free:
+            return await self._turns.wait(turn, request)
+        try:
+            async with self._turns.at_work:
+                return await self._obey(turn, request)
+        finally:
+            if not math.isinf(self._commands.deadline_s):
+                self._turns.wake()  # for the steps of what has begun
+
+    async def in_turn(self, mode: BufferMode, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
+        """Carry out a move after what the axis is doing: after having halted that, or after its end.
+
+        Raises:
+            StopLatched: a stop, or a later aborting move, came first.
+            LdcndError: as the move itself.
+        """
+        if mode is BufferMode.ABORTING and self.tracker.command:
+            await self.bring_to_rest(StopMode.SMOOTH)
+        still_wanted = self._turn("", Verb.HALT).still_wanted
+        async with self._successors:  # those who wait are served in the order in which they came
+            while self.tracker.command:
+                self._changed.clear()
+                await self._changed.wait()
+                still_wanted()
+            return await execute()
+
+    def preview(self, request: PlanRequest, obstacles: tuple[str, ...]) -> PlanReply:
+        """Tell what a motion would do; no effect. See `preview`."""
+        return preview(self._motion, self._bus, request, obstacles)
+
+    async def stop(self, mode: StopMode) -> bool:
+        """Stop at once, whatever the state, and latch; return whether the drive confirmed it.
+
+        The latch and the new epoch hold from this call on, confirmed or not. A drive that takes no stop over its line
+        is not latched either: nothing could clear that, and nothing here moves it.
+        """
+        if not self.stoppable:
+            log.warning("this drive cannot be stopped over its line", axis=self.config.name)
+            return False
+        self.tracker.latch_stop()
+        log.info("stop", axis=self.config.name, mode=mode.value)
+        return await self.bring_to_rest(mode, Verb.STOP)
+
+    async def bring_to_rest(self, mode: StopMode, verb: Verb = Verb.HALT) -> bool:
+        """Stop at once, before anything that waits; return whether the drive confirmed it."""
+        if not self.stoppable:
+            return False
+        self._epoch += 1
+        self._changed.set()
+        overtaken = self._overtaken("a queued command")
+        self._turns.refuse(overtaken)
+        self._bus.withdraw(self.driver.spec.address, overtaken)
+        if not self.tracker.energised:
+            mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
+        try:
+            return await self._confirmed_stop(mode, verb)
+        finally:
+            self.telemetry.state(self._clock.now_ns())
+
+    async def _confirmed_stop(self, mode: StopMode, verb: Verb) -> bool:
+        for _ in range(STOP_ROUNDS):
+            try:
+                await self.driver.stop(mode)
+            except BusError as error:
+                log.error("stop not confirmed", axis=self.config.name, reason=error.message)
+                if self._bus.is_open:
+                    continue
+                return False
+            if mode is StopMode.OFF:
+                self.tracker.powered(on=False, now_s=self._clock.now_s())
+            else:
+                self._commands.brought_to_rest(self._next_command_id(), verb)
+            return True
+        return False
+
+    def _turn(self, command_id: str, verb: Verb) -> Turn:
+        epoch = self._epoch
+
+        def still_wanted() -> None:
+            if self._closed:
+                raise self._ending()
+            if epoch != self._epoch:
+                raise self._overtaken(verb)
+
+        return Turn(command_id, verb, still_wanted)
+
+    async def _obey(self, turn: Turn, request: Request) -> CommandReply:
+        turn.still_wanted()
+        if turn.verb in TRACE_VERBS:
+            return await self.traces.carry_out(turn.command_id, turn.verb, request)
+        if self._parameters and Parameters.takes(turn.verb):
+            return await self._parameters.carry_out(turn.command_id, turn.verb, request)
+        return await self._commands.carry_out(turn, request)
+
+    def _require_reachable(self) -> None:
+        guards.check_reachable(self.tracker.view())
+
+    async def _read(self) -> AxisReading:
+        """Read the drive's state out of turn."""
+        return await self._bus.execute(self.driver.reading(frozenset()))
+
+    async def _step(self) -> None:
+        """Let the procedure under way take its step, if one is due."""
+        if not self._commands.step_due and self._clock.now_s() < self._commands.deadline_s:
+            return
+        try:
+            await self._commands.step(self._turn(self._next_command_id(), Verb.HALT))
+        except LdcndError as error:
+            log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
+
+    def _ending(self) -> ShuttingDown:
+        return ShuttingDown(f"axis {self.config.name}: the daemon is stopping", axis=self.config.name)
+
+    def _overtaken(self, what: str) -> StopLatched:
+        return StopLatched(
+            f"axis {self.config.name}: {what} was overtaken by a stop", axis=self.config.name, remedy="send reset"
+        )

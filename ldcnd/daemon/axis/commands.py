@@ -1,0 +1,310 @@
+"""What each command does to one axis: check, plan, talk to the drive, tell the tracker."""
+
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
+from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
+from ldcnd.daemon.axis.procedures.analog import AnalogMove
+from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
+from ldcnd.daemon.axis.procedures.home import HomeSequence
+from ldcnd.daemon.axis.procedures.pwm import PwmRun
+from ldcnd.daemon.axis.procedures.track import SetPoint
+from ldcnd.daemon.axis.state import Completion
+from ldcnd.drivers.driver import AxisReading, Gains, StopMode
+from ldcnd.errors import DriveFault, NotSupported, OutcomeUnknown, RequestRefused, StopLatched, WrongState
+from ldcnd.exchange import Timing
+from ldcnd.model.axes import AxisState, LinkState
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import (
+    HaltRequest,
+    HomeRequest,
+    MoveAbsoluteRequest,
+    MoveAnalogRequest,
+    MoveRelativeRequest,
+    MoveVelocityRequest,
+    PowerRequest,
+    Request,
+    ResetRequest,
+    SetGainsRequest,
+    SetOutputsRequest,
+    SetPositionRequest,
+    SetPwmRequest,
+    TrackRequest,
+    Verb,
+)
+
+STEP_RETRY_S = 0.2
+"""A step whose packets were lost is taken again so much later,"""
+BLIND_RETRY_S = 1.0
+"""or so much later while the drive does not answer at all."""
+
+
+class AxisCommands:
+    """The verbs of one axis, and the procedure that the last one may have begun.
+
+    Attributes:
+        step_due: the procedure's next step is due.
+    """
+
+    def __init__(self, motion: AxisMotion) -> None:
+        self.step_due = False
+        self._motion = motion
+        self._config = motion.config
+        self._driver = motion.driver
+        self._tracker = motion.tracker
+        self._gains = motion.driver.spec.gains
+        self._procedure: Procedure | None = None
+
+    async def carry_out(self, turn: Turn, request: Request) -> CommandReply:
+        """Do what the request says; returns once the drive has acknowledged it.
+
+        Raises:
+            RequestRefused: it cannot be done; nothing was sent.
+            DriveFault: the drive's condition forbids it.
+            BusError: the line failed; `OutcomeUnknown` when the drive may have started.
+        """
+        turn.still_wanted()
+        if procedure := self._procedure_for(turn, request):
+            return await self._undertake(procedure)
+        match request:
+            case PowerRequest():
+                return await self._power(turn, on=request.on)
+            case MoveAbsoluteRequest():
+                return await self._move_absolute(turn, request)
+            case MoveRelativeRequest():
+                return await self._move_relative(turn, request)
+            case MoveVelocityRequest():
+                return await self._move_velocity(turn, request)
+            case SetPositionRequest():
+                return self._set_position(turn, request.position)
+            case SetGainsRequest():
+                return await self._set_gains(turn, request)
+            case SetOutputsRequest():
+                return await self._set_outputs(turn, request)
+            case HaltRequest():
+                return await self._halt(turn)
+            case ResetRequest():
+                return await self._reset(turn)
+            case _:
+                raise NotSupported(f"axis {self._config.name} cannot {turn.verb}", axis=self._config.name)
+
+    def _procedure_for(self, turn: Turn, request: Request) -> Procedure | None:
+        """Return what carries out a request that takes more than one step."""
+        match request:
+            case GroupMoveRequest():
+                return GroupMember(self._motion, turn, request)
+            case HomeRequest():
+                return HomeSequence(self._motion, turn, request)
+            case MoveAnalogRequest():
+                return AnalogMove(self._motion, turn, request)
+            case SetPwmRequest():
+                return PwmRun(self._motion, turn, request)
+            case TrackRequest():
+                return SetPoint(self._motion, turn, request, self._procedure)
+            case _:
+                return None
+
+    def brought_to_rest(self, command_id: str, verb: Verb) -> None:
+        """The drive acknowledged a stop: watch the axis come to rest."""
+        self._drop_procedure()
+        self._motion.stopping(command_id, verb)
+
+    # -- procedures --------------------------------------------------------------------------------------------------
+
+    @property
+    def deadline_s(self) -> float:
+        """When the procedure takes its next step at the latest, in loop time; infinite without one."""
+        return self._procedure.deadline_s if self._procedure else NEVER_S
+
+    def observed(self, reading: AxisReading, timing: Timing) -> None:
+        """Take the latest reading, after the tracker has."""
+        self._motion.reading = reading
+        procedure = self._procedure
+        if procedure is None:
+            return
+        if procedure.outlived(self._tracker):
+            self._drop_procedure()
+        elif self._tracker.concerns(timing) and procedure.calls_for_step(reading):
+            self.step_due = True
+
+    async def step(self, turn: Turn) -> CommandReply:
+        """Let the procedure take the step that is due.
+
+        Raises:
+            StopLatched: a stop has overtaken it.
+            BusError: the line failed; the step is taken again.
+        """
+        procedure, self.step_due = self._procedure, False
+        if procedure is None:
+            return self._motion.reply(turn)
+        if procedure.outlived(self._tracker):
+            self._drop_procedure()
+            return self._motion.reply(turn)
+        delay_s = STEP_RETRY_S if self._tracker.link is LinkState.UP else BLIND_RETRY_S
+        due_s, retry_s = procedure.deadline_s, self._motion.clock.now_s() + delay_s
+        procedure.deadline_s = retry_s
+        try:
+            goes_on = await self._take_step(procedure, turn)
+        finally:
+            self.step_due = False  # what was read during the step called for the one that is over
+        if procedure is self._procedure and not goes_on:
+            self._drop_procedure()
+        elif procedure.deadline_s == retry_s:
+            procedure.deadline_s = due_s
+        self._motion.publish_state()
+        return self._motion.reply(turn)
+
+    async def _take_step(self, procedure: Procedure, turn: Turn) -> bool:
+        try:
+            return await procedure.step(turn)
+        except OutcomeUnknown:
+            # what was started must not be started again: the readings tell how it goes
+            return self._tracker.command is not None and self._tracker.command.completion is Completion.PROCEDURE
+        except StopLatched:
+            raise
+        except (RequestRefused, DriveFault) as error:
+            self._tracker.finished(error.message)
+            return False
+
+    def _drop_procedure(self) -> None:
+        self._procedure, self.step_due = None, False
+
+    async def _undertake(self, procedure: Procedure) -> CommandReply:
+        """Begin a procedure; it takes steps only from then on, also when nobody knows whether the drive has begun."""
+        try:
+            reply = await procedure.begin()
+        except OutcomeUnknown:
+            self._procedure, self.step_due = procedure, False
+            raise
+        command = self._tracker.command
+        if command and command.command_id == procedure.turn.command_id:  # else a stop has ended it meanwhile
+            self._procedure, self.step_due = procedure, False
+        return reply
+
+    # -- power -------------------------------------------------------------------------------------------------------
+
+    async def _power(self, turn: Turn, *, on: bool) -> CommandReply:
+        view = self._tracker.view()
+        if on:
+            guards.check_may_power_on(view)
+            guards.check_stands(view)
+            if self._gains is None:
+                raise WrongState(
+                    f"axis {view.name} has no gains: its loop cannot close",
+                    axis=view.name,
+                    remedy="configure gains or send set_gains",
+                )
+        else:
+            guards.check_reachable(view)
+        await self._driver.power(on=on)
+        self._drop_procedure()
+        self._motion.target_counts = None
+        self._tracker.powered(on=on, now_s=self._motion.clock.now_s())
+        self._motion.publish_state()
+        return self._motion.reply(turn)
+
+    async def _halt(self, turn: Turn) -> CommandReply:
+        view = self._tracker.view()
+        guards.check_reachable(view)
+        if view.state in guards.MOTION_STATES:
+            await self._driver.stop(StopMode.SMOOTH)
+            self.brought_to_rest(turn.command_id, turn.verb)
+        return self._motion.reply(turn)
+
+    async def _reset(self, turn: Turn) -> CommandReply:
+        """Recover from what has stopped the motor; mere warnings are cleared with the loop as it is."""
+        tracker = self._tracker
+        view = tracker.view()
+        guards.check_reachable(view)
+        guards.check_stands(view)  # a stop that is under way keeps its latch
+        if tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults):
+            await self._driver.reset()
+            self._drop_procedure()
+            tracker.switched(on=False, now_s=self._motion.clock.now_s())
+        elif tracker.active_faults:
+            await self._driver.clear_warnings()
+        tracker.cleared(self._motion.clock.now_s())
+        self._motion.publish_state()
+        return self._motion.reply(turn)
+
+    # -- motion ------------------------------------------------------------------------------------------------------
+
+    async def _move_absolute(self, turn: Turn, request: MoveAbsoluteRequest) -> CommandReply:
+        view = self._tracker.view()
+        guards.check_may_move(view)
+        guards.check_referenced(view)
+        plan = self._motion.plan_to(request.position, request.velocity, request.acceleration)
+        return await self._move(turn, plan, AxisState.DISCRETE_MOTION)
+
+    async def _move_relative(self, turn: Turn, request: MoveRelativeRequest) -> CommandReply:
+        motion = self._motion
+        guards.check_may_move(self._tracker.view())
+        from_counts = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
+        position = motion.telemetry.position(from_counts) + request.distance
+        plan = motion.plan_to(position, request.velocity, request.acceleration)
+        return await self._move(turn, plan, AxisState.DISCRETE_MOTION)
+
+    async def _move_velocity(self, turn: Turn, request: MoveVelocityRequest) -> CommandReply:
+        view, planner = self._tracker.view(), self._motion.planner
+        guards.check_may_move(view)
+        plan = planner.at_velocity(view, request.velocity, request.acceleration)
+        # bounded in the drive: a trapezoid ends by itself even if this host dies
+        end = planner.limit_ahead(request.velocity) if view.referenced else None
+        if end is None:
+            here = self._motion.telemetry.position(self._motion.latest().position_counts)
+            end = here + request.velocity * self._motion.config.jog_horizon_s
+        bounded = self._motion.plan_to(end, abs(request.velocity), request.acceleration)
+        reply = await self._move(turn, bounded, AxisState.CONTINUOUS_MOTION)
+        return reply.model_copy(update={"velocity": plan.velocity})
+
+    async def _move(
+        self,
+        turn: Turn,
+        plan: MotionPlan,
+        state: AxisState,
+        completion: Completion = Completion.PROFILE,
+    ) -> CommandReply:
+        await self._driver.load(plan.motion)
+        await self._motion.start(turn, state, completion, plan=plan)
+        self._motion.target_counts = plan.motion.target_counts
+        return self._motion.reply(turn).model_copy(
+            update={
+                "position": plan.position,
+                "velocity": plan.velocity,
+                "acceleration": plan.acceleration,
+                "duration_s": plan.duration_s,
+            }
+        )
+
+    # -- registers ---------------------------------------------------------------------------------------------------
+
+    def _set_position(self, turn: Turn, position: float) -> CommandReply:
+        motion = self._motion
+        view = self._tracker.view()
+        guards.check_reachable(view)
+        guards.check_stands(view)
+        guards.check_position_kept(view)
+        motion.telemetry.origin_counts = motion.latest().position_counts - motion.scale.to_counts(position)
+        self._tracker.referenced = True
+        motion.publish_state()
+        return motion.reply(turn).model_copy(update={"position": position})
+
+    async def _set_gains(self, turn: Turn, request: SetGainsRequest) -> CommandReply:
+        view = self._tracker.view()
+        guards.check_reachable(view)
+        asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name)) is not None}
+        if self._gains is None and not {"kp", "el"} <= asked.keys():
+            raise WrongState(
+                f"axis {self._config.name} has no gains yet", axis=self._config.name, remedy="send at least kp and el"
+            )
+        gains = self._gains or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
+        changed = Gains(**{name: asked.get(name, getattr(gains, name)) for name in Gains.__slots__})
+        if changed.sr != gains.sr:
+            guards.check_stands(view)
+        await self._driver.set_gains(changed)
+        self._gains = changed
+        return self._motion.reply(turn)
+
+    async def _set_outputs(self, turn: Turn, request: SetOutputsRequest) -> CommandReply:
+        guards.check_reachable(self._tracker.view())
+        await self._driver.set_outputs(request.limit1, request.limit2)
+        return self._motion.reply(turn)

@@ -1,0 +1,332 @@
+"""How any command moves one axis: plan, load, ask whether it is still wanted, start, bring to rest.
+
+A plan goes from a request in axis units to a motion in counts, checked against limits and quantised to the drive's
+registers. A preview is worked out by the very code that would do it, and not done.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from ldcnd.axis_config import AxisConfig
+from ldcnd.bus.bus import Bus
+from ldcnd.daemon.axis.guards import AxisView, check_acceleration, check_position, check_velocity
+from ldcnd.daemon.axis.procedure import Turn
+from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion
+from ldcnd.daemon.axis.telemetry import AxisTelemetry
+from ldcnd.daemon.clock import Clock
+from ldcnd.drivers.driver import AxisDriver, AxisReading, Motion
+from ldcnd.drivers.scaling import Scale
+from ldcnd.errors import BusError, MalformedRequest, OutcomeUnknown, RequestRefused, ValueOutOfRange, WrongState
+from ldcnd.messaging.codec import error_reply
+from ldcnd.model.axes import AxisState
+from ldcnd.model.preview import PlanReply, PlanRequest
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import Verb
+
+LARGEST_COUNT = 0x7FFFFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPlan:
+    """A motion that may be loaded as it is.
+
+    Attributes:
+        motion: in counts, as the registers hold it.
+        position: target in axis units; None for a motion without one.
+        velocity: in units a second, signed like the motion.
+        acceleration: in units a second squared.
+        duration_s: of the profile, without settling; None for a motion without an end.
+    """
+
+    motion: Motion
+    position: float | None
+    velocity: float
+    acceleration: float
+    duration_s: float | None
+
+
+class MotionPlanner:
+    """Plans the motions of one axis."""
+
+    def __init__(self, config: AxisConfig, driver: AxisDriver, scale: Scale) -> None:
+        self._config = config
+        self._driver = driver
+        self._scale = scale
+
+    def to_position(
+        self,
+        view: AxisView,
+        position: float,
+        *,
+        from_counts: int,
+        origin_counts: float,
+        velocity: float | None,
+        acceleration: float | None,
+    ) -> MotionPlan:
+        """Plan a trapezoid to a position in axis units.
+
+        Raises:
+            PositionLimit, VelocityLimit, AccelerationLimit: a software limit forbids it; names the nearest value.
+            ValueOutOfRange: a register cannot hold it.
+        """
+        speed, rate = self._checked(view, velocity, acceleration)
+        if view.referenced:
+            check_position(view, self._config.limits, position)
+        target = round(self._scale.to_counts(position) + origin_counts)
+        if abs(target) > LARGEST_COUNT or abs(target - from_counts) > LARGEST_COUNT:
+            raise ValueOutOfRange(
+                f"axis {view.name}: target {position:g} {view.unit} is {target} counts, beyond the drive's"
+                " 32-bit counter",
+                axis=view.name,
+                value=position,
+                limit=LARGEST_COUNT,
+            )
+        counts_per_unit = self._scale.counts_per_unit
+        motion = self._driver.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
+        duration_s = profile_duration_s(
+            abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
+        )
+        return MotionPlan(
+            motion,
+            self._scale.to_units(target - origin_counts),
+            motion.velocity_counts_per_s / counts_per_unit,
+            motion.acceleration_counts_per_s2 / counts_per_unit,
+            duration_s,
+        )
+
+    def at_velocity(self, view: AxisView, velocity: float, acceleration: float | None) -> MotionPlan:
+        """Plan a motion at a constant velocity in units a second, without an end.
+
+        Raises:
+            ValueOutOfRange: the velocity is 0, or a register cannot hold it.
+            VelocityLimit, AccelerationLimit: a software limit forbids it.
+        """
+        if velocity == 0:
+            raise ValueOutOfRange(
+                f"axis {view.name}: a velocity of 0 is not a motion", axis=view.name, value=0.0, remedy="send halt"
+            )
+        _, rate = self._checked(view, velocity, acceleration)
+        motion = self._driver.quantise(
+            Motion(None, self._scale.to_counts(velocity), rate * self._scale.counts_per_unit)
+        )
+        return MotionPlan(
+            motion,
+            None,
+            self._scale.to_units(motion.velocity_counts_per_s),
+            motion.acceleration_counts_per_s2 / self._scale.counts_per_unit,
+            None,
+        )
+
+    def limit_ahead(self, velocity: float) -> float | None:
+        """Return the software limit that a motion at this velocity runs towards, in axis units."""
+        limits = self._config.limits
+        return limits.position_max if velocity > 0 else limits.position_min
+
+    def _checked(self, view: AxisView, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
+        speed = self._config.velocity if velocity is None else velocity
+        rate = self._config.acceleration if acceleration is None else acceleration
+        check_velocity(view, self._config.limits, speed)
+        check_acceleration(view, self._config.limits, rate)
+        return speed, rate
+
+
+def profile_duration_s(distance: float, velocity: float, acceleration: float) -> float:
+    """Return how long a trapezoid takes, triangular when it is short; any consistent units, all positive."""
+    if distance * acceleration < velocity * velocity:
+        return 2 * math.sqrt(distance / acceleration)
+    return distance / velocity + velocity / acceleration
+
+
+class AxisMotion:
+    """The ways of one axis to move, shared by its commands and their procedures.
+
+    Attributes:
+        reading: the latest; None before the first.
+        target_counts: where the last motion was told to end; None when it had no end or something came after it.
+    """
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        driver: AxisDriver,
+        scale: Scale,
+        tracker: AxisTracker,
+        telemetry: AxisTelemetry,
+        clock: Clock,
+        read: Callable[[], Awaitable[AxisReading]],
+    ) -> None:
+        """Take what an axis consists of.
+
+        Args:
+            config: of the axis.
+            driver: of its drive.
+            scale: between counts and axis units.
+            tracker: of its state.
+            telemetry: publishes it.
+            clock: of the daemon.
+            read: reads the drive's state at once.
+        """
+        self.config = config
+        self.driver = driver
+        self.scale = scale
+        self.tracker = tracker
+        self.telemetry = telemetry
+        self.clock = clock
+        self.read = read
+        self.planner = MotionPlanner(config, driver, scale)
+        self.reading: AxisReading | None = None
+        self.target_counts: int | None = None
+        self._loop = asyncio.get_running_loop()
+
+    def reconfigure(self, config: AxisConfig) -> None:
+        """Plan with other limits and speeds from now on."""
+        self.config = config
+        self.planner = MotionPlanner(config, self.driver, self.scale)
+
+    def latest(self) -> AxisReading:
+        """Return the latest reading.
+
+        Raises:
+            WrongState: there is none yet.
+        """
+        if self.reading is None:
+            raise WrongState(
+                f"axis {self.config.name}: its position has not been read yet",
+                axis=self.config.name,
+                remedy="wait a moment",
+            )
+        return self.reading
+
+    def counts_of(self, position: float) -> int:
+        """Return the count of the drive that a position in axis units stands for."""
+        return round(self.scale.to_counts(position) + self.telemetry.origin_counts)
+
+    def plan_to(self, position: float, velocity: float | None, acceleration: float | None) -> MotionPlan:
+        """Plan a trapezoid from where the axis is to a position in axis units; raises as `MotionPlanner`."""
+        return self.planner.to_position(
+            self.tracker.view(),
+            position,
+            from_counts=self.latest().position_counts,
+            origin_counts=self.telemetry.origin_counts,
+            velocity=velocity,
+            acceleration=acceleration,
+        )
+
+    async def start(
+        self,
+        turn: Turn,
+        state: AxisState,
+        completion: Completion,
+        *,
+        opens_loop: bool = False,
+        plan: MotionPlan | None = None,
+    ) -> None:
+        """Start what was loaded, unless a stop has come meanwhile; the state says so before the drive does."""
+        turn.still_wanted()
+        self.begin(turn.command_id, turn.verb, state, completion, opens_loop=opens_loop, plan=plan)
+        try:
+            await self.driver.start()
+        except OutcomeUnknown:
+            self.tracker.started(self.clock.now_s())  # the next readings tell
+            raise
+        except BusError as error:
+            self.tracker.finished(error.message)
+            self.publish_state()
+            raise
+        self.tracker.started(self.clock.now_s())
+
+    def begin(
+        self,
+        command_id: str,
+        verb: Verb,
+        state: AxisState,
+        completion: Completion,
+        *,
+        opens_loop: bool = False,
+        plan: MotionPlan | None = None,
+    ) -> None:
+        """Say what the axis is about to do; readings count again once `AxisTracker.started` was called."""
+        self.target_counts = None
+        target, duration_s = (plan.position, plan.duration_s) if plan else (None, None)
+        now_ns = self.clock.now_ns()
+        command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s)
+        self.tracker.begin(command, float("inf"))
+        self.publish_state()
+
+    def stopping(
+        self,
+        command_id: str,
+        verb: Verb,
+        state: AxisState = AxisState.STOPPING,
+        completion: Completion = Completion.REST,
+    ) -> None:
+        """The drive acknowledged a stop: watch the axis come to rest; only reset leads out of error_stop, though."""
+        if self.tracker.energised and self.tracker.state is not AxisState.ERROR_STOP:
+            self.begin(command_id, verb, state, completion)
+            self.tracker.started(self.clock.now_s())
+
+    def publish_state(self) -> None:
+        """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""
+        self._loop.call_soon(self._tell_state)
+
+    def _tell_state(self) -> None:
+        self.telemetry.state(self.clock.now_ns())
+
+    def reply(self, turn: Turn) -> CommandReply:
+        """Return the bare reply to a command."""
+        return CommandReply(command_id=turn.command_id, axis=self.config.name, verb=turn.verb)
+
+
+def preview(motion: AxisMotion, bus: Bus, request: PlanRequest, obstacles: tuple[str, ...]) -> PlanReply:
+    """Plan a motion without sending anything.
+
+    Args:
+        motion: of the axis.
+        bus: its line.
+        request: what is asked.
+        obstacles: what else is in the way now.
+
+    Raises:
+        MalformedRequest: it does not say which motion is meant.
+        WrongState: the position has not been read yet.
+    """
+    name = motion.config.name
+    try:
+        plan = _plan(motion, request)
+    except MalformedRequest:
+        raise
+    except RequestRefused as error:
+        return PlanReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
+    exchanges = motion.driver.exchanges(plan.motion)
+    asked_velocity = motion.config.velocity if request.velocity is None else request.velocity
+    asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
+    return PlanReply(
+        axis=name,
+        refusal=None,
+        obstacles=obstacles,
+        position=plan.position,
+        velocity=plan.velocity,
+        velocity_error=plan.velocity - asked_velocity,
+        acceleration=plan.acceleration,
+        acceleration_error=plan.acceleration - asked_acceleration,
+        duration_s=plan.duration_s,
+        packets=tuple(exchange.request.hex(" ") for exchange in exchanges),
+        bus_s=sum(bus.longest_s(exchange) for exchange in exchanges),
+    )
+
+
+def _plan(motion: AxisMotion, request: PlanRequest) -> MotionPlan:
+    match request.position, request.distance, request.velocity:
+        case float() as position, None, velocity:
+            return motion.plan_to(position, velocity, request.acceleration)
+        case None, float() as distance, velocity:
+            here = motion.telemetry.position(motion.latest().position_counts)
+            return motion.plan_to(here + distance, velocity, request.acceleration)
+        case None, None, float() as velocity:
+            return motion.planner.at_velocity(motion.tracker.view(), velocity, request.acceleration)
+    raise MalformedRequest(
+        f"axis {motion.config.name}: a plan needs exactly one of position, distance, or velocity alone",
+        axis=motion.config.name,
+    )

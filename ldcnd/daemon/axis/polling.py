@@ -1,0 +1,94 @@
+"""How often each item of one axis is asked for; merges what is due into one exchange."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ldcnd.bus.poller import Poller, next_on_grid
+from ldcnd.drivers.driver import AxisDriver, AxisReading
+from ldcnd.errors import BusError
+from ldcnd.exchange import Exchange, Timing
+from ldcnd.model.samples import TelemetryItem
+
+Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], None]
+Missed = Callable[[BusError], None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """What to ask, and when the poll and each of the slower items are due next."""
+
+    exchange: Exchange[AxisReading]
+    due_at_s: float
+    slower_due_s: dict[TelemetryItem, float]
+
+
+class AxisPoller(Poller[AxisReading]):
+    """Polls one axis at the rate of its fastest item; the drive's state comes with every poll.
+
+    Slower items ride along with the poll that is nearest to their own due time, so they are never more than half a poll
+    period early or late, and the line carries one periodic exchange an axis. Deadlines are absolute: a late poll does
+    not shift the next one, and missed periods are skipped, not made up for.
+
+    Attributes:
+        rates_hz: how often each item is asked for.
+    """
+
+    laborious = True
+
+    def __init__(
+        self,
+        driver: AxisDriver,
+        rates_hz: Mapping[TelemetryItem, float],
+        start_at_s: float,
+        deliver: Deliver,
+        missed: Missed,
+    ) -> None:
+        self.node = driver.spec.address
+        self.rates_hz = rates_hz
+        self._driver = driver
+        self._take_rates(rates_hz)
+        self._slower_due_s = dict.fromkeys(self._slower_s, start_at_s)
+        self._deliver = deliver
+        self._missed = missed
+        self._prepared: _Turn | None = None
+        self.due_at_s = start_at_s
+        self.deadline_at_s = start_at_s + self._period_s
+
+    def _take_rates(self, rates_hz: Mapping[TelemetryItem, float]) -> None:
+        self.rates_hz = rates_hz
+        self._period_s = 1.0 / max(rates_hz.values())
+        self._slower_s = {item: 1.0 / rate for item, rate in rates_hz.items() if 1.0 / rate > self._period_s}
+        self._fastest = frozenset(rates_hz) - frozenset(self._slower_s)
+
+    def prepare(self, at_s: float) -> None:
+        """See `Poller`."""
+        self._prepared = self._turn_at(at_s)
+
+    def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
+        """See `Poller`."""
+        turn, self._prepared = self._prepared, None
+        if turn is None or turn.due_at_s <= now_s:
+            turn = self._turn_at(now_s)
+        self.due_at_s, self._slower_due_s = turn.due_at_s, turn.slower_due_s
+        self.deadline_at_s = turn.due_at_s + self._period_s
+        return turn.exchange
+
+    def _turn_at(self, now_s: float) -> _Turn:
+        asked, slower_due_s = self._fastest, self._slower_due_s
+        if slower_due_s:
+            nearer_s = now_s + self._period_s / 2
+            due = [item for item, due_s in slower_due_s.items() if due_s <= nearer_s]
+            slower_due_s = slower_due_s | {
+                item: next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
+            }
+            asked = asked.union(due)
+        due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
+        return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
+
+    def deliver(self, reply: AxisReading, timing: Timing) -> None:
+        """See `Poller`."""
+        self._deliver(reply, reply.asked, timing)
+
+    def missed(self, error: BusError) -> None:
+        """See `Poller`."""
+        self._missed(error)

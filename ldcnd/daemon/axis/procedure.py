@@ -1,0 +1,65 @@
+"""The contract of what goes on after its command was accepted: a homing, a timed duty, a stream of set-points."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ldcnd.daemon.axis.state import AxisTracker
+from ldcnd.drivers.driver import AxisReading
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import Verb
+
+NEVER_S = float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One command whose turn has come, or one more step of it.
+
+    Attributes:
+        command_id: names it everywhere.
+        verb: what is asked.
+        still_wanted: raises `StopLatched` when a stop has overtaken the command; asked before anything that moves.
+    """
+
+    command_id: str
+    verb: Verb
+    still_wanted: Callable[[], None]
+
+
+class Procedure(ABC):
+    """A command that takes steps of its own: when a reading calls for one, or at its deadline.
+
+    Attributes:
+        turn: of the command that began it.
+        deadline_s: when it takes a step without being called for, in loop time.
+    """
+
+    turn: Turn
+    deadline_s: float = NEVER_S
+
+    @abstractmethod
+    async def begin(self) -> CommandReply:
+        """Check, plan, and start.
+
+        Raises:
+            RequestRefused: it cannot be done; nothing was sent.
+            BusError: the line failed; `OutcomeUnknown` when the drive may have started.
+        """
+
+    @abstractmethod
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        """Tell whether the next step is due; the reading was asked for after the latest step took effect."""
+
+    @abstractmethod
+    async def step(self, turn: Turn) -> bool:
+        """Take the next step and tell whether more of them are to come; a step that failed is taken again.
+
+        Raises:
+            StopLatched: a stop has overtaken it.
+            BusError: the line failed.
+        """
+
+    def outlived(self, tracker: AxisTracker) -> bool:
+        """Tell whether the axis has left its command: a fault, a stop or another command ended it."""
+        return tracker.command is None or tracker.command.command_id != self.turn.command_id

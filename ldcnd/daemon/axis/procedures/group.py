@@ -1,0 +1,172 @@
+"""One axis's share of a group move, and where the members wait for each other.
+
+Every member goes through its own axis's queue and guards like any other command, and holds its turn until all the
+others have arrived; then the line starts them together, or none of them moves.
+"""
+
+import asyncio
+
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
+from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.state import Completion
+from ldcnd.drivers.driver import AxisReading
+from ldcnd.drivers.network import Network
+from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, WrongState
+from ldcnd.model.axes import AxisState
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import MoveAbsoluteRequest
+
+MEETING_S = 2.0
+"""A member that has not got its turn by then keeps the whole group from moving."""
+
+
+class GroupMoveRequest(MoveAbsoluteRequest):
+    """One member's share of a group move; made by the daemon, never read from the network."""
+
+    _meeting: "Meeting"
+
+    @classmethod
+    def of(cls, move: MoveAbsoluteRequest, meeting: "Meeting") -> "GroupMoveRequest":
+        """Return the share of an axis."""
+        request = cls(**move.model_dump())
+        request._meeting = meeting
+        return request
+
+    @property
+    def meeting(self) -> "Meeting":
+        """Where the members wait for each other."""
+        return self._meeting
+
+
+class Meeting:
+    """Where the members of one group move wait until all have their turns, and where it is started once."""
+
+    def __init__(self, network: Network, names: frozenset[str]) -> None:
+        self._network = network
+        self._missing = set(names)
+        self._members: dict[str, GroupMember] = {}
+        self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._started.add_done_callback(_look)
+
+    @property
+    def failure(self) -> BaseException | None:
+        """What kept the group from moving, before all else that followed from it."""
+        return self._started.exception() if self._started.done() else None
+
+    def fail(self, error: LdcndError) -> None:
+        """Keep the group from moving: a member cannot; without effect once it was started."""
+        if not self._started.done():
+            self._started.set_exception(error)
+
+    async def join(self, name: str, member: "GroupMember") -> None:
+        """Wait for the others; return once the drives have started.
+
+        Raises:
+            WrongState: another member did not come in time, or refused.
+            LdcndError: as `Network.start_group`.
+        """
+        self._members[name] = member
+        self._missing.discard(name)
+        if not self._missing and not self._started.done():
+            await self._start()
+        try:
+            async with asyncio.timeout(MEETING_S):
+                await asyncio.shield(self._started)
+        except TimeoutError:
+            late = WrongState(f"axes {', '.join(sorted(self._missing))} did not get their turn, so no axis was started")
+            self.fail(late)
+            raise late from None
+
+    async def _start(self) -> None:
+        motions = {name: member.plan.motion for name, member in self._members.items()}
+        try:
+            await self._network.start_group(motions, self._about_to_start)
+        except LdcndError as error:
+            self.fail(error)
+        except asyncio.CancelledError:
+            self.fail(ShuttingDown("the daemon is stopping"))
+            raise
+        else:
+            if not self._started.done():
+                self._started.set_result(None)
+
+    def _about_to_start(self) -> None:
+        """Ask every member whether it is still wanted, and only then say that all of them move."""
+        if self._started.done():
+            raise WrongState("a member of the group has left, so no axis was started")
+        for member in self._members.values():
+            member.turn.still_wanted()
+        for member in self._members.values():
+            member.announce()
+
+
+class GroupMember(Procedure):
+    """One axis of a group move; over as soon as the group was started, the readings tell the rest."""
+
+    def __init__(self, motion: AxisMotion, turn: Turn, request: GroupMoveRequest) -> None:
+        self.turn = turn
+        self.plan: MotionPlan
+        self._motion = motion
+        self._request = request
+        self._announced = False
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`; a member that cannot move keeps the others from moving.
+
+        Raises:
+            LdcndError: as `move_absolute`, or because another member could not.
+        """
+        meeting, motion = self._request.meeting, self._motion
+        try:
+            view = motion.tracker.view()
+            guards.check_may_move(view)
+            guards.check_referenced(view)
+            self.plan = motion.plan_to(self._request.position, self._request.velocity, self._request.acceleration)
+            await meeting.join(motion.config.name, self)
+        except LdcndError as error:
+            meeting.fail(error)
+            self._not_started(error)
+            raise
+        motion.tracker.started(motion.clock.now_s())
+        motion.target_counts = self.plan.motion.target_counts
+        return motion.reply(self.turn).model_copy(
+            update={
+                "position": self.plan.position,
+                "velocity": self.plan.velocity,
+                "acceleration": self.plan.acceleration,
+                "duration_s": self.plan.duration_s,
+            }
+        )
+
+    def announce(self) -> None:
+        """Say that the axis moves, before its drive does."""
+        self._announced = True
+        self._motion.begin(
+            self.turn.command_id, self.turn.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=self.plan
+        )
+
+    def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - part of the contract
+        """See `Procedure`: there are no further steps."""
+        return False
+
+    async def step(self, turn: Turn) -> bool:  # noqa: ARG002 - part of the contract
+        """See `Procedure`."""
+        return False
+
+    def _not_started(self, error: LdcndError) -> None:
+        """Let the readings tell after an unknown outcome; otherwise the axis is where it was."""
+        motion = self._motion
+        if not self._announced:
+            return
+        if isinstance(error, OutcomeUnknown):
+            motion.tracker.started(motion.clock.now_s())
+            return
+        motion.tracker.finished(error.message)
+        motion.publish_state()
+
+
+def _look(started: "asyncio.Future[None]") -> None:
+    """Take note of an error that no member is left to hear."""
+    if not started.cancelled():
+        started.exception()

@@ -1,0 +1,261 @@
+"""Homing step by step: off the switch if the axis stands on it, search, take the reference over, move on.
+
+Every leg is a trapezoid with an end in the drive, so that a search ends even if this host dies.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from ldcnd.axis_config import AxisConfig, HomeConfig
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.motion import LARGEST_COUNT, AxisMotion, MotionPlan
+from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.state import Completion
+from ldcnd.drivers.driver import AxisDriver, AxisReading, HomeCapture, StopMode
+from ldcnd.drivers.scaling import Scale
+from ldcnd.errors import MalformedRequest, NotSupported
+from ldcnd.log import get_logger
+from ldcnd.model.axes import AxisState
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import HomeMethod, HomeRequest, HomeStop
+
+log = get_logger("axis")
+
+DEFAULT_TIMEOUT_S = 60.0
+STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
+BEYOND = 1.1
+"""A search without a distance ends in the drive this much later than its time-out, in case nobody stops it."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomeSearch:
+    """One search.
+
+    Attributes:
+        method: what marks the reference position.
+        velocity: units a second, signed.
+        acceleration: units a second squared; None for the axis default.
+        position: what the position is called there, in axis units.
+        timeout_s: when to give up.
+        distance: how far it may go, in axis units; None for as far as the velocity goes in that time.
+        stop: how the motor stops there.
+        move_to: where to go afterwards, in axis units; None stays.
+        active_high: level of a limit switch input while the switch is actuated.
+    """
+
+    method: HomeMethod
+    velocity: float
+    acceleration: float | None
+    position: float
+    timeout_s: float
+    distance: float | None
+    stop: StopMode
+    move_to: float | None
+    active_high: bool
+
+    def runs_onto_switch(self, scale: Scale) -> bool:
+        """Tell whether the search moves towards the limit switch that it looks for."""
+        forward = scale.to_counts(self.velocity) > 0
+        return self.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
+
+
+def plan_search(config: AxisConfig, driver: AxisDriver, request: HomeRequest) -> HomeSearch:
+    """Complete a request from the axis's configuration.
+
+    Raises:
+        MalformedRequest: neither says how to search, or it contradicts itself.
+        NotSupported: the drive cannot capture on that.
+    """
+    preset = config.home
+    method = request.method or (preset.method if preset else None)
+    velocity = request.velocity if request.velocity is not None else (preset.velocity if preset else None)
+    if method is None or velocity is None:
+        missing = "method" if method is None else "velocity"
+        raise MalformedRequest(
+            f"axis {config.name}: home needs a {missing}; neither the request nor the configuration has one",
+            axis=config.name,
+            remedy=f"send {missing}, or configure [bus.axis.home]",
+        )
+    if method not in driver.home_methods:
+        raise NotSupported(
+            f"axis {config.name}: {config.model} cannot home on {method}; it can on"
+            f" {', '.join(sorted(driver.home_methods))}",
+            axis=config.name,
+            value=method.value,
+        )
+    defaults = preset or HomeConfig(method=method, velocity=velocity, timeout_s=DEFAULT_TIMEOUT_S)
+    stop = request.stop or defaults.stop
+    move_to = request.move_to if request.move_to is not None else defaults.move_to
+    if stop is HomeStop.OFF and move_to is not None:
+        raise MalformedRequest(
+            f"axis {config.name}: home cannot both open the loop and move to {move_to:g} afterwards",
+            axis=config.name,
+            remedy="leave out move_to, or stop otherwise",
+        )
+    return HomeSearch(
+        method=method,
+        velocity=velocity,
+        acceleration=request.acceleration,
+        position=request.position if request.position is not None else defaults.position,
+        timeout_s=request.timeout_s or defaults.timeout_s,
+        distance=request.distance or defaults.distance,
+        stop=STOPS[stop],
+        move_to=move_to,
+        active_high=defaults.switch_active == "high",
+    )
+
+
+class Leg(Enum):
+    """Where a homing is."""
+
+    OFF_SWITCH = "off_switch"
+    CLEAR = "clear"
+    """Off the switch, coming to rest."""
+    SEARCH = "search"
+    FOUND = "found"
+    """Coming to rest before moving on."""
+
+
+class HomeSequence(Procedure):
+    """One homing, from the request to the reference."""
+
+    def __init__(self, motion: AxisMotion, turn: Turn, request: HomeRequest) -> None:
+        self.turn = turn
+        self._motion = motion
+        self._search = plan_search(motion.config, motion.driver, request)
+        self._leg = Leg.SEARCH
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`."""
+        motion = self._motion
+        view = motion.tracker.view()
+        guards.check_may_move(view)
+        search = self._search
+        plan = motion.planner.at_velocity(view, search.velocity, search.acceleration)
+        if search.move_to is not None:
+            guards.check_position(view, motion.config.limits, search.move_to)
+        # the limit switches may not have been in sight at the last poll
+        off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
+        await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.SEARCH)
+        return motion.reply(self.turn).model_copy(
+            update={"position": search.position, "velocity": plan.velocity, "acceleration": plan.acceleration}
+        )
+
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        """See `Procedure`."""
+        resting = reading.profile_done and self._motion.tracker.at_rest
+        if self._leg in (Leg.CLEAR, Leg.FOUND):
+            return resting
+        return not reading.homing or resting
+
+    async def step(self, turn: Turn) -> bool:
+        """See `Procedure`."""
+        turn = replace(turn, command_id=self.turn.command_id, verb=self.turn.verb)
+        reading = self._motion.latest()
+        match self._leg:
+            case Leg.CLEAR if self._motion.clock.now_s() >= self.deadline_s:
+                return await self._give_up(turn, f"not at rest off the switch within {self._search.timeout_s:g} s")
+            case Leg.CLEAR if self._on_switch(reading):
+                return await self._give_up(turn, f"the axis does not come off the {self._search.method} switch")
+            case Leg.CLEAR:
+                await self._set_out(turn, Leg.SEARCH)
+                return True
+            case Leg.FOUND:
+                return await self._move_on(turn)
+        if reading.homing:
+            return await self._give_up(turn, self._failure())
+        if self._leg is Leg.SEARCH:
+            return await self._take_over(turn)
+        await self._motion.driver.stop(StopMode.SMOOTH)
+        turn.still_wanted()
+        self._leg = Leg.CLEAR
+        self._motion.stopping(turn.command_id, turn.verb, AxisState.HOMING, Completion.PROCEDURE)
+        return True
+
+    async def _set_out(self, turn: Turn, leg: Leg) -> None:
+        """Begin a leg that looks for the mark."""
+        motion, search = self._motion, self._search
+        away = leg is Leg.OFF_SWITCH
+        plan = motion.planner.at_velocity(
+            motion.tracker.view(), -search.velocity if away else search.velocity, search.acceleration
+        )
+        capture = HomeCapture(search.method, StopMode.SMOOTH if away else search.stop)
+        leg_motion = replace(
+            plan.motion,
+            target_counts=self._end_of_leg(plan),
+            velocity_counts_per_s=abs(plan.motion.velocity_counts_per_s),
+        )
+        await motion.driver.load(leg_motion, home=capture)
+        self._leg = leg
+        motion.tracker.referenced = False
+        opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
+        self.deadline_s = motion.clock.now_s() + search.timeout_s
+        await motion.start(turn, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and not away)
+
+    def _end_of_leg(self, plan: MotionPlan) -> int:
+        search, here = self._search, self._motion.latest().position_counts
+        speed = plan.motion.velocity_counts_per_s
+        if search.distance is None:
+            reach = abs(speed) * search.timeout_s * BEYOND
+        else:
+            reach = search.distance * self._motion.scale.counts_per_unit
+        room = LARGEST_COUNT - (here if speed > 0 else -here)  # to the end of the counter on this side
+        return here + round(math.copysign(min(reach, max(room, 0), LARGEST_COUNT), speed))
+
+    def _failure(self) -> str:
+        search = self._search
+        if search.distance is None or self._motion.clock.now_s() >= self.deadline_s:
+            return f"no {search.method} within {search.timeout_s:g} s"
+        return f"no {search.method} within {search.distance:g} {self._motion.config.unit}"
+
+    async def _give_up(self, turn: Turn, failure: str) -> bool:
+        await self._motion.driver.stop(StopMode.SMOOTH)
+        turn.still_wanted()
+        log.warning("homing failed", axis=self._motion.config.name, reason=failure)
+        self._motion.stopping(turn.command_id, turn.verb)
+        self._motion.tracker.failing(failure)
+        return False
+
+    async def _take_over(self, turn: Turn) -> bool:
+        """Read what was captured and make it the reference; the axis comes to rest meanwhile."""
+        motion, search = self._motion, self._search
+        driver, tracker = motion.driver, motion.tracker
+        if search.method is HomeMethod.POSITION_ERROR:
+            await driver.reset()  # the drive has tripped, as it was meant to
+        else:
+            await driver.stop(search.stop)
+        captured = await driver.captured_home()
+        await driver.clear_warnings()  # homing on the current sets one
+        turn.still_wanted()
+        closed = search.stop is not StopMode.OFF
+        if search.method is HomeMethod.POSITION_ERROR and closed:
+            await driver.power(on=True)
+            turn.still_wanted()
+        tracker.switched(on=closed, now_s=motion.clock.now_s())
+        motion.telemetry.origin_counts = captured - motion.scale.to_counts(search.position)
+        tracker.referenced = True
+        if not closed:
+            tracker.finished()
+            motion.publish_state()
+            return False
+        if search.move_to is None:
+            motion.stopping(turn.command_id, turn.verb, AxisState.HOMING)
+            return False
+        self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
+        motion.stopping(turn.command_id, turn.verb, AxisState.HOMING, Completion.PROCEDURE)
+        return True
+
+    async def _move_on(self, turn: Turn) -> bool:
+        motion, move_to = self._motion, self._search.move_to
+        if move_to is None or not motion.tracker.at_rest:
+            return await self._give_up(turn, f"not at rest within {self._search.timeout_s:g} s")
+        plan = motion.plan_to(move_to, None, None)
+        await motion.driver.load(plan.motion)
+        await motion.start(turn, AxisState.HOMING, Completion.PROFILE)
+        motion.target_counts = plan.motion.target_counts
+        return False
+
+    def _on_switch(self, reading: AxisReading) -> bool:
+        level = reading.reverse_limit if self._search.method is HomeMethod.REVERSE_LIMIT else reading.forward_limit
+        return level is not None and level is self._search.active_high

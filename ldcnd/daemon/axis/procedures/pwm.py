@@ -1,0 +1,86 @@
+"""A raw duty on the motor for a limited time, then a controlled stop.
+
+Nothing in these drives bounds a duty: if this daemon dies, the motor runs on. That is why the time must be named and
+the axis must be configured for it.
+"""
+
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.motion import AxisMotion
+from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.state import AxisTracker, Completion
+from ldcnd.drivers.driver import AxisReading, Motion, PwmOutput, StopMode
+from ldcnd.errors import NotSupported, ValueOutOfRange
+from ldcnd.model.axes import AxisState
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import SetPwmRequest, Verb
+
+FULL_DUTY = 255
+"""Steps of the duty in one direction on these drives."""
+
+
+class PwmRun(Procedure):
+    """One duty, from the request to the stop that ends it."""
+
+    def __init__(self, motion: AxisMotion, turn: Turn, request: SetPwmRequest) -> None:
+        self.turn = turn
+        self._motion = motion
+        self._request = request
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`. A duty under way may be replaced by another."""
+        motion, request = self._motion, self._request
+        view, active = motion.tracker.view(), motion.tracker.command
+        if active is None or active.verb is not Verb.SET_PWM:
+            guards.check_may_move(view)
+        else:
+            guards.check_may_power_on(view)
+        self._check_bounds()
+        speed, rate = motion.config.velocity, motion.config.acceleration
+        counts_per_unit = motion.scale.counts_per_unit
+        acceleration = motion.driver.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
+        duty = -request.duty if motion.scale.reverse else request.duty
+        await motion.driver.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
+        self.deadline_s = motion.clock.now_s() + request.duration_s
+        await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
+        return motion.reply(self.turn).model_copy(
+            update={"duration_s": request.duration_s, "duty": round(request.duty * FULL_DUTY) / FULL_DUTY}
+        )
+
+    def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - what the drive says is no comfort
+        """See `Procedure`: an axis that lost its command while it was out of sight may still be running."""
+        return self._motion.tracker.command is None
+
+    async def step(self, turn: Turn) -> bool:  # noqa: ARG002 - a stop needs nobody's leave
+        """See `Procedure`: the time is over. An axis that has meanwhile failed is switched off instead."""
+        ours = self._motion.tracker.command is not None
+        await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)
+        if ours:
+            self._motion.stopping(self.turn.command_id, self.turn.verb)
+        return False
+
+    def outlived(self, tracker: AxisTracker) -> bool:
+        """See `Procedure`; without a command nobody knows whether the motor still runs."""
+        return tracker.command is not None and super().outlived(tracker)
+
+    def _check_bounds(self) -> None:
+        name, bounds, request = self._motion.config.name, self._motion.config.pwm, self._request
+        if bounds is None:
+            raise NotSupported(
+                f"axis {name} is not configured for raw duties", axis=name, remedy="configure [bus.axis.pwm]"
+            )
+        if abs(request.duty) > bounds.duty:
+            raise ValueOutOfRange(
+                f"axis {name}: duty {request.duty:g} is above the limit {bounds.duty:g}",
+                axis=name,
+                value=request.duty,
+                limit=bounds.duty,
+                nearest=bounds.duty if request.duty > 0 else -bounds.duty,
+            )
+        if request.duration_s > bounds.duration_s:
+            raise ValueOutOfRange(
+                f"axis {name}: {request.duration_s:g} s of duty is above the limit {bounds.duration_s:g} s",
+                axis=name,
+                value=request.duration_s,
+                limit=bounds.duration_s,
+                nearest=bounds.duration_s,
+            )

@@ -1,0 +1,113 @@
+"""A stream of set-points that an axis follows without a profile, bounded in step and rate."""
+
+from ldcnd.axis_config import TrackingConfig
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.motion import AxisMotion
+from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.state import Completion
+from ldcnd.drivers.driver import AxisReading
+from ldcnd.errors import BusError, NotSupported, OutcomeUnknown, TooManyRequests, ValueOutOfRange
+from ldcnd.model.axes import AxisState
+from ldcnd.model.replies import CommandReply
+from ldcnd.model.requests import TrackRequest, Verb
+
+IDLE_PERIODS = 5
+SHORTEST_IDLE_S = 0.5
+"""A stream is over when nothing has come for so many of its shortest periods, but not sooner than this."""
+EARLY = 0.5
+"""A set-point may come this share of a period early; the mean rate is kept."""
+
+
+class SetPoint(Procedure):
+    """One set-point; it takes the stream over from the one before it."""
+
+    def __init__(self, motion: AxisMotion, turn: Turn, request: TrackRequest, before: Procedure | None) -> None:
+        self.turn = turn
+        self._motion = motion
+        self._request = request
+        self._before = before if isinstance(before, SetPoint) and not before.outlived(motion.tracker) else None
+        self._due_s = 0.0  # when this one could have come at the configured rate
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`.
+
+        Raises:
+            TooManyRequests: faster than the configured rate.
+            ValueOutOfRange: farther from the last set-point than the configured step.
+        """
+        motion, tracker, position = self._motion, self._motion.tracker, self._request.position
+        view, bounds = tracker.view(), self._bounds()
+        before, self._before = self._before, None  # a stream keeps only its last set-point
+        if before:
+            guards.check_may_power_on(view)
+        else:
+            guards.check_may_move(view)
+        guards.check_referenced(view)
+        guards.check_position(view, motion.config.limits, position)
+        self._check_rate(before, bounds)
+        target = motion.counts_of(position)
+        self._check_step(target, bounds)
+        if tracker.command and tracker.command.verb is Verb.TRACK:
+            tracker.finished()  # the stream goes on under the new command's name
+        motion.begin(self.turn.command_id, self.turn.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
+        try:
+            await motion.driver.track(target)
+        except OutcomeUnknown:
+            motion.target_counts = target  # if it was not executed the next set-point is still near enough
+            tracker.started(motion.clock.now_s())
+            raise
+        except BusError as error:
+            tracker.finished(error.message)
+            motion.publish_state()
+            raise
+        motion.target_counts = target
+        tracker.started(motion.clock.now_s())
+        return motion.reply(self.turn).model_copy(update={"position": motion.telemetry.position(target)})
+
+    def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - silence alone ends a stream
+        """See `Procedure`."""
+        return False
+
+    async def step(self, turn: Turn) -> bool:  # noqa: ARG002 - nothing is sent
+        """See `Procedure`: nothing came any more; the axis holds the last set-point."""
+        self._motion.tracker.finished()
+        self._motion.publish_state()
+        return False
+
+    def _bounds(self) -> TrackingConfig:
+        config = self._motion.config
+        if config.tracking is None:
+            raise NotSupported(
+                f"axis {config.name} is not configured for tracking",
+                axis=config.name,
+                remedy="configure [bus.axis.tracking]",
+            )
+        return config.tracking
+
+    def _check_rate(self, before: "SetPoint | None", bounds: TrackingConfig) -> None:
+        now_s, period_s = self._motion.clock.now_s(), 1.0 / bounds.rate
+        due_s = before._due_s + period_s if before else now_s  # noqa: SLF001 - the same stream
+        if now_s < due_s - EARLY * period_s:
+            raise TooManyRequests(
+                f"axis {self._motion.config.name}: more than {bounds.rate:g} set-points a second",
+                axis=self._motion.config.name,
+                limit=bounds.rate,
+                remedy="send them more slowly",
+            )
+        self._due_s = max(due_s, now_s)
+
+    def _check_step(self, target: int, bounds: TrackingConfig) -> None:
+        motion = self._motion
+        last = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
+        step = motion.scale.to_units(target - last)
+        if abs(step) > bounds.step:
+            nearest = motion.telemetry.position(last) + (bounds.step if step > 0 else -bounds.step)
+            raise ValueOutOfRange(
+                f"axis {motion.config.name}: set-point {self._request.position:g} is {abs(step):g} from the last one,"
+                f" the limit is {bounds.step:g}",
+                axis=motion.config.name,
+                value=self._request.position,
+                limit=bounds.step,
+                nearest=nearest,
+            )

@@ -1,0 +1,312 @@
+"""What the daemon knows of one axis: digests readings and commands into PLCopen states. Pure; time is an input."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from ldcnd.daemon.axis.guards import MOTION_STATES, AxisView
+from ldcnd.drivers.driver import AxisReading, Fault
+from ldcnd.exchange import Timing
+from ldcnd.fault_pages import page_of
+from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.requests import Verb
+from ldcnd.model.samples import FaultEntry
+
+MISSES_UNTIL_DOWN = 3
+"""So many polls in a row must fail before the drive counts as gone."""
+LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
+LOOP_OPENED = Fault("loop_opened", "the drive opened its position loop by itself; find out why, then send reset")
+
+
+class Completion(Enum):
+    """When a command is done."""
+
+    PROFILE = "profile"
+    """The drive says the profile has ended."""
+    REST = "rest"
+    """The profile has ended and nothing moves."""
+    PROCEDURE = "procedure"
+    """The procedure that follows it says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveCommand:
+    """A motion under way.
+
+    Attributes:
+        command_id: as told to the caller.
+        verb: what was asked.
+        since_ns: when it was accepted, UTC.
+        state: the axis state while it runs.
+        completion: what ends it.
+        opens_loop: it runs or ends with the position loop open, so an open loop is no failure.
+        target: where it ends, in axis units; None when it has no end of its own.
+        duration_s: of its profile, without settling; None when it has no end of its own.
+    """
+
+    command_id: str
+    verb: Verb
+    since_ns: int
+    state: AxisState
+    completion: Completion
+    opens_loop: bool = False
+    target: float | None = None
+    duration_s: float | None = None
+
+
+Ended = Callable[[ActiveCommand, CommandStatus, str | None], None]
+"""Takes a command that is over, how it ended, and why when it was not done."""
+
+
+def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None) -> None:
+    pass
+
+
+class AxisTracker:
+    """The state of one axis, changed only by what was observed or commanded."""
+
+    def __init__(self, name: str, unit: str, ended: Ended = _nobody) -> None:
+        """Begin in ignorance.
+
+        Args:
+            name: of the axis.
+            unit: of the axis.
+            ended: told of every command that is over.
+        """
+        self._ended = ended
+        self.name = name
+        self.unit = unit
+        self.state = AxisState.DISABLED
+        self.enabled = False
+        self.referenced = False
+        self.position_lost = False
+        self.stop_latched = False
+        self.link = LinkState.DOWN
+        self.command: ActiveCommand | None = None
+        self.last_error: str | None = None
+        self.active_faults: tuple[FaultEntry, ...] = ()
+        self.first_fault: FaultEntry | None = None
+        self._failure: str | None = None
+        self._misses = 0
+        self._effective_from_s = 0.0
+        self._at_rest = False
+
+    # -- what others ask ---------------------------------------------------------------------------------------------
+
+    def view(self) -> AxisView:
+        """Return what the guards need to know."""
+        return AxisView(
+            self.name,
+            self.unit,
+            self.state,
+            self.enabled,
+            self.referenced,
+            self.position_lost,
+            self.stop_latched,
+            self.link,
+            tuple(fault.text for fault in self.active_faults),
+        )
+
+    @property
+    def moving(self) -> Moving:
+        """Whether the axis moves, as far as the latest reading tells; never "no" without a reading that says so."""
+        if self.link is not LinkState.UP:
+            return Moving.UNKNOWN
+        if self.state in MOTION_STATES or not self._at_rest:
+            return Moving.YES
+        return Moving.NO
+
+    @property
+    def quality(self) -> Quality:
+        """What a value read just now is worth."""
+        match self.link:
+            case LinkState.UP:
+                return Quality.GOOD
+            case LinkState.DEGRADED:
+                return Quality.UNCERTAIN
+            case LinkState.DOWN:
+                return Quality.BAD
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the latest reading shows no velocity."""
+        return self._at_rest
+
+    @property
+    def energised(self) -> bool:
+        """Whether the motor gets voltage: the loop is closed, or open for a command that wants it so."""
+        return self.enabled or (self.command is not None and self.command.opens_loop)
+
+    def concerns(self, timing: Timing) -> bool:
+        """Tell whether a reading was asked for after the latest command took effect."""
+        return timing.sent_at_s >= self._effective_from_s
+
+    # -- what was observed -------------------------------------------------------------------------------------------
+
+    def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
+        """Digest a reading; `now_ns` stamps the faults that it brings up."""
+        faults = reading.faults
+        self._misses = 0
+        self.link = LinkState.UP
+        if faults or self.active_faults:
+            self._faults(faults, now_ns)
+        self.position_lost = bool(faults) and any(fault.loses_position for fault in faults)
+        if self.position_lost:
+            self.referenced = False
+        self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
+        if not self.concerns(timing):
+            return  # asked before the latest command took effect: says nothing about it
+        self.enabled = reading.enabled
+        if faults and any(fault.stops for fault in faults):
+            self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")
+        elif self.enabled:
+            self._enabled_reading(reading)
+        elif self.command and self.command.opens_loop:
+            pass
+        elif self.state not in (AxisState.DISABLED, AxisState.ERROR_STOP):
+            self._faults((*faults, LOOP_OPENED), now_ns)
+            self._fail(LOOP_OPENED.text)
+
+    def _enabled_reading(self, reading: AxisReading) -> None:
+        command = self.command
+        if command is None:
+            if self.state is not AxisState.ERROR_STOP:
+                resting = reading.profile_done and self._at_rest
+                self.state = AxisState.STANDSTILL if resting else AxisState.DISCRETE_MOTION
+            return
+        match command.completion:
+            case Completion.PROFILE if reading.profile_done:
+                self.finished()
+            case Completion.REST if reading.profile_done and self._at_rest:
+                self.finished()
+            case _:
+                pass
+
+    def missed(self, now_ns: int) -> None:
+        """Count a poll that brought nothing."""
+        self._misses += 1
+        if self._misses >= MISSES_UNTIL_DOWN:
+            self.disconnected(now_ns)
+        elif self.link is LinkState.UP:
+            self.link = LinkState.DEGRADED
+
+    def disconnected(self, now_ns: int) -> None:
+        """The drive is gone: nothing is known any more, and nothing resumes."""
+        if self.link is LinkState.DOWN:
+            return
+        self.link = LinkState.DOWN
+        self.referenced = False
+        self._at_rest = False
+        self._faults((LINK_LOST,), now_ns)
+        if self.state is not AxisState.DISABLED:
+            self._fail(LINK_LOST.text)
+
+    def _faults(self, faults: tuple[Fault, ...], now_ns: int) -> None:
+        known = {entry.code: entry for entry in self.active_faults}
+        self.active_faults = tuple(
+            known.get(fault.code)
+            or FaultEntry(
+                code=fault.code,
+                text=fault.text,
+                since=now_ns,
+                source="daemon" if fault in (LINK_LOST, LOOP_OPENED) else "drive",
+                stops=fault.stops,
+                page=page_of(fault.code),
+            )
+            for fault in faults
+        )
+        if self.first_fault is None and self.active_faults:
+            self.first_fault = self.active_faults[0]
+
+    def _fail(self, reason: str) -> None:
+        self.state = AxisState.ERROR_STOP
+        self._end(CommandStatus.FAILED, reason)
+
+    def _end(self, status: CommandStatus, reason: str | None = None) -> None:
+        command, self.command = self.command, None
+        self._failure = None
+        if command is None:
+            return
+        if reason:
+            self.last_error = f"{command.verb}: {reason}"
+        self._ended(command, status, reason)
+
+    # -- what was commanded ------------------------------------------------------------------------------------------
+
+    def begin(self, command: ActiveCommand, now_s: float) -> None:
+        """A motion is about to start; whatever ran before was aborted by it."""
+        if self.command is None:
+            self.last_error = None
+        elif self.command.command_id != command.command_id:
+            self._end(CommandStatus.ABORTED, f"aborted by {command.verb}")
+        self.command = command
+        self.state = command.state
+        self._effective_from_s = now_s
+        self._at_rest = False
+
+    def started(self, now_s: float) -> None:
+        """The drive acknowledged: only readings asked for from now on tell how the command goes."""
+        self._effective_from_s = now_s
+
+    def failing(self, reason: str) -> None:
+        """The active command will not end as it was asked, for this reason, once the axis has come to rest."""
+        self._failure = reason
+
+    def finished(self, error: str | None = None) -> None:
+        """The active command is over: done, or ended as `error` says."""
+        error = error or self._failure
+        self._end(CommandStatus.FAILED if error else CommandStatus.DONE, error)
+        self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
+
+    def latch_stop(self) -> None:
+        """A stop was asked for: nothing moves again before reset."""
+        self.stop_latched = True
+
+    def powered(self, *, on: bool, now_s: float) -> None:
+        """The drive acknowledged a change of power."""
+        self._effective_from_s = now_s
+        self._end(CommandStatus.ABORTED, "aborted by power")
+        self.enabled = on
+        self._at_rest = on
+        if self.state is not AxisState.ERROR_STOP:
+            self.state = AxisState.STANDSTILL if on else AxisState.DISABLED
+
+    def switched(self, *, on: bool, now_s: float) -> None:
+        """The loop was opened or closed in the course of a command, which goes on."""
+        self._effective_from_s = now_s
+        self.enabled = on
+        self._at_rest = False
+
+    def cleared(self, now_s: float) -> None:
+        """Reset: latch and first cause are forgotten; the next readings tell what stands."""
+        self._effective_from_s = now_s
+        self.stop_latched = False
+        self.position_lost = False
+        self.active_faults = ()
+        self.first_fault = None
+        self.last_error = None
+        if self.state is AxisState.ERROR_STOP:
+            self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
+
+
+class ObservedTracker(AxisTracker):
+    """An `AxisTracker` without commands: Disabled, Standstill, moving, ErrorStop as the drive shows them."""
+
+    def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:  # noqa: ARG002 - of the contract
+        """Digest a reading."""
+        self._misses = 0
+        self.link = LinkState.UP
+        self._faults(reading.faults, now_ns)
+        if not self.active_faults:
+            self.first_fault = None
+        self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
+        self.enabled = reading.enabled
+        self.state = self._shown(reading)
+
+    def _shown(self, reading: AxisReading) -> AxisState:
+        if any(fault.stops for fault in reading.faults):
+            return AxisState.ERROR_STOP
+        if not reading.enabled:
+            return AxisState.DISABLED
+        return AxisState.STANDSTILL if self._at_rest else AxisState.DISCRETE_MOTION

@@ -1,0 +1,190 @@
+"""Queries in, answers out: the only place where an exception becomes an error reply."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.capture.flight_recorder import Journal
+from ldcnd.daemon.command.dispatch import Control, move_together
+from ldcnd.daemon.command.loss import LeaseWatch, rehearse
+from ldcnd.daemon.line.rig import Rig
+from ldcnd.errors import InternalError, LdcndError, MalformedRequest, ShuttingDown, TooManyRequests, UnknownVerb
+from ldcnd.log import get_logger
+from ldcnd.messaging.codec import decode, encode, reply_encoding
+from ldcnd.messaging.keys import RIG_ITSELF, Keys
+from ldcnd.messaging.session import Query
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.group_moves import MoveTogetherReply, MoveTogetherRequest
+from ldcnd.model.preview import PlanReply, PlanRequest
+from ldcnd.model.rehearsal import RehearsalRequest
+from ldcnd.model.replies import StopReply
+from ldcnd.model.requests import REQUEST_MODELS, MoveAbsoluteRequest, StopRequest, Verb
+from ldcnd.model.verbs import MOVE_TOGETHER, PLAN, REHEARSE, WHY
+from ldcnd.model.why import WhyRequest
+
+log = get_logger("requests")
+
+STOPS_AT_ONCE = 8
+"""So many stops of the same axes are sent one beside the other; more than that join."""
+PENDING_REQUESTS = 64
+"""So many commands may be under way at once; stops are not counted."""
+
+
+class Requests:
+    """Answers the command and stop queries of one rig, each exactly once."""
+
+    def __init__(self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, control: Control, leases: LeaseWatch) -> None:
+        self._rig = rig
+        self._control = control
+        self._leases = leases
+        self._keys = keys
+        self._group = group
+        self._journal = Journal(rig)
+        self._pending = 0
+        self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
+        self._closing = False
+
+    def close(self) -> None:
+        """Refuse further commands; stops are still taken."""
+        self._closing = True
+
+    def on_command(self, query: Query) -> None:
+        """Take a query on `@cmd/**`."""
+        self._leases.expire()  # before anything that waited while this process or its client was frozen
+        if self._pending >= PENDING_REQUESTS:
+            self._refuse(
+                query,
+                TooManyRequests(
+                    f"{PENDING_REQUESTS} commands are under way already; nothing was done",
+                    limit=PENDING_REQUESTS,
+                    remedy="wait for replies before sending more",
+                ),
+            )
+            return
+        self._pending += 1
+        task = self._group.create_task(self._answer(query, self._command), name=f"command {query.key}")
+        task.add_done_callback(self._done)
+
+    def on_stop(self, query: Query) -> None:
+        """Take a query on `@stop` or `@stop/<axis>`."""
+        self._group.create_task(self._answer(query, self._stop), name=f"stop {query.key}")
+
+    def _done(self, _task: "asyncio.Task[None]") -> None:
+        self._pending -= 1
+
+    async def _answer(self, query: Query, run: Callable[[Query], Awaitable[Frozen]]) -> None:
+        try:
+            reply = await run(query)
+        except LdcndError as error:
+            self._refuse(query, error)
+        except asyncio.CancelledError:
+            self._refuse(query, ShuttingDown("the daemon is stopping"))
+            raise
+        except Exception:
+            log.exception("bug while answering", key=query.key)
+            self._refuse(query, InternalError("an error inside ldcnd; its log has the details"))
+        else:
+            query.reply(*encode(reply, reply_encoding(query.encoding)))
+
+    async def _command(self, query: Query) -> Frozen:
+        address = self._keys.parse_command(query.key)
+        if self._closing:
+            raise ShuttingDown("the daemon is stopping", axis=address.axis)
+        if address.axis == RIG_ITSELF and address.verb == REHEARSE:
+            rehearsal = decode(RehearsalRequest, query.payload, query.encoding)
+            self._journal.asked(RIG_ITSELF, REHEARSE, rehearsal)
+            return await rehearse(self._rig, rehearsal)
+        if address.axis == RIG_ITSELF and address.verb == MOVE_TOGETHER:
+            request = decode(MoveTogetherRequest, query.payload, query.encoding)
+            self._journal.asked(RIG_ITSELF, MOVE_TOGETHER, request)
+            return await self._move_together(request, query.login)
+        if address.axis == RIG_ITSELF:
+            return self._control.rig.answer(address.verb, query.payload, query.encoding)
+        axis = self._rig.axis(address.axis)
+        if address.verb == WHY:
+            return self._control.commands.why(axis, decode(WhyRequest, query.payload, query.encoding))
+        if address.verb == PLAN:
+            return self._plan(axis, decode(PlanRequest, query.payload, query.encoding))
+        try:
+            verb = Verb(address.verb)
+        except ValueError:
+            raise UnknownVerb(
+                f"there is no command {address.verb!r}; there are {', '.join(Verb)}",
+                axis=address.axis,
+                value=address.verb,
+            ) from None
+        command = decode(REQUEST_MODELS[verb], query.payload, query.encoding)
+        self._journal.asked(address.axis, verb, command)
+        return await self._control.commands.carry_out(address.axis, verb, command, query.login)
+
+    async def _move_together(self, request: MoveTogetherRequest, login: str | None) -> MoveTogetherReply:
+        moves = {move.axis: MoveAbsoluteRequest(**move.model_dump(exclude={"axis"})) for move in request.moves}
+        if len(moves) < len(request.moves):
+            raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
+        replies = await move_together(self._rig, moves, partial(self._control.commands.carry_out, login=login))
+        return MoveTogetherReply(replies=replies)
+
+    def _plan(self, axis: AxisService, request: PlanRequest) -> PlanReply:
+        why = self._control.commands.why(axis, WhyRequest(absolute=request.position is not None))
+        return axis.preview(request, tuple(cause.text for cause in why.causes))
+
+    async def _stop(self, query: Query) -> Frozen:
+        """Stop even if the payload is nonsense: a stop is always accepted."""
+        name = self._keys.parse_stop(query.key)
+        names = tuple(self._rig.axes) if name is None else (self._rig.axis(name).config.name,)
+        try:
+            self._journal.stopped(name)
+        except Exception:
+            log.exception("stop not recorded", key=query.key)  # it is carried out all the same
+        return StopReply(axes=names, confirmed=await self._stop_once(names, query))
+
+    async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
+        """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.
+
+        Hundreds may ask at once, and the lines carry a few stops for all of them. Only a stop whose latches still hold
+        is joined: since they were set nothing has begun to move, so there is nothing that it does not stop. What joins
+        leaves no event of its own.
+        """
+        under_way = self._stops.setdefault(names, [])
+        if len(under_way) >= STOPS_AT_ONCE and self._are_latched(names):
+            confirmed = await asyncio.shield(under_way[-1])
+            if self._are_latched(names):
+                return confirmed
+            # a reset that was under way has taken the latch from this stop
+        for axis in (self._rig.axis(name) for name in names):
+            if axis.stoppable:
+                axis.tracker.latch_stop()  # at once, for those who ask in this very turn of the loop
+        own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
+        under_way.append(own)
+        try:
+            confirmed = await self._rig.stop(names)
+        except BaseException:
+            own.set_exception(InternalError("the stop that this one had joined was cut short"))
+            own.exception()  # perhaps nobody has joined
+            raise
+        else:
+            own.set_result(confirmed)
+            self._enter_stop(query, names, confirmed)
+            return confirmed
+        finally:
+            under_way.remove(own)
+
+    def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
+        """Tell in the events who has asked for a stop, as far as that can be read; nothing has waited for this."""
+        try:
+            request = decode(StopRequest, query.payload, query.encoding)
+        except LdcndError:
+            request = StopRequest()
+        try:
+            self._control.commands.stopped(names, confirmed, request, query.login)
+        except Exception:
+            log.exception("stop not entered into the events", key=query.key)
+
+    def _are_latched(self, names: tuple[str, ...]) -> bool:
+        axes = (self._rig.axis(name) for name in names)
+        return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
+
+    def _refuse(self, query: Query, error: LdcndError) -> None:
+        log.info("refused", key=query.key, code=error.code.value, reason=error.message)
+        query.refuse(error)

@@ -1,0 +1,53 @@
+"""Why an axis cannot move now: every guard is asked, not only the first that refuses."""
+
+from collections.abc import Callable
+
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.state import AxisTracker
+from ldcnd.errors import DriveFault, LdcndError
+from ldcnd.model.samples import FaultEntry
+from ldcnd.model.why import Cause, WhyReply
+
+
+def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) -> WhyReply:
+    """Ask every guard about a motion.
+
+    Args:
+        tracker: what is known of the axis.
+        admit: raises what the authority would refuse the sender with.
+        absolute: whether the motion would name a position.
+    """
+    view = tracker.view()
+    checks: list[Callable[[], None]] = [
+        admit,
+        lambda: guards.check_reachable(view),
+        lambda: guards.check_not_latched(view),
+        *(_fault(view.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
+        lambda: guards.check_not_in_error(view),
+        lambda: guards.check_enabled(view),
+        lambda: guards.check_stands(view),
+    ]
+    if absolute:
+        checks.append(lambda: guards.check_referenced(view))
+    causes = []
+    for check in checks:
+        try:
+            check()
+        except LdcndError as error:
+            causes.append(Cause(code=error.code.value, text=error.message, remedy=error.remedy, page=error.page))
+    first = tracker.first_fault
+    return WhyReply(
+        axis=view.name,
+        can_move=not causes,
+        causes=tuple(causes),
+        first_fault=f"{first.code}: {first.text}" if first else None,
+    )
+
+
+def _fault(axis: str, fault: FaultEntry) -> Callable[[], None]:
+    def check() -> None:
+        raise DriveFault(
+            f"axis {axis}: {fault.text}", axis=axis, value=fault.code, remedy="remove the cause, then send reset"
+        )
+
+    return check

@@ -1,0 +1,4 @@
+"""Lines at work and the rig that they form: bring-up, polling, drives that return.
+
+Serves `command`, `publish` and `capture`. Start with `line.py`.
+"""

@@ -1,0 +1,206 @@
+"""One line at work: brings its drives up whenever it opens, has them polled, tells the axes when it is gone."""
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from ldcnd.axis_config import AxisConfig
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.poller import Poller, Priority
+from ldcnd.bus.wire_log import WireEvent
+from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.axis.polling import AxisPoller
+from ldcnd.drivers.driver import ReadingListeners, StopMode
+from ldcnd.drivers.network import BringUpReport, Network
+from ldcnd.errors import BusError, LdcndError
+from ldcnd.log import get_logger
+from ldcnd.model.samples import TelemetryItem
+from ldcnd.planning.plan import wanted_rates_hz
+
+log = get_logger("bus")
+
+FIRST_RETRY_S = 0.5
+LONGEST_RETRY_S = 10.0
+FIRST_LOOK_S = 0.25
+LONGEST_LOOK_S = 2.0
+"""Longest pause between two looks for drives that have gone: what powers up must be back within 3 s."""
+LOOK_SHARE = 0.01
+"""Of the line's time, for these looks; more where the longest pause is too short for that."""
+
+
+class BusService:
+    """One bus, its network and its axes.
+
+    Attributes:
+        port: where it is connected, as configured.
+        family: the drive family on it.
+        report: how the line came up; None while it is not up.
+        problem: why it is not up; empty while it is.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        network: Network,
+        axes: tuple[AxisService, ...],
+        *,
+        port: str,
+        family: str,
+        stop_probe_hz: float = 0.0,
+    ) -> None:
+        self.bus = bus
+        self.port = port
+        self.family = family
+        self.network = network
+        self.axes = axes
+        self.report: BringUpReport | None = None
+        self.problem = "not opened yet"
+        self._pollers: dict[str, Poller[Any]] = {}
+        self._stop_probe_hz = stop_probe_hz
+        self._was_up = False
+        self._up = asyncio.Event()
+        self._down = asyncio.Event()
+        self._down.set()
+        bus.resync = network.resync
+
+    async def run(self) -> None:
+        """Serve the line until cancelled."""
+        name = self.bus.settings.name
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.bus.run(), name=f"bus {name}")
+            group.create_task(self._supervise(), name=f"bring up {name}")
+            if self._stop_probe_hz:
+                group.create_task(self._probe_stop_lane(1.0 / self._stop_probe_hz), name=f"stop probes {name}")
+            for axis in self.axes:
+                group.create_task(axis.run(), name=f"axis {axis.config.name}")
+                group.create_task(axis.traces.run(), name=f"traces {axis.config.name}")
+
+    async def wait_up(self) -> None:
+        """Return as soon as the drives are polled."""
+        await self._up.wait()
+
+    async def wait_down(self) -> None:
+        """Return as soon as the axes know that the line is lost."""
+        await self._down.wait()
+
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
+        """Stop axes with closed loops by one packet if they form groups; each must be stopped by itself besides."""
+        try:
+            await self.network.stop_together(mode, names)
+        except BusError as error:
+            log.warning("group stop not sent", bus=self.bus.settings.name, reason=error.message)
+
+    def reconfigure(self, configs: Mapping[str, AxisConfig]) -> None:
+        """Take other limits, speeds, rates and priorities of axes, by name."""
+        for axis in self.axes:
+            config, before = configs[axis.config.name], axis.config
+            axis.reconfigure(config)
+            polled_anew = (config.rates, config.priority) != (before.rates, before.priority)
+            if polled_anew and self.report is not None:
+                self._poll(axis, asyncio.get_running_loop().time())
+
+    def asked_hz(self, axis: str) -> Mapping[TelemetryItem, float]:
+        """Return how often the items of an axis are asked for now."""
+        poller = self._pollers.get(axis)
+        return poller.rates_hz if poller else {}
+
+    async def _supervise(self) -> None:
+        retry_s = FIRST_RETRY_S
+        while True:
+            await self.bus.wait_opened()
+            try:
+                self.report = await self.network.bring_up()
+            except LdcndError as error:  # also a stop that took one of its packets off the queue
+                if error.message != self.problem:
+                    log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
+                self.problem = error.message
+                await asyncio.sleep(retry_s)
+                retry_s = min(2 * retry_s, LONGEST_RETRY_S)
+                continue
+            retry_s, self.problem = FIRST_RETRY_S, ""
+            self._connect(self.report)
+            await self._look_after()
+            self.report, self.problem = None, "the line was lost"
+            self._up.clear()
+            self._down.set()
+            for axis in self.axes:
+                axis.disconnected()
+
+    async def _look_after(self) -> None:
+        """Look for drives that have lost power and came back; return when the line is lost."""
+        pause_s = FIRST_LOOK_S
+        loop = asyncio.get_running_loop()
+        while not await self._closed_within(pause_s):
+            pause_s = FIRST_LOOK_S
+            if not self.network.incomplete():
+                continue
+            began_s = loop.time()
+            heard: frozenset[str] = frozenset()
+            try:
+                heard = await self.network.rejoin(self._restarted)
+            except LdcndError as error:
+                log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
+            now_s = loop.time()
+            for axis in self.axes:
+                if axis.config.name in heard:
+                    self._poll(axis, now_s)
+            if not heard:
+                pause_s = min((now_s - began_s + self.bus.fence_s) / LOOK_SHARE, LONGEST_LOOK_S)
+
+    async def _probe_stop_lane(self, period_s: float) -> None:
+        """Keep measuring how long a stop would wait."""
+        while True:
+            await asyncio.sleep(period_s)
+            await self.wait_up()
+            try:
+                await self.bus.probe_stop_wait()
+            except LdcndError as error:  # a lost reply is counted and told by those who look after the drive
+                log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
+
+    async def _closed_within(self, pause_s: float) -> bool:
+        try:
+            async with asyncio.timeout(pause_s):
+                await self.bus.wait_closed()
+        except TimeoutError:
+            return False
+        return True
+
+    def _restarted(self, name: str) -> None:
+        """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
+        log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
+        axis = next(axis for axis in self.axes if axis.config.name == name)
+        axis.disconnected()
+        axis.tracker.powered(on=False, now_s=asyncio.get_running_loop().time())
+        axis.tracker.finished()
+
+    def _connect(self, report: BringUpReport) -> None:
+        """Start polling. Only the very first reset can be a reference: later ones follow a gap in knowledge."""
+        log.info(
+            "line up",
+            bus=self.bus.settings.name,
+            baud=report.baud,
+            drives=dict(report.identities),
+            remarks=report.remarks,
+        )
+        now_s = asyncio.get_running_loop().time()
+        for axis in self.axes:
+            trusted = axis.config.reference == "at_reset" and report.reset and not self._was_up
+            axis.connected(referenced=trusted)
+            self._poll(axis, now_s)
+        for watch in self.network.watches:
+            self.bus.add_poller(watch)
+        self._was_up = True
+        self._down.clear()
+        self._up.set()
+
+    def _poll(self, axis: AxisService, now_s: float) -> None:
+        """Ask the axis from now on; a poller that it had is replaced."""
+        if previous := self._pollers.get(axis.config.name):
+            self.bus.remove_poller(previous)
+        own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed))
+        rates_hz = wanted_rates_hz(axis.config.rates, adc=bool(axis.driver.adc_full_scale))
+        poller = own or AxisPoller(axis.driver, rates_hz, now_s, axis.observed, axis.missed)
+        poller.priority = Priority[axis.config.priority.upper()]
+        self._pollers[axis.config.name] = poller
+        self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)
+        self.bus.add_poller(poller)

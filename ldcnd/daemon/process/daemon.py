@@ -1,0 +1,226 @@
+"""The daemon as a whole: in which order things start and stop."""
+
+import asyncio
+import contextlib
+
+from ldcnd.bus.capture import Capture
+from ldcnd.config import RigConfig
+from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
+from ldcnd.daemon.capture.watch import CaptureWatch
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.command.dispatch import Control
+from ldcnd.daemon.command.loss import LeaseWatch, apply_policy
+from ldcnd.daemon.command.requests import Requests
+from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.publish.health import EepromWrites, HealthWatch
+from ldcnd.daemon.publish.meta import Describing
+from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.log import get_logger
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Declaration, Load, Session
+from ldcnd.model.axes import LinkState
+from ldcnd.model.meta import DaemonInfo
+from ldcnd.model.plan import RigPlan
+from ldcnd.planning.plan import plan_rig
+from ldcnd.version import version
+
+log = get_logger("daemon")
+
+API = 1
+"""Version of keys and payloads: within one, fields are only ever added."""
+TOKEN_PERIOD_S = 0.2
+STOP_TIME_S = 2.0
+"""A daemon that is told to end gives its axes so long to confirm what their policies say."""
+
+
+class Daemon:
+    """Serves one rig over one session until it is told to end.
+
+    Attributes:
+        rig: what it serves.
+        captures: writes captures when something goes wrong; None where there is no place for them.
+    """
+
+    def __init__(
+        self,
+        config: RigConfig,
+        session: Session,
+        rig: Rig,
+        control: Control,
+        publisher: Publisher,
+        clock: Clock,
+        instance: str,
+        eeprom_writes: EepromWrites,
+    ) -> None:
+        self.rig = rig
+        self._control = control
+        self._config = config
+        self._session = session
+        self._keys = Keys(config.rig)
+        self._publisher = publisher
+        self._run = Run(instance, clock.now_ns(), clock)
+        self._serving = asyncio.Event()
+        self._ending = asyncio.Event()
+        self.captures = _capture_watch(self, self._run)
+        self._declarations: list[Declaration] = []
+        self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
+        plan = plan_rig(config)
+        self._health.stop_bounds_s = _stop_bounds_s(plan)
+        self._describing = Describing(rig, self._keys, publisher, self._info, lambda: self._config, plan, self._health)
+
+    @property
+    def config(self) -> RigConfig:
+        """With what it runs at present."""
+        return self._config
+
+    def end(self) -> None:
+        """Ask the daemon to stop its axes and to leave; `run` returns when that is done."""
+        self._ending.set()
+
+    def capture(self, bus: str, cause: str) -> Capture:
+        """Return what the flight recorder of a line holds.
+
+        Raises:
+            ValueOutOfRange: there is no such line.
+        """
+        return capture_of(snapshot_of(self.rig.line(bus), self._run.clock), self._config, self._run, cause)
+
+    def reconfigure(self, config: RigConfig, plan: RigPlan) -> None:
+        """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`.
+
+        Args:
+            config: the rig.
+            plan: of its lines; to work it out takes longer than lines should be held up.
+        """
+        self._config = config
+        self._describing.plan = plan
+        self._health.stop_bounds_s = _stop_bounds_s(plan)
+        axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
+        for bus in self.rig.buses:
+            bus.reconfigure(axes)
+
+    async def wait_serving(self) -> None:
+        """Return as soon as questions and commands are answered, whether or not any line is up."""
+        await self._serving.wait()
+
+    async def wait_up(self) -> None:
+        """Return as soon as every line is up."""
+        for bus in self.rig.buses:
+            await bus.wait_up()
+
+    async def run(self) -> None:
+        """Serve until `end` is called or the caller is cancelled.
+
+        Start: lines first, then questions, then commands, so that whoever can ask finds an answer. Stop: commands are
+        refused, what moves comes to rest, tokens go, lines close.
+        """
+        async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
+            declared.callback(self._control.events.tell)  # last of all
+            leases = LeaseWatch(self.rig, self._control.authority, self._run.clock, group)
+            requests = Requests(self.rig, self._keys, group, self._control, leases)
+            serving = [group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses]
+            try:
+                await self._declare(declared, requests)
+                serving.append(group.create_task(self._watch_axes(group), name="liveliness"))
+                serving.append(group.create_task(leases.run(), name="leases"))
+                serving.append(group.create_task(self._health.run(), name="health"))
+                if self.captures:
+                    serving.append(group.create_task(self.captures.run(), name="captures"))
+                self._serving.set()
+                log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
+                await self._ending.wait()
+                requests.close()
+                await self._come_to_rest()
+            finally:
+                for task in serving:
+                    task.cancel()
+                for axis in self.rig.axes:
+                    self._publisher.withdraw(axis)
+        log.info("ended", rig=self.rig.name)
+
+    async def _declare(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
+        keys, session = self._keys, self._session
+        describing = self._describing
+
+        async def until_end(declaration: Declaration) -> None:
+            self._declarations.append(declaration)
+            declared.push_async_callback(declaration.close)
+
+        await until_end(await session.serve(keys.all_telemetry, describing.on_telemetry, complete=False))
+        await until_end(await session.serve(keys.all_meta, describing.on_meta, complete=True))
+        for stop in keys.all_stops:
+            await until_end(await session.serve(stop, requests.on_stop, complete=True, urgent=True))
+        await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
+        await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
+        await until_end(await session.declare_token(keys.alive(self._run.instance)))
+
+    def _load(self) -> Load:
+        """Return how the daemon keeps up with what is asked of it."""
+        loads = [declaration.load for declaration in self._declarations]
+        return Load(sum(load.waiting for load in loads), sum(load.lost for load in loads))
+
+    def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
+        """Notice another daemon on the same rig: two of them would move every axis twice."""
+        address = self._keys.parse_alive(key)
+        if address.axis is not None or address.instance == self._run.instance:
+            return
+        log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
+        self._control.commands.rival = address.instance if alive else None
+
+    async def _come_to_rest(self) -> None:
+        """The daemon ends: do to each axis what its policy says; bounded."""
+        try:
+            async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
+                for name, axis in self.rig.axes.items():
+                    group.create_task(
+                        apply_policy(axis, axis.config.loss.daemon, "the daemon ends"), name=f"rest {name}"
+                    )
+        except TimeoutError:
+            log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
+
+    async def _watch_axes(self, group: asyncio.TaskGroup) -> None:
+        """Keep one liveliness token for each axis whose drive answers; act when one is back that still moves."""
+        tokens: dict[str, Declaration] = {}
+        known: set[str] = set()
+        try:
+            while True:
+                for name, axis in self.rig.axes.items():
+                    alive = axis.tracker.link is not LinkState.DOWN
+                    if alive and name not in tokens:
+                        if name in known:
+                            policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
+                            group.create_task(policy, name=f"bus loss {name}")
+                        known.add(name)
+                        tokens[name] = await self._session.declare_token(
+                            self._keys.alive_axis(self._run.instance, name)
+                        )
+                    elif not alive and name in tokens:
+                        await tokens.pop(name).close()
+                await asyncio.sleep(TOKEN_PERIOD_S)
+        finally:
+            for token in tokens.values():
+                await token.close()
+
+    def _info(self) -> DaemonInfo:
+        return DaemonInfo(
+            rig=self.rig.name,
+            version=version(),
+            api=API,
+            instance=self._run.instance,
+            started=self._run.started_ns,
+            encoding=self._config.telemetry.encoding,
+            axes=tuple(self.rig.axes),
+            buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
+        )
+
+
+def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:
+    directory, bounds = daemon.config.captures_dir, daemon.config.captures
+    if directory is None:
+        return None
+    store = CaptureStore(directory, bounds.files, bounds.total_mb * 1_000_000)
+    return CaptureWatch(daemon.rig, lambda: daemon.config, run, store)
+
+
+def _stop_bounds_s(plan: RigPlan) -> dict[str, float]:
+    return {bus.bus: bus.stop_wait_s for bus in plan.buses if bus.family == "ldcn"}

@@ -1,0 +1,283 @@
+"""The daemon as a service: says when it is ready and what works, feeds the watchdog, reloads when asked, ends in order.
+
+The watchdog is fed only while every bus keeps to its own plan. So it ends a daemon whose loop hangs and one whose loop
+runs while a line does not; a line without adapter or without drives is no reason, and is told in the status instead.
+"""
+
+import asyncio
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from ldcnd.config import RigConfig
+from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.process import systemd
+from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.daemon.process.reload import Reload, plan_reload
+from ldcnd.daemon.process.systemd import Notifier
+from ldcnd.errors import ConfigError
+from ldcnd.log import get_logger
+from ldcnd.model.axes import LinkState
+from ldcnd.model.plan import RigPlan
+from ldcnd.planning.plan import require_plan
+
+log = get_logger("service")
+
+CPU_LATENCY = Path("/dev/cpu_dma_latency")
+"""Linux: whoever holds it open with a number of microseconds in it bounds how long the processor takes to wake up."""
+
+LoopFactory = Callable[[], asyncio.AbstractEventLoop]
+
+
+def loop_factory(*, uvloop: bool) -> LoopFactory:
+    """Return what makes the event loop: uvloop's where it is wanted and installed, asyncio's otherwise."""
+    if uvloop:
+        try:
+            import uvloop as fast  # noqa: PLC0415 - an optional package
+        except ImportError:
+            log.warning("no uvloop", remedy="install ldcnd[fast], or set uvloop = false")
+        else:
+            return _finely_timed(fast.Loop)
+    return asyncio.new_event_loop
+
+
+def require_writable(rig: RigConfig) -> None:
+    """Check that the daemon can keep what must outlive it, before anything is opened.
+
+    Raises:
+        ConfigError: it may not write where the configuration says; names where a service manager lets it.
+    """
+    for key, directory in (("state_dir", rig.state_dir), ("captures.directory", rig.captures.directory)):
+        if directory is None:
+            continue
+        there = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
+        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+            allowed = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+            raise ConfigError(
+                f"{key}: {directory} cannot be written by this user or service",
+                value=str(directory),
+                remedy=f'{key} = "{allowed}", where the service may write' if allowed else "choose a writable place",
+            )
+
+
+@contextmanager
+def held_awake(*, wanted: bool, device: Path = CPU_LATENCY) -> Iterator[None]:
+    """Keep the processor out of idle states that take long to leave, for as long as the context lasts.
+
+    Where that is refused the daemon runs all the same, a little slower, and says so.
+    """
+    descriptor = _hold(device) if wanted else None
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+@contextmanager
+def last_words(speak: Callable[[], object]) -> Iterator[None]:
+    """Have something done when the process is aborted, as a service manager does whose watchdog was not fed.
+
+    It is done wherever the interpreter is just then, also in an event loop that hangs; then the process dies as it
+    would have without.
+    """
+
+    def aborted(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        try:
+            speak()
+        finally:
+            os.kill(os.getpid(), number)
+
+    before = signal.signal(signal.SIGABRT, aborted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGABRT, before)
+
+
+def settle_heap() -> None:
+    """Take what start-up has left behind out of the collector's sight: it lives as long as the process.
+
+    A full collection of it would hold up several polls.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+def _finely_timed(loop: type[asyncio.AbstractEventLoop]) -> LoopFactory:
+    """Give a loop the clock of asyncio's own.
+
+    uvloop tells the time in whole milliseconds, of when its present turn began. That is longer than many a packet: a
+    reply would seem to come before its request was over. The zero of both clocks is the same.
+    """
+
+    class FinelyTimed(loop):  # type: ignore[valid-type, misc] # a class that is known at run time only
+        time = staticmethod(time.monotonic)  # read several times for each exchange: no Python frame round it
+
+    return FinelyTimed
+
+
+def _hold(device: Path) -> int | None:
+    try:
+        descriptor = os.open(device, os.O_WRONLY | os.O_CLOEXEC)
+    except OSError as error:
+        log.warning(
+            "processor not held awake",
+            device=str(device),
+            reason=error.strerror,
+            remedy="give the daemon write access, or set hold_cpu_awake = false",
+        )
+        return None
+    os.write(descriptor, bytes(4))
+    log.info("processor held awake", device=str(device))
+    return descriptor
+
+
+STATUS_PERIOD_S = 1.0
+FEEDINGS = 3
+"""The watchdog is fed so often within its time."""
+TRIES, TRY_PERIOD_S = 50, 0.1
+RELOAD_TIME_S = 10.0
+"""A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
+
+
+class Service:
+    """Runs a daemon and keeps its service manager informed.
+
+    Args:
+        daemon: what to run.
+        notifier: where to say it.
+        load: reads the configuration again, as it was read at the start.
+        monotonic_ns: CLOCK_MONOTONIC, which the service manager compares with its own.
+    """
+
+    def __init__(
+        self,
+        daemon: Daemon,
+        notifier: Notifier,
+        load: Callable[[], RigConfig],
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._daemon = daemon
+        self._notifier = notifier
+        self._load = load
+        self._monotonic_ns = monotonic_ns
+        self._asked = asyncio.Event()
+        self._ending = False
+        self._stuck: tuple[str, ...] = ()
+        self._remark = ""
+
+    def reload(self) -> None:
+        """Ask for the configuration to be read again; requests that come meanwhile are one."""
+        self._asked.set()
+
+    def end(self) -> None:
+        """Say that the daemon ends, and end it; `run` returns when its axes have come to rest."""
+        self._ending = True
+        self._notifier.tell(systemd.STOPPING, systemd.status(self._status()))
+        self._daemon.end()
+
+    async def run(self) -> None:
+        """Serve until `end` is called or the caller is cancelled."""
+        async with asyncio.TaskGroup() as group:
+            beside = [group.create_task(self._reload_when_asked(), name="reload")]
+            if self._notifier.is_heard:
+                beside.append(group.create_task(self._report(), name="service manager"))
+            try:
+                await self._daemon.run()
+            finally:
+                for task in beside:
+                    task.cancel()
+
+    async def _report(self) -> None:
+        await self._daemon.wait_serving()
+        watchdog_s = self._notifier.watchdog_s
+        period_s = min(STATUS_PERIOD_S, watchdog_s / FEEDINGS) if watchdog_s else STATUS_PERIOD_S
+        told = self._status()
+        await self._assure(systemd.READY, systemd.status(told))
+        while True:
+            messages = [systemd.WATCHDOG] if self._turning() else []
+            if (now := self._status()) != told:
+                messages.append(systemd.status(now))
+                told = now
+            self._notifier.tell(*messages)
+            await asyncio.sleep(period_s)
+
+    async def _assure(self, *messages: str) -> None:
+        """Tell what is told only once, again and again for a while if the service manager is too busy to take it."""
+        for _ in range(TRIES):
+            if self._notifier.tell(*messages):
+                return
+            await asyncio.sleep(TRY_PERIOD_S)
+
+    def _turning(self) -> bool:
+        now_s = asyncio.get_running_loop().time()
+        stuck = tuple(bus.bus.settings.name for bus in self._daemon.rig.buses if not bus.bus.turning(now_s))
+        if stuck and stuck != self._stuck:
+            log.error("not turning", buses=stuck, watchdog_s=self._notifier.watchdog_s)
+        self._stuck = stuck
+        return not stuck
+
+    def _status(self) -> str:
+        if self._ending:
+            return "stopping: axes come to rest"
+        stuck = [f"bus {name} does not turn" for name in self._stuck]
+        return "; ".join(filter(None, [describe(self._daemon.rig), *stuck, self._remark]))
+
+    # -- reloading ---------------------------------------------------------------------------------------------------
+
+    async def _reload_when_asked(self) -> None:
+        await self._daemon.wait_serving()
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            await self._assure(systemd.reloading(self._monotonic_ns()))
+            self._remark = await self._reload()
+            await self._assure(systemd.READY, systemd.status(self._status()))
+
+    async def _reload(self) -> str:
+        """Take what can be taken; return what the status must say about the rest."""
+        try:
+            async with asyncio.timeout(RELOAD_TIME_S):
+                reload, plan = await asyncio.to_thread(self._prepare, self._daemon.config)
+        except TimeoutError:
+            log.error("configuration not reloaded", reason=f"not read within {RELOAD_TIME_S:g} s")
+            return "configuration not reloaded: it cannot be read"
+        except ConfigError as error:
+            log.error("configuration not reloaded", reason=error.message, code=error.code.value)
+            return f"configuration not reloaded: {error.message.splitlines()[0]}"
+        self._daemon.reconfigure(reload.config, plan)
+        log.info("configuration reloaded", changed=reload.changed)
+        if not reload.refused:
+            return ""
+        log.warning("changes need a restart", keys=reload.refused)
+        return f"restart needed for {', '.join(reload.refused)}"
+
+    def _prepare(self, running: RigConfig) -> tuple[Reload, RigPlan]:
+        """Read and judge the file, beside the loop: lines go on meanwhile."""
+        reload = plan_reload(running, self._load())
+        return reload, require_plan(reload.config)
+
+
+def describe(rig: Rig) -> str:
+    """Return in one line what of a rig works and what does not."""
+    buses_up = sum(bus.report is not None for bus in rig.buses)
+    down = [name for name, axis in rig.axes.items() if axis.tracker.link is LinkState.DOWN]
+    parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {len(rig.axes) - len(down)}/{len(rig.axes)} axes up"]
+    for bus in rig.buses:
+        if bus.report is None:
+            why = bus.problem if bus.bus.is_open else bus.bus.loss_reason or bus.problem
+            parts.append(f"bus {bus.bus.settings.name}: {why}")
+    lost = [axis for bus in rig.buses if bus.report for axis in down if axis in {one.config.name for one in bus.axes}]
+    if lost:
+        parts.append(f"no answer from {', '.join(lost)}")
+    faulty = [name for name, axis in rig.axes.items() if axis.tracker.active_faults]
+    if faulty:
+        parts.append(f"faults on {', '.join(faulty)}")
+    return "; ".join(parts)

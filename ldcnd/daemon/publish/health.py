@@ -1,0 +1,214 @@
+"""How the rig is doing: gathers what the lines count and publishes it once a second."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+
+from ldcnd.bus.exchange_queue import Lane
+from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.line.line import BusService
+from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Load
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth, StopWaitHealth
+from ldcnd.model.samples import TelemetryItem
+
+EepromWrites = Callable[[AxisService], int | None]
+
+PERIOD_S = 1.0
+TURNS = 4
+"""A rate is told from so many turns at least: what comes every ten seconds is not there in most seconds."""
+CLOCK_S = 0.1
+"""Reports are no more punctual than this."""
+LAG_LOOKS = 10
+"""So many times in a period a timer is looked at for how late it comes."""
+LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
+
+
+class _Rate:
+    """How often something is counted, over as long as it takes to tell."""
+
+    __slots__ = ("_count", "_hz", "_since_s")
+
+    def __init__(self, since_s: float, count: int) -> None:
+        self._since_s = since_s
+        self._count = count
+        self._hz = 0.0
+
+    def of(self, count: int, now_s: float, least_s: float) -> float:
+        """Return the rate since at least `least_s` ago; before that the one found last."""
+        elapsed_s = now_s - self._since_s
+        if elapsed_s >= least_s - CLOCK_S:
+            self._hz = max(0, count - self._count) / elapsed_s
+            self._since_s, self._count = now_s, count
+        elif not self._hz and elapsed_s > 0:
+            return (count - self._count) / elapsed_s
+        return self._hz
+
+
+class HealthWatch:
+    """Reports on one rig.
+
+    Args:
+        rig: what is reported on.
+        keys: where.
+        publisher: takes the reports, and knows what else was published.
+        clock: as everywhere.
+        load: returns how the daemon keeps up with its queries.
+        eeprom_writes: returns how often an axis's EEPROM was written, None where nobody knows.
+
+    Attributes:
+        latest: the newest report of each key.
+        stop_bounds_s: what the plan promises of stops, by line.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        keys: Keys,
+        publisher: Publisher,
+        clock: Clock,
+        load: Callable[[], Load],
+        eeprom_writes: EepromWrites,
+    ) -> None:
+        self.latest: dict[str, Frozen] = {}
+        self.stop_bounds_s: Mapping[str, float] = {}
+        self._rig = rig
+        self._keys = keys
+        self._publisher = publisher
+        self._clock = clock
+        self._load = load
+        self._eeprom_writes = eeprom_writes
+        self._seq = 0
+        self._missed = 0
+        self._busy_s: dict[str, float] = {}
+        self._granted: dict[tuple[str, TelemetryItem], _Rate] = {}
+
+    async def run(self) -> None:
+        """Report each second until cancelled; then take the reports off the network."""
+        self._note_counters()
+        last_s = due_s = self._clock.now_s()
+        try:
+            while True:
+                lag_s = 0.0
+                for _ in range(LAG_LOOKS):
+                    due_s += PERIOD_S / LAG_LOOKS
+                    await asyncio.sleep(due_s - self._clock.now_s())
+                    lag_s = max(lag_s, self._clock.now_s() - due_s)
+                now_s = self._clock.now_s()
+                held_up = int((now_s - due_s) / PERIOD_S)
+                self._missed += held_up
+                due_s += held_up * PERIOD_S
+                self._report(now_s - last_s, lag_s)
+                last_s = now_s
+        finally:
+            for key in self.latest:
+                self._publisher.withdraw_report(key)
+
+    def _report(self, period_s: float, lag_s: float) -> None:
+        """Publish all reports.
+
+        Args:
+            period_s: how long ago the one before was.
+            lag_s: how late a timer came since.
+        """
+        t = self._clock.now_ns()
+        load = self._load()
+        reports: dict[str, Frozen] = {
+            self._keys.health: DaemonHealth(
+                t=t,
+                seq=self._seq,
+                loop_lag_s=lag_s,
+                published=self._publisher.published,
+                missed_reports=self._missed,
+                waiting_queries=load.waiting,
+                dropped=load.lost,
+            )
+        }
+        for bus in self._rig.buses:
+            reports[self._keys.bus_health(bus.bus.settings.name)] = self._bus(bus, t, period_s)
+        self._seq += 1
+        self._note_counters()
+        self.latest = reports
+        for key, report in reports.items():
+            self._publisher.publish_report(key, report, t)
+
+    def _bus(self, service: BusService, t: int, period_s: float) -> BusHealth:
+        bus, statistics = service.bus, service.bus.statistics
+        name = bus.settings.name
+        return BusHealth(
+            t=t,
+            seq=self._seq,
+            bus=name,
+            up=service.report is not None,
+            utilisation=(statistics.wire_busy_s - self._busy_s[name]) / period_s,
+            exchanges=statistics.exchanges,
+            timeouts=statistics.timeouts,
+            corrupt_replies=statistics.corrupt_replies,
+            rejected_packets=statistics.rejected_packets,
+            resent=statistics.resent,
+            resynchronisations=statistics.resynchronisations,
+            stray_bytes=statistics.stray_bytes,
+            losses=statistics.losses,
+            lanes=tuple(_lane(service, lane) for lane in Lane),
+            stop_wait=self._stop_wait(service),
+            axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t) for axis in service.axes),
+        )
+
+    def _stop_wait(self, service: BusService) -> StopWaitHealth:
+        waits = service.bus.statistics.stop_wait
+        return StopWaitHealth(
+            bound_s=self.stop_bounds_s.get(service.bus.settings.name),
+            probes=sum(waits.counts),
+            p99_s=waits.quantile_s(0.99),
+            longest_s=waits.longest_s,
+        )
+
+    def _axis(self, axis: AxisService, asked_hz: Mapping[TelemetryItem, float], t: int) -> AxisHealth:
+        name = axis.config.name
+        granted_hz = {item: self._granted_hz(name, item, asked_hz.get(item, 0.0)) for item in TelemetryItem}
+        last = self._publisher.last.get(self._keys.telemetry(name, TelemetryItem.POSITION))
+        return AxisHealth(
+            axis=name,
+            link=axis.tracker.link,
+            sample_age_s=max(0.0, (t - last.t) / 1e9) if last else None,
+            rate_wanted_hz=axis.config.rates.position,
+            rate_hz=granted_hz[TelemetryItem.POSITION],
+            faults=len(axis.tracker.active_faults),
+            eeprom_writes=self._eeprom_writes(axis),
+            items=tuple(
+                ItemHealth(item=item.value, asked_hz=hz, granted_hz=granted_hz[item]) for item, hz in asked_hz.items()
+            ),
+        )
+
+    def _granted_hz(self, axis: str, item: TelemetryItem, asked_hz: float) -> float:
+        """Return how often an item was published lately."""
+        now_s, count = self._clock.now_s(), self._count(axis, item)
+        rate = self._granted.setdefault((axis, item), _Rate(now_s, count))
+        return rate.of(count, now_s, TURNS / asked_hz if asked_hz else PERIOD_S)
+
+    def _count(self, axis: str, item: TelemetryItem) -> int:
+        """Return how many samples of an item were published so far."""
+        last = self._publisher.last.get(self._keys.telemetry(axis, item))
+        return last.seq + 1 if last else 0
+
+    def _note_counters(self) -> None:
+        self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}
+
+
+def _lane(service: BusService, lane: Lane) -> LaneHealth:
+    latency = service.bus.statistics.latency[lane]
+    return LaneHealth.model_validate(
+        {
+            "lane": LANES[lane],
+            "waiting": service.bus.waiting(lane),
+            "exchanges": sum(latency.counts),
+            "p50_s": latency.quantile_s(0.5),
+            "p99_s": latency.quantile_s(0.99),
+            "longest_s": latency.longest_s,
+            "total_s": latency.total_s,
+            "counts": tuple(latency.counts),
+        }
+    )
