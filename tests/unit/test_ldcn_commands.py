@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Group, Node
-from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
+from ldcnd.drivers.ldcn.controls import HomingControl, IoOption, LimitPins, StopControl
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, actual_baud
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem
@@ -265,13 +265,21 @@ def test_each_way_to_stop(control, position, data):
         (StopControl.HERE, None),
         (StopControl.SMOOTH, 5),
         (StopControl.HERE, 0x8000_0000),
-        (StopControl(0x20), None),
         (StopControl(0x40), None),
     ],
 )
 def test_a_contradictory_stop_is_refused(control, position):
     with pytest.raises(ValueOutOfRange):
         commands.stop_motor(NODE, control, position)
+
+
+def test_only_the_cmc_has_advanced_features_to_turn_on():
+    control = StopControl.AMP_ENABLE | StopControl.ABRUPT | StopControl.ADVANCED
+
+    assert commands.stop_motor(Node(1, PROFILES["pic-servo-cmc"]), control).request == bytes.fromhex("aa 01 17 25 3d")
+    for profile in (LS_182AP, V4, SC):
+        with pytest.raises(NotSupported):
+            commands.stop_motor(Node(1, profile), control)
 
 
 def test_version_1_cannot_stop_here_and_others_have_no_lock():
@@ -317,16 +325,16 @@ def test_homing_that_a_device_cannot_do_is_refused(profile, control):
 # -- what only some devices have -------------------------------------------------------------------------------------
 
 
-def test_command_8_means_limit_pins_on_version_4_and_an_output_mode_on_sc():
+def test_command_8_means_limit_pins_on_version_4_and_options_on_sc():
     pins = LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT
 
     assert commands.io_control(Node(1, V4), pins).request[2:-1] == b"\x18\x09"
-    assert commands.set_output_mode(Node(1, SC), 0x90).request == bytes.fromhex("aa 01 18 90 a9")
+    assert commands.set_options(Node(1, SC), IoOption(0x90)).request == bytes.fromhex("aa 01 18 90 a9")
     for profile in (LS_182AP, V3, SC):
         with pytest.raises(NotSupported):
             commands.io_control(Node(1, profile), pins)
     with pytest.raises(NotSupported):
-        commands.set_output_mode(Node(1, V4), 0)
+        commands.set_options(Node(1, V4), IoOption(0))
 
 
 def test_only_sc_resets_its_position_to_something_else_than_zero():

@@ -19,7 +19,7 @@ from ldcnd.drivers.ldcn.profiles import PROFILES, HomingSource, Support, identif
         (0, 60, "ls-173"),
         (0, 79, "ls-173"),
         (2, 1, "pic-io"),
-        (2, 52, "pic-io"),
+        (2, 52, "sk-2310g2"),
         (3, 7, "pic-step"),
         (90, 1, "ls-173ap"),
         (90, 19, "ls-173ap"),

@@ -28,7 +28,7 @@ EVERYTHING = StatusItem(0xFF)
         ("pic-servo-v1", 14),
         ("pic-servo-v4", 14),
         ("pic-servo-sc", 17),
-        ("pic-servo-cmc", 17),
+        ("pic-servo-cmc", 14),
         ("ls-173ap", 16),
         ("ls-182ap", 17),
     ],

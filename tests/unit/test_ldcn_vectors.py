@@ -1,14 +1,19 @@
-"""Every printed frame of the manuals, right or wrong: tests/vectors/ldcn-nmc.json."""
+"""Every frame of tests/vectors/ldcn-nmc.json and sc-io.json, both ways.
+
+The first file has what the manuals print, right or wrong; the second PIC-SERVO SC, CMC and PIC-I/O.
+"""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.ldcn import commands
+from ldcnd.drivers.ldcn import commands, pic_io
 from ldcnd.drivers.ldcn.commands import Group, Node
+from ldcnd.drivers.ldcn.controls import IoOption, LimitPins, StartUp
 from ldcnd.drivers.ldcn.packet import Command, decode_packet, encode_packet
-from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.path import PathPoint, decode_point
+from ldcnd.drivers.ldcn.profiles import PROFILES, DeviceKind
 from ldcnd.drivers.ldcn.received import (
     AddPathPoints,
     DefineStatus,
@@ -26,15 +31,43 @@ from ldcnd.drivers.ldcn.received import (
     decode_command,
     interpret_bytes,
 )
-from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, baud_divisor
+from ldcnd.drivers.ldcn.registers import BAUD_DIVISORS, BaudCodes, Gains, baud_divisor, module_baud
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, decode_status, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.errors import BadReply
+from ldcnd.errors import BadReply, ValueOutOfRange
 
-ROWS = json.loads((Path(__file__).parents[1] / "vectors" / "ldcn-nmc.json").read_text())
-DIALECTS = {"ldcn-182": "ls-182ap", "ldcn-173": "ls-173ap", "nmc-sc": "pic-servo-sc"}
+VECTORS = Path(__file__).parents[1] / "vectors"
+ROWS = [row for name in ("ldcn-nmc.json", "sc-io.json") for row in json.loads((VECTORS / name).read_text())]
+DIALECTS = {
+    "ldcn-182": "ls-182ap",
+    "ldcn-173": "ls-173ap",
+    "nmc-sc": "pic-servo-sc",
+    "nmc-cmc": "pic-servo-cmc",
+    "nmc-io": "pic-io",
+}
 
-STOP_BITS = {"amp_enable": 0x01, "motor_off": 0x02, "stop_abrupt": 0x04, "stop_smooth": 0x08, "stop_here": 0x10}
+STOP_BITS = {
+    "amp_enable": 0x01,
+    "motor_off": 0x02,
+    "stop_abrupt": 0x04,
+    "stop_smooth": 0x08,
+    "stop_here": 0x10,
+    "advanced": 0x20,
+}
+OPTION_BITS = {
+    "limit_off": 0x04,
+    "limit_stop": 0x08,
+    "three_phase": 0x10,
+    "antiphase": 0x20,
+    "fast_path": 0x40,
+    "step_dir": 0x80,
+}
+PIN_BITS = {"limit1_is_input": 0x04, "limit2_is_input": 0x08, "fast_path": 0x40}
+START_UP_BITS = {"save": 0x01, "restore_address": 0x02, "three_phase": 0x40, "antiphase": 0x80}
+FORBIDDEN = 0x0C
+"""Both kinds of limit protection at once: a habit of hosts for version 4, where the byte means something else."""
+NOT_BUILT = {"the same with the don't-care bits set", "14 bytes to an SC: step multiplier stays 1"}
+"""Meanings of frames that other hosts send and ours does not."""
 HOMING_BITS = {
     "on_limit1": 0x01,
     "on_limit2": 0x02,
@@ -44,11 +77,14 @@ HOMING_BITS = {
     "stop_smooth": 0x20,
 }
 ITEM_BITS = ("position", "ad", "velocity", "aux", "home", "id_version", "pos_error", "bit7")
+IO_ITEM_BITS = ("inputs", "ad1", "ad2", "ad3", "timer", "id_version", "synch_inputs", "synch_timer")
+HERTZ = {30: 64, 60: 32, 120: 16}
+"""Nominal rates of path points, and the servo cycles that a point really takes."""
 
 
 def rows(kind, *, ok):
     chosen = [row for row in ROWS if row["kind"] == kind and row["ok"] is ok]
-    return pytest.mark.parametrize("row", chosen, ids=[row["hex"] for row in chosen])
+    return pytest.mark.parametrize("row", chosen, ids=[f"{row['profile']} {row['hex']}" for row in chosen])
 
 
 def profile_of(row):
@@ -59,7 +95,9 @@ def bits(names, table):
     return sum(table[name] for name in names)
 
 
-def trajectory_of(decoded):
+def trajectory_of(decoded, profile=None):
+    trapezoidal = decoded["servo"] and decoded["profile"] == "trapezoidal"
+    relative = trapezoidal and decoded["reverse_or_relative"]
     return Trajectory(
         position=decoded.get("position"),
         velocity=decoded.get("velocity"),
@@ -67,8 +105,9 @@ def trajectory_of(decoded):
         pwm_or_target=decoded.get("pwm_or_atv"),
         servo=decoded["servo"],
         mode=ProfileMode(decoded["profile"]),
-        reverse=decoded["reverse_or_relative"],
+        reverse=decoded["reverse_or_relative"] and not relative,
         start_now=decoded["start_now"],
+        relative=relative,
     )
 
 
@@ -77,8 +116,33 @@ def gains_of(decoded):
     return Gains(*registers, decoded.get("sm", 1))
 
 
-def expected(decoded):  # noqa: PLR0911, PLR0912 - one branch per command
+def expected(row):
     """Say with our types what the row says."""
+    decoded = row["decoded"]
+    own = expected_of_io(decoded) if row["profile"] == "nmc-io" else None
+    return own or expected_of_servo(decoded)
+
+
+def expected_of_io(decoded):
+    match decoded["name"]:
+        case "Set Direction":
+            return pic_io.SetDirection(decoded["directions"])
+        case "Set PWM":
+            return pic_io.SetPwm(decoded["pwm1"], decoded["pwm2"])
+        case "Synch Output":
+            return pic_io.SynchOutput()
+        case "Set Output":
+            return pic_io.SetOutput(decoded["outputs"])
+        case "Set Synch Output":
+            return pic_io.SetSynchOutput(decoded["outputs"], decoded["pwm1"], decoded["pwm2"])
+        case "Set Timer Mode":
+            return pic_io.SetTimerMode(decoded["enabled"], decoded["counter"], decoded["prescale"])
+        case "Synch Input":
+            return pic_io.SynchInput()
+    return None
+
+
+def expected_of_servo(decoded):  # noqa: PLR0911, PLR0912 - one branch per command
     match Command(decoded["cmd"]):
         case Command.RESET_POSITION:
             return ResetPosition(decoded.get("set_position", 0), decoded.get("relative_to_home", False))
@@ -108,8 +172,21 @@ def expected(decoded):  # noqa: PLR0911, PLR0912 - one branch per command
             return PlainCommand(plain)
 
 
-def built(profile, address, command):  # noqa: PLR0911, PLR0912 - one branch per command
+def built(row, command):
     """Build the frame from the decoded command; None where the host has no use for it."""
+    address, profile = row["decoded"]["addr"], profile_of(row)
+    if profile.kind is not DeviceKind.IO:
+        return built_for_servo(profile, address, command, row["decoded"])
+    if isinstance(command, pic_io.IoCommand):
+        return pic_io.send_io_command(pic_io.IoNode(address), command)
+    if isinstance(command, DefineStatus):
+        return pic_io.define_io_status(pic_io.IoNode(address), pic_io.IoItem(command.items))
+    if isinstance(command, ReadStatus):
+        return pic_io.read_io_status(pic_io.IoNode(address), pic_io.IoItem(command.items))
+    return built_for_servo(profile, address, command, row["decoded"])
+
+
+def built_for_servo(profile, address, command, decoded):  # noqa: PLR0911, PLR0912 - one branch per command
     to = Node(address, profile)
     match command:
         case ResetPosition(0, False):
@@ -130,12 +207,24 @@ def built(profile, address, command):  # noqa: PLR0911, PLR0912 - one branch per
             return commands.set_gain(to, gains)
         case StopMotor(control, position):
             return commands.stop_motor(to, control, position)
+        case IoControl(control) if profile.sc_extensions:
+            return None if control == FORBIDDEN else commands.set_options(to, IoOption(control))
         case IoControl(control):
-            return commands.set_output_mode(to, control)
+            fast_path = bool(control & IoOption.FAST_PATH)
+            return commands.io_control(to, LimitPins(control & ~IoOption.FAST_PATH), fast_path=fast_path)
         case SetHomingMode(control):
             return commands.set_homing(to, control)
-        case SetBaudRate():
-            return commands.set_baud(Group(address, profile), 115_200, BaudCodes.MANUAL)
+        case SetBaudRate(code):
+            codes = next(codes for codes in BaudCodes if BAUD_DIVISORS[codes].get(decoded["baud"]) == code)
+            return commands.set_baud(Group(address, profile), decoded["baud"], codes)
+        case AddPathPoints(()):
+            return commands.start_path(to)
+        case AddPathPoints(words):
+            fast_path = decoded.get("fast_path", False)
+            points = [decode_point(word, fast_path=fast_path) for word in words]
+            return commands.add_path_points(to, points, fast_path=fast_path)
+        case HardReset(control) if control is not None:
+            return commands.configure_start_up(to, StartUp(control))
         case PlainCommand(Command.START_MOTION):
             return commands.start_motion(to)
         case PlainCommand(Command.CLEAR_STICKY_BITS):
@@ -158,26 +247,42 @@ def test_a_correct_frame_is_decoded_and_framed_again(row):
 
     assert (packet.address, packet.command, len(packet.data)) == tuple(row["decoded"][k] for k in ("addr", "cmd", "n"))
     assert interpretation.address == row["decoded"]["addr"]
-    assert interpretation.command == expected(row["decoded"])
+    assert interpretation.command == expected(row)
     assert encode_packet(packet) == frame
 
 
 @rows("command", ok=True)
 def test_a_correct_frame_is_built_byte_by_byte(row):
-    command = expected(row["decoded"])
-
-    exchange = built(profile_of(row), row["decoded"]["addr"], command)
+    exchange = built(row, expected(row))
 
     if exchange is None:
-        assert isinstance(command, AddPathPoints | HardReset)
-    else:
+        assert row["decoded"]["control"] == FORBIDDEN
+    elif row["meaning"] not in NOT_BUILT:
         assert exchange.request == bytes.fromhex(row["hex"])
+
+
+def test_the_host_refuses_the_combination_of_options_that_the_sc_does_not_allow():
+    with pytest.raises(ValueOutOfRange, match="exclude each other"):
+        commands.set_options(Node(1, PROFILES["pic-servo-sc"]), IoOption(FORBIDDEN))
+
+
+@pytest.mark.parametrize("row", [row for row in ROWS if row["decoded"].get("points")], ids=lambda row: row["hex"])
+def test_path_points_are_taken_apart(row):
+    decoded = row["decoded"]
+
+    points = [decode_point(word, fast_path=decoded["fast_path"]) for word in decoded["points_raw"]]
+
+    assert points == [PathPoint(point["counts"], HERTZ[point["hz"]]) for point in decoded["points"]]
 
 
 @rows("command", ok=False)
 def test_a_wrong_frame_is_refused_for_the_reason_noted(row):
-    note = row["note"]
-    if note.startswith("checksum"):
+    note, frame = row["note"], bytes.fromhex(row["hex"])
+    if "odd count" in note:
+        reason = "3 data bytes, ADD_PATH_POINTS takes 2"
+    elif "not executed" in note:
+        reason = f"packet checksum {frame[-1]:02X}"
+    elif note.startswith("checksum"):
         reason = note
     elif note.startswith("control byte"):
         control, implied = note.split()[2], note.split()[4]
@@ -187,7 +292,7 @@ def test_a_wrong_frame_is_refused_for_the_reason_noted(row):
         reason = f"says {nibble} data bytes, the frame has {row['decoded']['n']}"
 
     with pytest.raises(BadReply, match=reason):
-        decode_command(profile_of(row), bytes.fromhex(row["hex"]))
+        decode_command(profile_of(row), frame)
 
 
 @rows("command", ok=False)
@@ -202,9 +307,13 @@ def test_a_wrong_frame_is_taken_as_the_firmware_would(row):
     if nibble_is_short:  # the last data byte is taken for the checksum: nothing is executed
         assert not interpretation.checksum_ok
         assert any("follow" in oddity for oddity in interpretation.oddities)
+    elif "odd count" in row["note"]:
+        assert interpretation.command == AddPathPoints((402,))
+    elif "not executed" in row["note"]:
+        assert not interpretation.checksum_ok
     elif row["note"].startswith("checksum"):
         assert not interpretation.checksum_ok
-        assert interpretation.command == expected(row["decoded"])
+        assert interpretation.command == expected(row)
     else:  # what is missing counts as 0
         trajectory = interpretation.command.trajectory
         given = trajectory_of(row["decoded"])
@@ -214,28 +323,75 @@ def test_a_wrong_frame_is_taken_as_the_firmware_would(row):
         assert (trajectory.servo, trajectory.mode, trajectory.start_now) == (given.servo, given.mode, given.start_now)
 
 
+def status_of(decoded, profile):
+    raw = decoded.get("velocity_raw")
+    return Status(
+        StatusFlag(decoded["status"]),
+        position=decoded.get("position"),
+        adc=decoded.get("ad"),
+        velocity=None if raw is None else profile.velocity_sign * raw,
+        aux=decoded.get("aux"),
+        home=decoded.get("home"),
+        device_id=decoded.get("device_id"),
+        version=decoded.get("version"),
+        position_error=decoded.get("pos_error"),
+        bit7=decoded.get("path_points"),
+    )
+
+
+def io_status_of(decoded):
+    return pic_io.IoStatus(
+        rejected=bool(decoded["status"] & 2),
+        levels=decoded.get("inputs"),
+        adc1=decoded.get("ad1"),
+        adc2=decoded.get("ad2"),
+        adc3=decoded.get("ad3"),
+        counter=decoded.get("timer"),
+        device_id=decoded.get("device_id"),
+        version=decoded.get("version"),
+        captured_levels=decoded.get("synch_inputs"),
+        captured_counter=decoded.get("synch_timer"),
+    )
+
+
 @rows("status", ok=True)
 def test_a_status_packet_goes_both_ways(row):
-    frame = bytes.fromhex(row["hex"])
-    items = StatusItem(row["mask"])
-    decoded = row["decoded"]
+    frame, profile = bytes.fromhex(row["hex"]), profile_of(row)
 
-    status = decode_status(profile_of(row), items, frame)
-
-    assert status == Status(StatusFlag(decoded["status"]), position=decoded.get("position"))
-    assert encode_status(profile_of(row), items, status) == frame
+    if profile.kind is DeviceKind.IO:
+        items = pic_io.IoItem(row["mask"])
+        io_status = pic_io.decode_io_status(items, frame)
+        assert io_status == io_status_of(row["decoded"])
+        assert pic_io.encode_io_status(items, io_status) == frame
+    else:
+        items = StatusItem(row["mask"])
+        status = decode_status(profile, items, frame)
+        assert status == status_of(row["decoded"], profile)
+        assert encode_status(profile, items, status) == frame
 
 
 def test_masks_name_their_items():
     for row in ROWS:
         if "items" in row["decoded"]:
-            assert row["decoded"]["mask"] == sum(1 << ITEM_BITS.index(item) for item in row["decoded"]["items"])
+            names = IO_ITEM_BITS if row["profile"] == "nmc-io" else ITEM_BITS
+            assert row["decoded"]["mask"] == sum(1 << names.index(item) for item in row["decoded"]["items"])
 
 
 def test_baud_codes_agree_with_the_table():
     for row in ROWS:
         if "brd" in row["decoded"]:
-            assert baud_divisor(row["decoded"]["baud"]) == row["decoded"]["brd"]
+            baud, code = row["decoded"]["baud"], row["decoded"]["brd"]
+            assert module_baud(profile_of(row), code) == pytest.approx(baud, rel=0.035)
+            assert code in {baud_divisor(baud, codes) for codes in BaudCodes}
+
+
+def test_control_bytes_name_their_bits():
+    tables = {7: STOP_BITS, 9: HOMING_BITS, 15: START_UP_BITS}
+    for row in ROWS:
+        decoded = row["decoded"]
+        if "bits" in decoded and "control" in decoded:
+            pins = PIN_BITS if row["profile"] == "nmc-cmc" else OPTION_BITS
+            assert decoded["control"] == bits(decoded["bits"], tables.get(decoded["cmd"], pins))
 
 
 def test_every_row_is_tested():

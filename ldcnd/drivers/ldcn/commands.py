@@ -8,11 +8,22 @@ data sheets.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
-from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, PositionReset, StopControl, check_homing, check_stop
+from ldcnd.drivers.ldcn.controls import (
+    HomingControl,
+    IoOption,
+    LimitPins,
+    PositionReset,
+    StartUp,
+    StopControl,
+    check_homing,
+    check_options,
+    check_stop,
+)
 from ldcnd.drivers.ldcn.packet import (
     ADDRESS,
     GROUP_ADDRESS,
@@ -20,10 +31,10 @@ from ldcnd.drivers.ldcn.packet import (
     MOST_ADDRESS,
     POSITION,
     Command,
-    Field,
     Packet,
     encode_packet,
 )
+from ldcnd.drivers.ldcn.path import PathPoint, encode_points
 from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, Gains, baud_divisor, encode_gains
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusItem, check_status, status_bytes, status_decoder
@@ -147,7 +158,8 @@ RESET_SETTLE_S = 0.1
 """What a module gets to restart after Hard Reset; the manuals name no time."""
 COMMON_TOP_BAUD = 115_200
 """The rate that every dialect reaches."""
-OUTPUT_MODE = Field("output mode", 1, 0, 0xFF)
+EEPROM_SETTLE_S = 0.3
+"""What PIC-SERVO SC gets to write its EEPROM and to restart; the data sheet names no time."""
 COMMON_COMMANDS = frozenset(
     {
         Command.SET_ADDRESS,
@@ -268,30 +280,55 @@ def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | No
     return _exchange(to, Command.STOP_MOTOR, data)
 
 
-def io_control(to: Destination[ReplyT], pins: LimitPins) -> Exchange[ReplyT]:
-    """Set direction and level of the limit switch pins.
+def io_control(to: Destination[ReplyT], pins: LimitPins, *, fast_path: bool = False) -> Exchange[ReplyT]:
+    """Set direction and level of the limit switch pins, on PIC-SERVO CMC the path rate, too.
 
     Raises:
-        NotSupported: the module is no PIC-SERVO version 4; elsewhere the command is unused or means something else.
+        NotSupported: the module is no PIC-SERVO version 4 or CMC; elsewhere the command is unused or means something
+            else. Or it has no fast path.
     """
-    if not _dialect(to).limit_outputs:
-        raise NotSupported(f"{_dialect(to).title} has no limit pins that can be outputs")
-    return _exchange(to, Command.IO_CONTROL, bytes((pins,)))
+    profile = _dialect(to)
+    if not profile.limit_outputs:
+        raise NotSupported(f"{profile.title} has no limit pins that can be outputs")
+    if fast_path and not profile.path_points:
+        raise NotSupported(f"{profile.title} has no path mode")
+    return _exchange(to, Command.IO_CONTROL, bytes((pins | (IoOption.FAST_PATH if fast_path else 0),)))
 
 
-def set_output_mode(to: Destination[ReplyT], mode: int) -> Exchange[ReplyT]:
-    """Choose the amplifier interface, the meaning of the same command on PIC-SERVO SC.
-
-    Args:
-        to: a PIC-SERVO SC.
-        mode: the control byte of its data sheet, 0 to 255.
+def set_options(to: Destination[ReplyT], options: IoOption) -> Exchange[ReplyT]:
+    """Choose limit protection, output mode and path rate of a PIC-SERVO SC; what is left out is switched off.
 
     Raises:
         NotSupported: the module is no PIC-SERVO SC.
-        ValueOutOfRange: the mode is no byte.
+        ValueOutOfRange: options that exclude each other.
     """
-    _require_sc(to, "an output mode")
-    return _exchange(to, Command.IO_CONTROL, OUTPUT_MODE.encode(mode))
+    _require_sc(to, "options of I/O Control")
+    check_options(options)
+    return _exchange(to, Command.IO_CONTROL, bytes((options,)))
+
+
+def add_path_points(
+    to: Destination[ReplyT], points: Sequence[PathPoint], *, fast_path: bool = False
+) -> Exchange[ReplyT]:
+    """Append 1 to 7 points to the path; the host sees to it that the buffer has room for them.
+
+    Raises:
+        NotSupported: the module has no path mode.
+        ValueOutOfRange: a point does not fit, or there are too many.
+    """
+    data = encode_points(_dialect(to), points, fast_path=fast_path)
+    return _exchange(to, Command.ADD_PATH_POINTS, data, repeatable=False)
+
+
+def start_path(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Start walking through the points loaded so far.
+
+    Raises:
+        NotSupported: the module has no path mode.
+    """
+    if not _dialect(to).path_points:
+        raise NotSupported(f"{_dialect(to).title} has no path mode")
+    return _exchange(to, Command.ADD_PATH_POINTS, repeatable=False)
 
 
 def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[ReplyT]:
@@ -338,6 +375,22 @@ def hard_reset(to: Node | Group) -> Exchange[None]:
     """Put modules back into the state after power-up: 19200 baud, address 0, motor off; nobody answers."""
     request = encode_packet(Packet(to.address, Command.HARD_RESET))
     return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False)
+
+
+def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
+    """Save gains, velocity, acceleration and these options in the EEPROM, or erase it without `SAVE`; then reset.
+
+    The module restarts as after Hard Reset. Saved values are restored by a loss of its supply only. With
+    `AMPLIFIER_ON` and `SERVO_ON` it energises its motor then, at the latest when it is given an address.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+        ValueOutOfRange: the address is a group's: it would rewrite every module in it.
+    """
+    _require_sc(to, "saving its configuration")
+    ADDRESS.check(to.address)
+    request = encode_packet(Packet(to.address, Command.HARD_RESET, bytes((start_up,))))
+    return unanswered(to.address, request, EEPROM_SETTLE_S, repeatable=False)
 
 
 def _exchange(

@@ -24,6 +24,8 @@ class StopControl(IntFlag):
     """Decelerate at the loaded acceleration, then hold."""
     HERE = 0x10
     """Go to the given position without a profile."""
+    ADVANCED = 0x20
+    """Turn on what PIC-SERVO CMC has beyond version 4; PIC-SERVO SC ignores it."""
     LOCK_DISABLE = 0x80
     """Allow motion again after homing on a limit; LS-182AP from version `Profile.motion_lock_from` on."""
 
@@ -50,6 +52,33 @@ class LimitPins(IntFlag):
     LIMIT2_INPUT = 0x08
 
 
+class IoOption(IntFlag):
+    """I/O Control of PIC-SERVO SC; every command sets or clears all of them."""
+
+    LIMIT_OFF = 0x04
+    """Limit protection: a limit switch turns the motor off."""
+    LIMIT_STOP = 0x08
+    """Limit protection: a limit switch stops the motor abruptly."""
+    THREE_PHASE = 0x10
+    ANTIPHASE = 0x20
+    FAST_PATH = 0x40
+    """Path points come at 60 or 120 Hz instead of 30 or 60; PIC-SERVO CMC has this bit, too."""
+    STEP_DIRECTION = 0x80
+
+
+class StartUp(IntFlag):
+    """The data byte of Hard Reset on PIC-SERVO SC; without SAVE everything that was saved is erased."""
+
+    SAVE = 0x01
+    ADDRESSES = 0x02
+    AMPLIFIER_ON = 0x04
+    SERVO_ON = 0x08
+    STEP_DIRECTION = 0x10
+    LIMIT_PROTECTION = 0x20
+    THREE_PHASE = 0x40
+    ANTIPHASE = 0x80
+
+
 class PositionReset(IntEnum):
     """Reset Position with data, PIC-SERVO SC only."""
 
@@ -60,6 +89,13 @@ class PositionReset(IntEnum):
 WAYS_TO_STOP = StopControl.MOTOR_OFF | StopControl.ABRUPT | StopControl.SMOOTH | StopControl.HERE
 STOPS_ON_HOME = HomingControl.MOTOR_OFF | HomingControl.STOP_ABRUPT | HomingControl.STOP_SMOOTH
 ALL_STOP_BITS = WAYS_TO_STOP | StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE
+EXCLUSIVE_OPTIONS = (
+    IoOption.LIMIT_OFF | IoOption.LIMIT_STOP,
+    IoOption.THREE_PHASE | IoOption.ANTIPHASE,
+    IoOption.STEP_DIRECTION | IoOption.LIMIT_OFF,
+    IoOption.STEP_DIRECTION | IoOption.LIMIT_STOP,
+)
+"""Pairs that the data sheet of PIC-SERVO SC does not allow together."""
 
 
 def check_stop(control: StopControl, profile: Profile | None) -> None:
@@ -67,16 +103,32 @@ def check_stop(control: StopControl, profile: Profile | None) -> None:
 
     Raises:
         ValueOutOfRange: more than one way to stop, or a bit that must be clear.
-        NotSupported: "stop here" on PIC-SERVO version 1, "lock disable" where there is no lock.
+        NotSupported: "stop here" on PIC-SERVO version 1, "lock disable" where there is no lock, the bit for the
+            advanced features where there are none.
     """
     if (control & WAYS_TO_STOP).bit_count() > 1:
         raise ValueOutOfRange(f"stop control {int(control):02X}: at most one of bits 1 to 4", value=int(control))
-    if control & ~ALL_STOP_BITS:
-        raise ValueOutOfRange(f"stop control {int(control):02X}: bits 5 and 6 must be clear", value=int(control))
+    if control & ~(ALL_STOP_BITS | StopControl.ADVANCED):
+        raise ValueOutOfRange(f"stop control {int(control):02X}: bit 6 must be clear", value=int(control))
+    if control & StopControl.ADVANCED and not (profile and profile.advanced_stop):
+        raise NotSupported(f"{profile.title if profile else 'the group'} has no advanced features to turn on")
     if profile and control & StopControl.HERE and not profile.stop_here:
         raise NotSupported(f"{profile.title} cannot stop at a given position")
     if control & StopControl.LOCK_DISABLE and not (profile and profile.motion_lock_from is not None):
         raise NotSupported(f"{profile.title if profile else 'the group'} has no motion lock")
+
+
+def check_options(control: IoOption) -> None:
+    """Refuse a combination of options that PIC-SERVO SC does not allow.
+
+    Raises:
+        ValueOutOfRange: two options exclude each other, or a bit that must be clear is set.
+    """
+    if control & ~IoOption(0xFC):
+        raise ValueOutOfRange(f"I/O control {int(control):02X}: bits 0 and 1 must be clear", value=int(control))
+    for pair in EXCLUSIVE_OPTIONS:
+        if control & pair == pair:
+            raise ValueOutOfRange(f"I/O control {int(control):02X}: {pair!r} exclude each other", value=int(control))
 
 
 def check_homing(control: HomingControl, profile: Profile | None) -> None:

@@ -253,6 +253,7 @@ class DriveState:
             self.amp_enabled = True  # no drive closes its loop without; known also after somebody else enabled it
         self.motion_locked = self._profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED)
         shows_limits = self._shows_limits(flags)
+        reverse, forward = (_LIMIT2, _LIMIT1) if self._profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
         tick_s = SERVO_CYCLE_S * (self.servo_divisor if self._profile.divisor_slows_profile else 1)
         return AxisReading(
             position_counts=status.position,
@@ -264,8 +265,8 @@ class DriveState:
             profile_done=bool(flags & _MOVE_DONE),
             homing=bool(flags & _HOMING),
             faults=self.faults(status),
-            reverse_limit=bool(flags & _LIMIT1) if shows_limits else None,
-            forward_limit=bool(flags & _LIMIT2) if shows_limits else None,
+            reverse_limit=bool(flags & reverse) if shows_limits else None,
+            forward_limit=bool(flags & forward) if shows_limits else None,
             asked=asked,
         )
 

@@ -17,11 +17,20 @@ class Support(StrEnum):
     """Kept on the chain, published with identity and status byte, never moved."""
 
 
+class DeviceKind(StrEnum):
+    """What a module is; the same command codes mean other things to the next kind."""
+
+    SERVO = "servo"
+    IO = "io"
+    STEPPER = "stepper"
+    SUPERVISOR = "supervisor"
+
+
 class HomingSource(IntFlag):
     """Bits of the homing control byte that capture the home position (manuals, "Set Homing Mode")."""
 
-    LIMIT1 = 0x01  # LS-182AP: reverse limit
-    LIMIT2 = 0x02  # LS-182AP: forward limit
+    LIMIT1 = 0x01  # the reverse limit, but the forward one with `limit1_is_forward`
+    LIMIT2 = 0x02
     INDEX = 0x08
     POSITION_ERROR = 0x40
     CURRENT = 0x80
@@ -33,6 +42,7 @@ class Profile:
 
     Attributes:
         name: the name used in the configuration, and `title` the one for people.
+        kind: what the commands beyond the common ones mean.
         device_id: first byte of status item 5.
         versions: the versions of that id that speak this dialect.
         adc_bytes: width of status item 1, and `adc_bits` its resolution.
@@ -50,7 +60,18 @@ class Profile:
         offset_on_the_fly: a trapezoidal position loaded in mid-move is added as an offset; elsewhere it is erratic.
         current_limit: Set Gain's CL byte works.
         top_baud: the highest rate of Set Baud Rate.
-        sc_extensions: Reset Position with data, output modes in command 0x8, path points and Hard Reset with data.
+        baud_keys: Set Baud Rate looks its byte up in a table of rates; elsewhere the byte divides the clock.
+        encoder_counts_per_s: the highest rate of encoder transitions that is counted without loss.
+        most_velocity: the largest programmed velocity, 16.16 counts per tick.
+        most_error_limit: the largest EL of Set Gain, counts.
+        velocity_sign: the sign of status item 2 while the motor runs forward, 1 or -1.
+        limit1_is_forward: LIMIT1 is the forward limit switch and LIMIT2 the reverse one.
+        live_aux: aux bits 3 and 4 tell what the profile does now, and bit 0 is the level of the index; elsewhere the
+            two are latched phases of a trapezoid, and bit 0 the complement of the level.
+        sc_extensions: Reset Position with data, options in command 0x8, Hard Reset with data, relative moves, and
+            goal, velocity and acceleration that may be changed during a trapezoidal move.
+        advanced_stop: Stop Motor bit 5 turns on what the device has beyond version 4.
+        path_points: how many points the path buffer holds; 0 without path mode.
         motion_lock_from: from this version on, Stop Motor bit 7 unlocks motion and aux bit 7 says that it is locked
             (after homing on a limit); None on devices without the lock.
     """
@@ -60,6 +81,7 @@ class Profile:
     device_id: int
     versions: range
     support: Support
+    kind: DeviceKind = DeviceKind.SERVO
     adc_bytes: int = 1
     adc_bits: int = 8
     position_error_bytes: int = 0
@@ -82,7 +104,16 @@ class Profile:
     offset_on_the_fly: bool = False
     current_limit: bool = True
     top_baud: int = 115_200
+    baud_keys: bool = False
+    encoder_counts_per_s: int = 500_000
+    most_velocity: int = 0x7FFF_FFFF
+    most_error_limit: int = 0x3FFF
+    velocity_sign: int = -1
+    limit1_is_forward: bool = False
+    live_aux: bool = False
     sc_extensions: bool = False
+    advanced_stop: bool = False
+    path_points: int = 0
     motion_lock_from: int | None = None
 
 
@@ -127,8 +158,29 @@ PIC_SERVO_SC = Profile(
     gain_bytes=15,
     divisor_slows_profile=False,
     top_baud=230_400,
+    baud_keys=True,
+    encoder_counts_per_s=2_500_000,
+    most_velocity=1280 << 16,
+    most_error_limit=0x7FFF,
+    velocity_sign=1,
+    limit1_is_forward=True,
+    live_aux=True,
     sc_extensions=True,
+    path_points=128,
 )
+PIC_SERVO_CMC = replace(
+    PIC_SERVO_V4,
+    name="pic-servo-cmc",
+    title="PIC-SERVO CMC",
+    versions=range(5, 6),
+    advanced_stop=True,
+    path_points=96,
+)
+PIC_SERVO_CMC_ADVANCED = replace(PIC_SERVO_CMC, position_error_bytes=2, bit7_bytes=1)
+"""The same device after Stop Motor with bit 5, which adds two status items and path mode; it has the same identity.
+
+Before that it works as a version 4. Whether it already sends the two items is not known, so hosts do not ask for them.
+"""
 LS_173AP = Profile(
     "ls-173ap",
     "Logosol LS-173AP",
@@ -141,6 +193,7 @@ LS_173AP = Profile(
     analog_target=True,
     offset_on_the_fly=True,
     current_limit=False,
+    encoder_counts_per_s=2_000_000,
 )
 LS_182AP = replace(
     LS_173AP,
@@ -153,11 +206,11 @@ LS_182AP = replace(
     homing_sources=HomingSource.LIMIT1 | HomingSource.LIMIT2 | HomingSource.INDEX | HomingSource.POSITION_ERROR,
     motion_lock_from=22,
 )
-PIC_SERVO_CMC = replace(PIC_SERVO_SC, name="pic-servo-cmc", title="PIC-SERVO CMC", versions=range(5, 6))
 LS_231 = Profile("ls-231", "Logosol LS-231/LS-132 family", 0, range(20, 40), Support.IDENTIFY)
 LS_173 = Profile("ls-173", "Logosol LS-173/LS-174 family", 0, range(60, 80), Support.IDENTIFY)
-PIC_IO = Profile("pic-io", "PIC-I/O or SK-2310g2", 2, range(256), Support.IDENTIFY)
-PIC_STEP = Profile("pic-step", "PIC-STEP", 3, range(256), Support.IDENTIFY)
+PIC_IO = Profile("pic-io", "PIC-I/O", 2, range(1, 2), Support.IDENTIFY, DeviceKind.IO)
+SK_2310G2 = Profile("sk-2310g2", "Logosol SK-2310g2", 2, range(2, 256), Support.IDENTIFY, DeviceKind.SUPERVISOR)
+PIC_STEP = Profile("pic-step", "PIC-STEP", 3, range(256), Support.IDENTIFY, DeviceKind.STEPPER)
 
 PROFILES: dict[str, Profile] = {
     profile.name: profile
@@ -173,6 +226,7 @@ PROFILES: dict[str, Profile] = {
         LS_231,
         LS_173,
         PIC_IO,
+        SK_2310G2,
         PIC_STEP,
     )
 }

@@ -7,6 +7,7 @@ Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-
 
 from dataclasses import dataclass
 
+from ldcnd.drivers.ldcn.commands import COMMON_COMMANDS
 from ldcnd.drivers.ldcn.controls import HomingControl, PositionReset, StopControl
 from ldcnd.drivers.ldcn.packet import (
     GROUP_MEMBER,
@@ -17,13 +18,16 @@ from ldcnd.drivers.ldcn.packet import (
     ReceivedPacket,
     decode_packet,
 )
-from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.pic_io import DATA_BYTES, IoCommand, decode_io_command
+from ldcnd.drivers.ldcn.profiles import DeviceKind, Profile, Support
 from ldcnd.drivers.ldcn.registers import Gains, decode_gains
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.ldcn.trajectory import Trajectory, TrajectoryControl, decode_trajectory, trajectory_bytes
 from ldcnd.errors import BadReply
 
 POSITION_BYTES = POSITION.width
+OLDEST_GAIN_BYTES = 13
+"""What PIC-SERVO versions 1 to 3 take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,14 @@ class PlainCommand:
 @dataclass(frozen=True, slots=True)
 class UndefinedCommand:
     """A command that this device does not define; it answers and does nothing."""
+
+    command: Command
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class UndescribedCommand:
+    """A command of a device that ldcnd only identifies: what its data mean is not known."""
 
     command: Command
     data: bytes
@@ -101,7 +113,7 @@ class StopMotor:
 
 @dataclass(frozen=True, slots=True)
 class IoControl:
-    """Limit pins on PIC-SERVO version 4, output mode on PIC-SERVO SC."""
+    """Limit pins on PIC-SERVO version 4 and CMC, `IoOption` on PIC-SERVO SC."""
 
     control: int
 
@@ -115,14 +127,14 @@ class SetHomingMode:
 
 @dataclass(frozen=True, slots=True)
 class SetBaudRate:
-    """Change the rate; see `registers.actual_baud`."""
+    """Change the rate to `registers.module_baud` of this code."""
 
-    divisor: int
+    code: int
 
 
 @dataclass(frozen=True, slots=True)
 class AddPathPoints:
-    """Append to the path buffer of a PIC-SERVO SC; without points, start the path. Points are raw 16-bit words."""
+    """Append to the path buffer; without points, start the path. Points are raw 16-bit words."""
 
     points: tuple[int, ...]
 
@@ -137,6 +149,8 @@ class HardReset:
 ReceivedCommand = (
     PlainCommand
     | UndefinedCommand
+    | UndescribedCommand
+    | IoCommand
     | ResetPosition
     | SetAddress
     | DefineStatus
@@ -173,6 +187,11 @@ def interpret(profile: Profile, packet: Packet) -> Interpretation:
     """Take an intact packet as this device would."""
     command, expected = _decode(profile, packet)
     return Interpretation(packet.address, command, _oddities(profile, packet, command, expected))
+
+
+def received_command(profile: Profile, packet: Packet) -> ReceivedCommand:
+    """Return what an intact packet commands this device to do."""
+    return _decode(profile, packet)[0]
 
 
 def interpret_bytes(profile: Profile, data: bytes) -> Interpretation:
@@ -216,6 +235,8 @@ def _with_frame(profile: Profile, received: ReceivedPacket, *, checksum: int, le
 def _oddities(profile: Profile, packet: Packet, command: ReceivedCommand, expected: int) -> tuple[str, ...]:
     if isinstance(command, UndefinedCommand):
         return (f"{profile.title} does not define command {packet.command:X}",)
+    if isinstance(command, UndescribedCommand):
+        return ()
     count = len(packet.data)
     if count == expected:
         return ()
@@ -229,6 +250,12 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
     """Return the command and how many data bytes it should have had."""
     data = packet.data
     first = data[0] if data else 0
+    if packet.command not in COMMON_COMMANDS:
+        if profile.kind is DeviceKind.IO:
+            own = decode_io_command(packet)
+            return (own, DATA_BYTES[packet.command]) if own else (UndefinedCommand(packet.command, data), 0)
+        if profile.support is Support.IDENTIFY:
+            return UndescribedCommand(packet.command, data), 0
     match packet.command:
         case Command.RESET_POSITION | Command.IO_CONTROL | Command.ADD_PATH_POINTS | Command.HARD_RESET:
             return _decode_by_dialect(profile, packet, first)
@@ -237,7 +264,7 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
         case Command.LOAD_TRAJECTORY:
             return LoadTrajectory(decode_trajectory(profile, data)), trajectory_bytes(profile, TrajectoryControl(first))
         case Command.SET_GAIN:
-            return SetGain(decode_gains(profile, data)), profile.gain_bytes
+            return SetGain(decode_gains(profile, data)), _gain_bytes(profile, len(data))
         case Command.STOP_MOTOR:
             if first & StopControl.HERE:
                 return StopMotor(StopControl(first), POSITION.decode(data[1:])), 1 + POSITION_BYTES
@@ -245,6 +272,12 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
         case Command.SET_HOMING_MODE:
             return SetHomingMode(HomingControl(first)), 1
     return PlainCommand(packet.command), 0
+
+
+def _gain_bytes(profile: Profile, count: int) -> int:
+    """Return how many bytes Set Gain should have had: PIC-SERVO SC takes those of every older version."""
+    accepted = range(OLDEST_GAIN_BYTES, profile.gain_bytes)
+    return count if profile.sc_extensions and count in accepted else profile.gain_bytes
 
 
 def _decode_network(packet: Packet, first: int) -> tuple[ReceivedCommand, int]:
@@ -268,7 +301,7 @@ def _decode_by_dialect(profile: Profile, packet: Packet, first: int) -> tuple[Re
             return ResetPosition(), 0
         case Command.IO_CONTROL if profile.limit_outputs or profile.sc_extensions:
             return IoControl(first), 1
-        case Command.ADD_PATH_POINTS if profile.sc_extensions:
+        case Command.ADD_PATH_POINTS if profile.path_points:
             points = tuple(int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2))
             return AddPathPoints(points), 2 * len(points)
         case Command.HARD_RESET if data and profile.sc_extensions:

@@ -24,7 +24,7 @@ SERVO_CYCLE_S = 0.000512
 """The servo period at divisor 1; commands are executed at its end whatever the divisor is."""
 FRACTION = 1 << 16
 MOST_RATE = 0x7FFF_FFFF
-"""The largest programmed velocity or acceleration."""
+"""The largest programmed acceleration, and the largest velocity of most devices."""
 MOST_DIVISOR = 0xFF
 PROCESSOR_HZ = 20_000_000
 CLOCKS_PER_BIT = 16
@@ -46,6 +46,8 @@ BAUD_DIVISORS = MappingProxyType(
     }
 )
 """The divisor of each rate; 230400 exists on PIC-SERVO SC only."""
+BAUD_KEYS = MappingProxyType({code: baud for rates in BAUD_DIVISORS.values() for baud, code in rates.items()})
+"""What PIC-SERVO SC looks the byte up in: it knows both families and sets its clock to the rate itself."""
 
 
 def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profile) -> int:
@@ -54,7 +56,9 @@ def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profil
     Raises:
         ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
     """
-    return _programmed("velocity", "counts/s", counts_per_s, _velocity_factor(servo_divisor, profile))
+    return _programmed(
+        "velocity", "counts/s", counts_per_s, _velocity_factor(servo_divisor, profile), profile.most_velocity
+    )
 
 
 def velocity_counts_per_s(programmed: int, servo_divisor: int, profile: Profile) -> float:
@@ -72,7 +76,9 @@ def programmed_acceleration(counts_per_s2: float, servo_divisor: int, profile: P
     Raises:
         ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
     """
-    return _programmed("acceleration", "counts/s^2", counts_per_s2, _acceleration_factor(servo_divisor, profile))
+    return _programmed(
+        "acceleration", "counts/s^2", counts_per_s2, _acceleration_factor(servo_divisor, profile), MOST_RATE
+    )
 
 
 def acceleration_counts_per_s2(programmed: int, servo_divisor: int, profile: Profile) -> float:
@@ -104,6 +110,11 @@ def actual_baud(divisor: int) -> float:
     return PROCESSOR_HZ / CLOCKS_PER_BIT / (divisor + 1)
 
 
+def module_baud(profile: Profile, code: int) -> float | None:
+    """Return the rate that a device takes at this code of Set Baud Rate, 0 to 255; None when it knows no such code."""
+    return BAUD_KEYS.get(code) if profile.baud_keys else actual_baud(code)
+
+
 def _velocity_factor(servo_divisor: int, profile: Profile) -> float:
     return FRACTION * _profile_tick_s(servo_divisor, profile)
 
@@ -123,8 +134,8 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
     return SERVO_CYCLE_S * (servo_divisor if profile.divisor_slows_profile else 1)
 
 
-def _programmed(what: str, unit: str, value: float, factor: float) -> int:
-    most = MOST_RATE / factor
+def _programmed(what: str, unit: str, value: float, factor: float, most_register: int) -> int:
+    most = most_register / factor
     if not 0 <= value <= most:
         nearest = most if value > most else 0.0
         raise ValueOutOfRange(
@@ -142,7 +153,7 @@ def _programmed(what: str, unit: str, value: float, factor: float) -> int:
             limit=least,
             nearest=least,
         )
-    return min(register, MOST_RATE)
+    return min(register, most_register)
 
 
 _KP = Field("KP", 2, 0, 0x7FFF)
@@ -152,7 +163,6 @@ _IL = Field("IL", 2, 0, 0x7FFF)
 _OL = Field("OL", 1, 0, 0xFF)
 _CL = Field("CL", 1, 0, 0xFF)
 _RESERVED_CL = Field("CL (reserved on this drive)", 1, 0, 0)
-_EL = Field("EL", 2, 0, 0x3FFF)
 _SR = Field("SR", 1, 1, MOST_DIVISOR)
 _DEADBAND = Field("deadband compensation", 1, 0, 0xFF)
 _STEP_MULTIPLIER = Field("step multiplier", 1, 1, 0xFF)
@@ -173,7 +183,7 @@ class Gains:
         ol: PWM output limit, 0 to 255; the LS-182AP manual recommends 250.
         cl: current limit, 0 to 255, odd when the sense voltage rises with the current; 0 is off, and the only value on
             Logosol drives.
-        el: position error limit, 0 to 0x3FFF counts.
+        el: position error limit, 0 to 0x3FFF counts; 0x7FFF on PIC-SERVO SC.
         sr: servo rate divisor, 1 to 255.
         deadband: amplifier deadband compensation, 0 to 255; 0 on PIC-SERVO versions 1 to 3.
         step_multiplier: 1 to 255; 1 on everything but PIC-SERVO SC.
@@ -224,7 +234,16 @@ def decode_gains(profile: Profile, data: bytes) -> Gains:
 
 def _fields(profile: Profile) -> tuple[Field, ...]:
     """Return the registers in order; older devices have fewer."""
-    fields: tuple[Field, ...] = (_KP, _KD, _KI, _IL, _OL, _CL if profile.current_limit else _RESERVED_CL, _EL, _SR)
+    fields: tuple[Field, ...] = (
+        _KP,
+        _KD,
+        _KI,
+        _IL,
+        _OL,
+        _CL if profile.current_limit else _RESERVED_CL,
+        Field("EL", 2, 0, profile.most_error_limit),
+        _SR,
+    )
     if profile.gain_bytes >= _BYTES_WITH_DEADBAND:
         fields += (_DEADBAND,)
     if profile.gain_bytes >= _BYTES_WITH_STEP_MULTIPLIER:

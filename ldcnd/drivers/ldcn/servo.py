@@ -50,6 +50,9 @@ SOURCES = MappingProxyType(
         HomeMethod.CURRENT: HomingSource.CURRENT,
     }
 )
+OPPOSITE_LIMITS = MappingProxyType(
+    {HomeMethod.REVERSE_LIMIT: HomeMethod.FORWARD_LIMIT, HomeMethod.FORWARD_LIMIT: HomeMethod.REVERSE_LIMIT}
+)
 STOPS = MappingProxyType(
     {
         StopMode.SMOOTH: HomingControl.STOP_SMOOTH,
@@ -59,9 +62,16 @@ STOPS = MappingProxyType(
 )
 
 
+def homing_source(profile: Profile, method: HomeMethod) -> HomingSource:
+    """Return the input or event that a method watches on this device."""
+    if profile.limit1_is_forward:
+        method = OPPOSITE_LIMITS.get(method, method)
+    return SOURCES[method]
+
+
 def home_methods(profile: Profile) -> frozenset[HomeMethod]:
     """Return what can capture the home position of this device."""
-    return frozenset(method for method, source in SOURCES.items() if source & profile.homing_sources)
+    return frozenset(method for method in SOURCES if homing_source(profile, method) & profile.homing_sources)
 
 
 def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
@@ -69,7 +79,7 @@ def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
 
     An excess position error opens the loop by itself, so no way to stop goes with it.
     """
-    control = HomingControl(SOURCES[capture.method])
+    control = HomingControl(homing_source(profile, capture.method))
     if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
         control |= STOPS[capture.stop]
     return control

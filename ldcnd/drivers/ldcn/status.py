@@ -48,12 +48,13 @@ class StatusFlag(IntFlag):
 class AuxFlag(IntFlag):
     """The auxiliary status byte."""
 
-    INDEX = 0x01  # complement of the index input, or diagnostic bit
+    INDEX = 0x01  # complement of the index input (its level with `live_aux`), or diagnostic bit
     POSITION_WRAP = 0x02
     SERVO_ON = 0x04
-    ACCEL_DONE = 0x08
-    SLEW_DONE = 0x10
+    ACCEL_DONE = 0x08  # with `live_aux`: accelerating now
+    SLEW_DONE = 0x10  # with `live_aux`: at constant velocity, or standing
     SERVO_OVERRUN = 0x20
+    PATH_MODE = 0x40  # a path runs
     MOTION_LOCKED = 0x80  # LS-182AP from version 22 on
 
 
@@ -64,7 +65,7 @@ class Status:
     Attributes:
         position: counts, signed 32 bit.
         adc: counts, 0 to 255 or 0 to 1023 as the profile says.
-        velocity: counts per servo tick, **positive forward** (the wire says the opposite).
+        velocity: counts per servo tick, **positive forward** (most devices send the opposite).
         home: counts, signed 32 bit.
         position_error: counts, commanded minus actual, signed 16 bit.
         bit7: the byte of status item 7 (PIC-SERVO SC: path points left).
@@ -132,7 +133,7 @@ def encode_status(profile: Profile, items: StatusItem, status: Status) -> bytes:
     if mask & _ADC:
         body += (status.adc or 0).to_bytes(profile.adc_bytes, "little")
     if mask & _VELOCITY:
-        body += (-(status.velocity or 0)).to_bytes(2, "little", signed=True)
+        body += (profile.velocity_sign * (status.velocity or 0)).to_bytes(2, "little", signed=True)
     if mask & _AUX:
         body.append(status.aux or 0)
     if mask & _HOME:
@@ -180,7 +181,7 @@ def _decode_items(profile: Profile, mask: int, data: bytes) -> Status:
         adc = int.from_bytes(data[at : at + profile.adc_bytes], "little")
         at += profile.adc_bytes
     if mask & _VELOCITY:
-        velocity = -int.from_bytes(data[at : at + 2], "little", signed=True)
+        velocity = profile.velocity_sign * int.from_bytes(data[at : at + 2], "little", signed=True)
         at += 2
     if mask & _AUX:
         aux = _AUX_FLAGS[data[at]]

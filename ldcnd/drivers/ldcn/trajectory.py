@@ -22,7 +22,6 @@ from ldcnd.drivers.ldcn.registers import (
 )
 from ldcnd.errors import NotSupported, ValueOutOfRange
 
-VELOCITY = Field("velocity", 4, 0, MOST_RATE)
 ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
 MOST_PWM = 0xFF
 
@@ -43,7 +42,7 @@ class TrajectoryControl(IntFlag):
     LOAD_PWM_OR_TARGET = 0x08
     SERVO = 0x10
     VELOCITY_MODE = 0x20
-    REVERSE = 0x40
+    REVERSE = 0x40  # in trapezoidal mode: a relative goal on PIC-SERVO SC, nothing elsewhere
     START_NOW = 0x80
 
 
@@ -61,6 +60,7 @@ class Trajectory:
         mode: the profile, while the servo is on.
         reverse: backward, in velocity and PWM mode; in trapezoidal mode the direction follows from the position.
         start_now: execute at once instead of waiting for Start Motion.
+        relative: the position is a distance from the present command position; PIC-SERVO SC, trapezoidal mode.
     """
 
     position: int | None = None
@@ -71,6 +71,7 @@ class Trajectory:
     mode: ProfileMode = ProfileMode.TRAPEZOIDAL
     reverse: bool = False
     start_now: bool = False
+    relative: bool = False
 
     @property
     def control(self) -> TrajectoryControl:
@@ -83,7 +84,7 @@ class Trajectory:
             (self.pwm_or_target is not None, TrajectoryControl.LOAD_PWM_OR_TARGET),
             (self.servo, TrajectoryControl.SERVO),
             (self.mode is ProfileMode.VELOCITY, TrajectoryControl.VELOCITY_MODE),
-            (self.reverse, TrajectoryControl.REVERSE),
+            (self.reverse or self.relative, TrajectoryControl.REVERSE),
             (self.start_now, TrajectoryControl.START_NOW),
         ):
             if present:
@@ -101,10 +102,14 @@ def encode_trajectory(profile: Profile, trajectory: Trajectory) -> bytes:
 
     Raises:
         ValueOutOfRange: a value does not fit its register.
-        NotSupported: an analog target on a device without absolute positioning, or a backward trapezoid: the bit means
-            nothing there on most devices, and a relative move on PIC-SERVO SC.
+        NotSupported: an analog target on a device without absolute positioning, a relative move on another device than
+            PIC-SERVO SC or in another mode than the trapezoidal one, or a backward trapezoid: the bit means nothing
+            there on most devices, and a relative move on PIC-SERVO SC.
     """
-    if trajectory.servo and trajectory.mode is ProfileMode.TRAPEZOIDAL and trajectory.reverse:
+    trapezoidal = trajectory.servo and trajectory.mode is ProfileMode.TRAPEZOIDAL
+    if trajectory.relative and not (trapezoidal and profile.sc_extensions):
+        raise NotSupported(f"{profile.title} has no relative moves, or this is no trapezoidal one")
+    if trapezoidal and trajectory.reverse:
         raise NotSupported("a trapezoidal move takes its direction from the position, not from the reverse bit")
     if trajectory.servo and trajectory.pwm_or_target and not profile.analog_target:
         raise NotSupported(f"{profile.title} has no absolute positioning: with the servo on it takes no analog target")
@@ -125,15 +130,20 @@ def decode_trajectory(profile: Profile, data: bytes) -> Trajectory:
         values.append(field.decode(data[at:]) if field else None)
         at += field.width if field else 0
     position, velocity, acceleration, pwm_or_target = values
+    servo = bool(control & TrajectoryControl.SERVO)
+    trapezoidal = not control & TrajectoryControl.VELOCITY_MODE
+    reverse = bool(control & TrajectoryControl.REVERSE)
+    relative = reverse and servo and trapezoidal and profile.sc_extensions
     return Trajectory(
         position=position,
         velocity=velocity,
         acceleration=acceleration,
         pwm_or_target=pwm_or_target,
-        servo=bool(control & TrajectoryControl.SERVO),
-        mode=ProfileMode.VELOCITY if control & TrajectoryControl.VELOCITY_MODE else ProfileMode.TRAPEZOIDAL,
-        reverse=bool(control & TrajectoryControl.REVERSE),
+        servo=servo,
+        mode=ProfileMode.TRAPEZOIDAL if trapezoidal else ProfileMode.VELOCITY,
+        reverse=reverse and not relative,
         start_now=bool(control & TrajectoryControl.START_NOW),
+        relative=relative,
     )
 
 
@@ -141,7 +151,7 @@ def _fields(profile: Profile, control: TrajectoryControl) -> tuple[Field | None,
     """Return position, velocity, acceleration and PWM or target, None for those that the control byte leaves out."""
     return (
         POSITION if control & TrajectoryControl.LOAD_POSITION else None,
-        VELOCITY if control & TrajectoryControl.LOAD_VELOCITY else None,
+        Field("velocity", 4, 0, profile.most_velocity) if control & TrajectoryControl.LOAD_VELOCITY else None,
         ACCELERATION if control & TrajectoryControl.LOAD_ACCELERATION else None,
         _pwm_or_target(profile, control) if control & TrajectoryControl.LOAD_PWM_OR_TARGET else None,
     )

@@ -13,19 +13,27 @@ Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3.
 """
 
 from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
-from ldcnd.drivers.ldcn.packet import POSITION, Command, Packet
+from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, decode_gains
+from ldcnd.drivers.ldcn.received import (
+    IoControl,
+    LoadTrajectory,
+    PlainCommand,
+    ReceivedCommand,
+    ResetPosition,
+    SetGain,
+    SetHomingMode,
+    StopMotor,
+)
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, encode_status
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, decode_trajectory
+from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing, SimulatedModule
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage
 from ldcnd.sim.ldcn.servo import COUNTER_SPAN, HomeSearch, ServoLoop
 from ldcnd.sim.plant import MotorPlant, Shaft
 
 SHORTS = range(-0x8000, 0x8000)
-_TO_HOME, _TO_POSITION = 1, 2
-"""First data byte of Reset Position on PIC-SERVO SC."""
 _NO_TRAJECTORY = Trajectory(servo=False)
 _ALL_INPUTS = LimitPins.LIMIT1_INPUT | LimitPins.LIMIT2_INPUT
 
@@ -88,29 +96,28 @@ class SimulatedDrive(SimulatedModule):
             self.loop.homed_on_limit = False
             self._locked = self._may_lock
 
-    def execute(self, packet: Packet) -> None:
+    def execute(self, command: ReceivedCommand) -> None:
         """See `SimulatedModule`."""
-        match packet.command:
-            case Command.RESET_POSITION:
-                self._reset_position(packet.data)
-            case Command.LOAD_TRAJECTORY:
-                self._load(decode_trajectory(self.profile, packet.data))
-            case Command.START_MOTION:
+        loop = self.loop
+        match command:
+            case ResetPosition(position, relative_to_home):
+                loop.renumber(loop.position - loop.home if relative_to_home else position)
+            case LoadTrajectory(trajectory):
+                self._load(trajectory)
+            case PlainCommand(Command.START_MOTION):
                 self._start()
-            case Command.SET_GAIN:
-                self.loop.set_gains(decode_gains(self.profile, packet.data))
-            case Command.STOP_MOTOR:
-                self._stop(StopControl(packet.data[0] if packet.data else 0), packet.data[1:])
-            case Command.IO_CONTROL if self.profile.limit_outputs:
-                self._pins = LimitPins(packet.data[0] & 0x0F) if packet.data else LimitPins(0)
-            case Command.SET_HOMING_MODE:
-                self._arm_homing(HomingControl(packet.data[0] if packet.data else 0))
-            case Command.CLEAR_STICKY_BITS:
+            case SetGain(gains):
+                loop.set_gains(gains)
+            case StopMotor(control, position):
+                self._stop(control, position)
+            case IoControl(control) if self.profile.limit_outputs:
+                self._pins = LimitPins(control & 0x0F)
+            case SetHomingMode(control):
+                self._arm_homing(control)
+            case PlainCommand(Command.CLEAR_STICKY_BITS):
                 self._clear_sticky_bits()
-            case Command.SAVE_CURRENT_POSITION_AS_HOME:
-                self.loop.home = self.loop.position
-            case _:
-                pass
+            case PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME):
+                loop.home = loop.position
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
         """See `SimulatedModule`."""
@@ -170,17 +177,6 @@ class SimulatedDrive(SimulatedModule):
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
-    def _reset_position(self, data: bytes) -> None:
-        """Name the present position anew: 0; on PIC-SERVO SC also relative to home, or any number."""
-        loop = self.loop
-        variant = data[0] if data and self.profile.sc_extensions else 0
-        if variant == _TO_HOME:
-            loop.renumber(loop.position - loop.home)
-        elif variant == _TO_POSITION:
-            loop.renumber(POSITION.decode(data[1:]))
-        else:
-            loop.renumber(0)
-
     def _load(self, trajectory: Trajectory) -> None:
         self._trajectory = trajectory
         if trajectory.position is not None:
@@ -227,7 +223,7 @@ class SimulatedDrive(SimulatedModule):
         loop.analog_target = None
         loop.trajectory.run_at(-self._speed if trajectory.reverse else self._speed, self._acceleration)
 
-    def _stop(self, control: StopControl, position: bytes) -> None:
+    def _stop(self, control: StopControl, position: int | None) -> None:
         self.stage.enable(on=bool(control & StopControl.AMP_ENABLE))
         if control & StopControl.LOCK_DISABLE and self._may_lock:
             self._locked = self._may_lock = False
@@ -238,8 +234,10 @@ class SimulatedDrive(SimulatedModule):
         if control & StopControl.MOTOR_OFF:
             loop.open()
             return
-        here = control & StopControl.HERE and self.profile.stop_here
-        if not self.stage.allows_servo or not (here or control & (StopControl.ABRUPT | StopControl.SMOOTH)):
+        if not self.profile.stop_here:
+            position = None
+        profiled = control & (StopControl.ABRUPT | StopControl.SMOOTH)
+        if not self.stage.allows_servo or not (profiled or position is not None):
             return
         self._close()
         loop.analog_target = None
@@ -247,8 +245,8 @@ class SimulatedDrive(SimulatedModule):
             loop.trajectory.stop_abruptly()
         elif control & StopControl.SMOOTH:
             loop.trajectory.stop_smoothly()
-        else:
-            loop.trajectory.jump_to(POSITION.decode(position))
+        elif position is not None:
+            loop.trajectory.jump_to(position)
 
     def _arm_homing(self, control: HomingControl) -> None:
         loop = self.loop

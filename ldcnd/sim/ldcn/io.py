@@ -6,8 +6,8 @@ Sources: later vendor data sheets; widths of items that no source here describes
 
 from dataclasses import dataclass
 
-from ldcnd.drivers.ldcn.packet import Packet
 from ldcnd.drivers.ldcn.profiles import PIC_IO, Profile
+from ldcnd.drivers.ldcn.received import ReceivedCommand
 from ldcnd.drivers.ldcn.status import StatusFlag, StatusItem
 from ldcnd.sim.ldcn.module import ModuleSettings, SimulatedModule
 
@@ -42,7 +42,7 @@ class SimulatedIo(SimulatedModule):
     def run(self, cycles: int) -> None:
         """See `SimulatedModule`: nothing here moves."""
 
-    def execute(self, packet: Packet) -> None:
+    def execute(self, command: ReceivedCommand) -> None:
         """See `SimulatedModule`: outputs and timers are not simulated."""
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:

@@ -19,14 +19,22 @@ from enum import StrEnum
 
 from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader
 from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.received import (
+    DefineStatus,
+    HardReset,
+    PlainCommand,
+    ReadStatus,
+    ReceivedCommand,
+    SetAddress,
+    SetBaudRate,
+    received_command,
+)
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
 
 EVERYBODY = 0xFF
 RESET_BAUD_DIVISOR = 0x3F
-GROUP_BIT = 0x80
-LOGOSOL_ID = 90
 _ROUNDING = 1e-6
 
 
@@ -170,7 +178,7 @@ class SimulatedModule(Module):
         """Let servo cycles pass."""
 
     @abstractmethod
-    def execute(self, packet: Packet) -> None:
+    def execute(self, command: ReceivedCommand) -> None:
         """Execute a command that is not common to all modules; ignore what this one does not know."""
 
     @abstractmethod
@@ -202,29 +210,24 @@ class SimulatedModule(Module):
         if not self._intact:
             return self.status(self.items, checksum_error=True) if self._answers else None
         items = self.items
-        match packet.command:
-            case Command.SET_ADDRESS:
-                address, group = packet.data[:2].ljust(2, b"\0")
-                self.address, self.group = address, group | GROUP_BIT
-                self.leader = not group & GROUP_BIT
+        match received_command(self.profile, packet):
+            case SetAddress() as addresses:
+                self.address, self.group, self.leader = addresses.address, addresses.group, addresses.leader
                 self.address_out = True
-            case Command.DEFINE_STATUS:
-                items = self.items = self._items(packet)
-            case Command.READ_STATUS:
-                items = self._items(packet)
-            case Command.SET_BAUD_RATE:
-                self.baud = actual_baud(packet.data[0] if packet.data else 0)
-            case Command.HARD_RESET:
+            case DefineStatus(items):
+                self.items = items
+            case ReadStatus(items):
+                pass
+            case SetBaudRate(code):
+                self.baud = actual_baud(code)
+            case HardReset():
                 self._reset(at_s)
                 return None
-            case Command.NO_OPERATION:
+            case PlainCommand(Command.NO_OPERATION):
                 pass
-            case _:
-                self.execute(packet)
+            case command:
+                self.execute(command)
         return self.status(items, checksum_error=False) if self._answers else None
-
-    def _items(self, packet: Packet) -> StatusItem:
-        return StatusItem(packet.data[0] if packet.data else 0)
 
     def _reset(self, at_s: float) -> None:
         self._deaf_until_s = at_s + self.settings.reset_dead_s
