@@ -8,6 +8,7 @@ from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import Trajectory
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, UTILITY_GAINS, SimulatedAxis
 from tests.support.simulated_host import little
 
@@ -51,6 +52,31 @@ def test_velocity_is_sent_negative_when_moving_forward():
     raw = axis.send(1, Command.READ_STATUS, 0x04)
 
     assert int.from_bytes(raw[1:3], "little", signed=True) == pytest.approx(-10, abs=1)
+
+
+def test_sc_sends_the_velocity_positive_when_moving_forward():
+    axis = SimulatedAxis("picservo-sc")
+    axis.jog(10 * ONE)
+    axis.wait(1.0)
+
+    raw = axis.send(1, Command.READ_STATUS, 0x04)
+
+    assert int.from_bytes(raw[1:3], "little", signed=True) == pytest.approx(10, abs=1)
+
+
+def test_limit1_is_the_forward_switch_of_sc_and_the_reverse_one_of_the_others():
+    flags = {}
+    for name in ("picservo-sc", "picservo-v4", "ls182ap"):
+        axis = SimulatedAxis(name, plant=MotorPlant(forward_limit_counts=1000))
+        axis.move(1500)
+        axis.finish()
+        flags[name] = axis.status().flags & (StatusFlag.LIMIT1 | StatusFlag.LIMIT2)
+
+    assert flags == {
+        "picservo-sc": StatusFlag.LIMIT1,
+        "picservo-v4": StatusFlag.LIMIT2,
+        "ls182ap": StatusFlag.LIMIT2,
+    }
 
 
 def test_velocity_mode_reports_done_at_the_goal_velocity_and_runs_on():

@@ -108,7 +108,9 @@ class ServoLoop:
     def inputs(self) -> Inputs:
         """The levels of the inputs at this moment."""
         shaft = self.shaft
-        return Inputs(shaft.on_reverse_limit, shaft.on_forward_limit, shaft.on_index)
+        limits = (shaft.on_reverse_limit, shaft.on_forward_limit)
+        limit1, limit2 = reversed(limits) if self._profile.limit1_is_forward else limits
+        return Inputs(limit1, limit2, shaft.on_index)
 
     @property
     def following_error(self) -> int:
