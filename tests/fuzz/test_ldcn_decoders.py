@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.faults import diagnose
+from ldcnd.drivers.ldcn.faults import Knowledge, diagnose
 from ldcnd.drivers.ldcn.packet import HEADER, Command, Packet, PacketReader, decode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
 from ldcnd.drivers.ldcn.received import decode_command, interpret, interpret_bytes
@@ -15,6 +15,7 @@ from ldcnd.drivers.ldcn.status import Status, StatusItem, check_status, decode_s
 from ldcnd.errors import BadReply
 from ldcnd.exchange import ReplyVerdict
 
+unsure = st.sampled_from([True, False, None])
 profiles = st.sampled_from(list(PROFILES.values()))
 masks = st.integers(0, 255).map(StatusItem)
 
@@ -54,17 +55,17 @@ def test_any_bytes_are_a_status_or_a_bad_reply(profile, items, data):
     with suppress(BadReply):
         status = decode_status(profile, items, data)
         assert len(data) == status_bytes(profile, items)
-        assert diagnose(profile, status, pic_ae=True, absolute_mode=True) is not None
+        assert diagnose(profile, status, Knowledge(pic_ae=True, absolute=True)) is not None
 
 
-@given(profiles, masks, st.binary(min_size=1, max_size=18), st.booleans(), st.booleans())
+@given(profiles, masks, st.binary(min_size=1, max_size=18), unsure, unsure)
 def test_what_the_check_lets_pass_can_be_decoded(profile, items, body, pic_ae, absolute_mode):
     body = body.ljust(status_bytes(profile, items) - 1, b"\0")[: status_bytes(profile, items) - 1]
     data = body + bytes((sum(body) & 0xFF,))
 
     assert check_status(data) in {ReplyVerdict.INTACT, ReplyVerdict.REJECTED}
     status = decode_status(profile, items, data)
-    for fault in diagnose(profile, status, pic_ae=pic_ae, absolute_mode=absolute_mode):
+    for fault in diagnose(profile, status, Knowledge(pic_ae=pic_ae, absolute=absolute_mode)):
         assert fault.remedy
 
 

@@ -121,7 +121,15 @@ async def dialect_rig(
         yield DialectRig(rig, chain, drive)
 
 
-def _config(dialect: Dialect, axis: dict[str, object]) -> RigConfig:
+@asynccontextmanager
+async def adopting_rig(dialect: Dialect, before: DialectRig, **axis: object) -> AsyncIterator[DialectRig]:
+    """Run a new daemon that takes the line of an earlier one over as it is."""
+    config = _config(dialect, axis, start="adopt")
+    async with running_rig(config, {"line": before.chain}) as rig:
+        yield DialectRig(rig, before.chain, before.drive)
+
+
+def _config(dialect: Dialect, axis: dict[str, object], start: str = "reset") -> RigConfig:
     return RigConfig.model_validate(
         {
             "rig": "dialect",
@@ -131,6 +139,7 @@ def _config(dialect: Dialect, axis: dict[str, object]) -> RigConfig:
                     "name": "line",
                     "port": "sim:line",
                     "baud": 115_200,
+                    "start": start,
                     "axis": [
                         {
                             "name": AXIS,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.faults import WARNINGS, Fault, FaultCode, diagnose
+from ldcnd.drivers.ldcn.faults import WARNINGS, Fault, FaultCode, Knowledge, diagnose
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 
@@ -23,8 +23,9 @@ def logosol(row, *, adc=None):
     return Status(StatusFlag(flags), adc=adc, aux=AuxFlag(AuxFlag.SERVO_ON * servo_on | AuxFlag.INDEX * index))
 
 
-def found(profile, status, *, pic_ae, absolute_mode=False):
-    return diagnose(profile, status, pic_ae=pic_ae, absolute_mode=absolute_mode)
+def found(profile, status, *, pic_ae, absolute_mode=False, **known):
+    known = {"nothing_latched": pic_ae is False, "closed": bool(pic_ae)} | known
+    return diagnose(profile, status, Knowledge(pic_ae=pic_ae, absolute=absolute_mode, **known))
 
 
 @pytest.mark.parametrize("pos_error", "01")
@@ -46,7 +47,8 @@ def test_switched_on_the_limit_bits_are_limit_switches(row):
         ("1 0 1 1 0 1", [FaultCode.STOP_INPUT]),
         ("0 0 1 1 0 1", [FaultCode.STOP_INPUT, FaultCode.OVERHEAT]),
         ("1 1 0 0 0 1", [FaultCode.OVERVOLTAGE]),
-        ("0 0 1 0 0 1", [FaultCode.OVERVOLTAGE]),
+        ("1 1 1 0 0 1", [FaultCode.OVERVOLTAGE]),
+        ("1 0 1 0 0 1", [FaultCode.LATCHED_FAULT]),  # the chapter on the stop input has it clear bit 3, too
     ],
 )
 def test_switched_off_the_bits_say_what_is_wrong_at_present(row, codes):
@@ -66,7 +68,49 @@ def test_switched_off_the_bits_say_what_is_wrong_at_present(row, codes):
     ],
 )
 def test_switched_on_the_bits_say_what_switched_the_driver_off(row, code):
-    assert found(LS_182AP, logosol(row), pic_ae=True) == (Fault(code, latched=True),)
+    loses = code is FaultCode.ENCODER_OR_HALL
+    assert found(LS_182AP, logosol(row), pic_ae=True) == (Fault(code, latched=True, loses_position=loses),)
+
+
+@pytest.mark.parametrize("row", ["1 1 1 0 0 1", "0 0 1 0 0 1", "1 0 1 0 0 0"])
+@pytest.mark.parametrize("pic_ae", [False, None])
+def test_what_bit_3_stands_for_is_not_readable_while_a_cause_may_be_latched(row, pic_ae):
+    fault = Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
+
+    assert found(LS_182AP, logosol(row), pic_ae=pic_ae, nothing_latched=False) == (fault,)
+
+
+@pytest.mark.parametrize("row", ["1 1 1 0 0 1", "0 0 1 0 0 1"])
+@pytest.mark.parametrize("pic_ae", [False, None])
+def test_a_cause_that_was_seen_keeps_its_name_while_bit_3_is_clear(row, pic_ae):
+    cause = Fault(FaultCode.OVERCURRENT, latched=True)
+
+    assert found(LS_182AP, logosol(row), pic_ae=pic_ae, nothing_latched=False, latched=cause) == (cause,)
+
+
+def test_a_cause_of_the_power_driver_is_gone_once_bit_3_is_set_again():
+    cause = Fault(FaultCode.OVERCURRENT, latched=True)
+
+    assert found(LS_182AP, logosol("1 1 1 1 0 1"), pic_ae=False, latched=cause) == ()
+
+
+@pytest.mark.parametrize(
+    ("row", "codes"), [("1 1 1 1 0 1", []), ("0 0 0 1 0 1", []), ("0 1 1 1 0 1", [FaultCode.LATCHED_FAULT])]
+)
+def test_with_pic_ae_not_known_only_what_both_readings_call_a_fault_is_one(row, codes):
+    assert [fault.code for fault in found(LS_182AP, logosol(row), pic_ae=None)] == codes
+
+
+def test_a_closed_loop_is_read_as_the_power_driver_being_on():
+    assert found(LS_182AP, logosol("0 0 0 1 1 1"), pic_ae=None) == ()
+
+
+def test_an_analog_move_that_may_have_been_under_way_leaves_the_cause_open():
+    status = logosol("1 1 1 1 0 1", adc=0)
+
+    (fault,) = diagnose(LS_182AP, status, Knowledge(pic_ae=True, absolute=None))
+
+    assert fault.code is FaultCode.LATCHED_FAULT
 
 
 @pytest.mark.parametrize("adc", [0, 7, 1016, 1023])
@@ -97,12 +141,11 @@ def test_an_old_position_error_in_a_closed_loop_is_no_fault():
     assert found(LS_182AP, logosol("1 1 1 1 1 1"), pic_ae=True) == ()
 
 
-def test_without_the_auxiliary_byte_both_readings_are_reported():
+def test_without_the_auxiliary_byte_a_stop_input_and_a_lost_encoder_look_alike():
     status = Status(StatusFlag.LIMIT2 | StatusFlag.POSITION_ERROR)
 
-    codes = [fault.code for fault in found(LS_182AP, status, pic_ae=True)]
-
-    assert codes == [FaultCode.STOP_INPUT, FaultCode.ENCODER_OR_HALL]
+    fault = Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
+    assert found(LS_182AP, status, pic_ae=True) == (fault,)
 
 
 def test_pic_servo_at_rest_with_everything_off_is_healthy():
@@ -116,7 +159,19 @@ def test_pic_servo_tells_a_position_error_from_lost_power():
     unpowered = Status(StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
 
     assert found(V4, tripped, pic_ae=True) == (Fault(FaultCode.POSITION_ERROR, latched=True),)
-    assert found(V4, unpowered, pic_ae=True) == (Fault(FaultCode.POWER_LOST, latched=False),)
+    assert found(V4, unpowered, pic_ae=True) == (Fault(FaultCode.POWER_LOST, latched=True),)
+    assert found(V4, unpowered, pic_ae=False) == (Fault(FaultCode.POWER_LOST, latched=False),)
+
+
+def test_missing_motor_power_stops_nothing_while_the_loop_is_open():
+    assert not Fault(FaultCode.POWER_LOST, latched=False).stops
+    assert Fault(FaultCode.POWER_LOST, latched=True).stops
+
+
+def test_pic_servo_that_tripped_out_of_sight_does_not_say_why():
+    tripped = Status(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+
+    assert found(V4, tripped, pic_ae=True, seen=False) == (Fault(FaultCode.LATCHED_FAULT, latched=True),)
 
 
 def test_pic_servo_limit_switches_are_no_faults():

@@ -1,5 +1,7 @@
 """The parts of an LDCN/NMC servo axis that need no line: registers, homing control, motions, pins, drive state."""
 
+from dataclasses import replace
+
 import pytest
 
 from ldcnd.drivers.driver import AnalogMotion, HomeCapture, Motion, PwmOutput, StopMode
@@ -178,7 +180,7 @@ def test_a_closed_loop_proves_that_the_power_driver_is_on():
 
     reading = state.reading(status(flags=StatusFlag.POWER_ON | StatusFlag.LIMIT1))
 
-    assert state.amp_enabled
+    assert state.known.pic_ae
     assert (reading.faults, reading.reverse_limit, reading.forward_limit) == ((), True, False)
 
 
@@ -194,14 +196,16 @@ def test_limit_switches_are_out_of_sight_while_the_power_driver_is_off():
 
 def test_an_open_loop_on_purpose_is_no_position_error():
     state = DriveState("x", PIC_SERVO_V4)
-    state.amp_enabled = True
+    state.switched(pic_ae=True, closed=True)
     tripped = status(flags=StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag.INDEX)
     searching = status(
         flags=StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR | StatusFlag.HOME_IN_PROGRESS, aux=AuxFlag.INDEX
     )
     assert [fault.code for fault in state.faults(tripped)] == ["position_error"]
 
-    state.loop_may_open = True
+    state.switched(pic_ae=True, closed=True)
+    state.known = replace(state.known, latched=None)
+    state.loaded(absolute=False, opens_loop=True)
 
     assert state.faults(tripped) == ()
     assert [fault.code for fault in state.faults(searching)] == ["position_error"]

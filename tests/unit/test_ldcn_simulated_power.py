@@ -3,7 +3,7 @@
 import pytest
 
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.faults import FaultCode, diagnose
+from ldcnd.drivers.ldcn.faults import AFTER_RESET, FaultCode, Knowledge, diagnose
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP
 from ldcnd.drivers.ldcn.registers import Gains, encode_gains
@@ -44,7 +44,8 @@ def columns(status):
 
 
 def codes(status, *, pic_ae):
-    return [fault.code for fault in diagnose(LS_182AP, status, pic_ae=pic_ae, absolute_mode=False)]
+    known = Knowledge(pic_ae=True, absolute=False) if pic_ae else AFTER_RESET
+    return [fault.code for fault in diagnose(LS_182AP, status, known)]
 
 
 def test_healthy_rows():

@@ -1,13 +1,16 @@
-"""What an LDCN/NMC status packet says, given what the host knows of the drive, and what to do about it.
+"""What an LDCN/NMC status packet says, decided from what the host knows of the drive, and what to do about it.
 
 On Logosol drives status bits 3, 5, 6 and aux bit 0 form a code whose meaning depends on the power driver enable bit
-Pic_ae: while it is 0 they show what is wrong at present, while it is 1 what switched the power driver off. PIC-SERVO
-has a power bit, a sticky position error and a sticky current limit. So the host remembers what it has told the drive.
+Pic_ae: while it is 0 they show what is wrong at present, while it is 1 what switched the power driver off. Bit 3 stays
+0 after that until Pic_ae is 0 and Clear Sticky Bits has found nothing wrong any more (footnote of the table): with
+Pic_ae = 0 it means overvoltage only if nothing can be latched. PIC-SERVO has a power bit, a sticky position error and a
+sticky current limit. Neither tells the host what Pic_ae is, so the host remembers what it has told the drive and which
+cause it has seen, and where it does not know it says so: `FaultCode.LATCHED_FAULT`.
 Sources: LS-182AP manual, "Diagnostic bits" and "Status byte and auxiliary status byte definitions"; PIC-SERVO manual,
 4.5 and 5.3. The position error flag is also set whenever the servo is off: alone it is no fault.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from types import MappingProxyType
 
@@ -37,6 +40,7 @@ class FaultCode(StrEnum):
     POSITION_ERROR = "position_error"
     SENSOR_FAULT = "sensor_fault"
     POWER_LOST = "power_lost"
+    LATCHED_FAULT = "latched_fault"
     CURRENT_LIMIT = "current_limit"
     POSITION_WRAP = "position_wrap"
     SERVO_OVERRUN = "servo_overrun"
@@ -49,9 +53,6 @@ class FaultCode(StrEnum):
 
 WARNINGS = frozenset({FaultCode.CURRENT_LIMIT, FaultCode.POSITION_WRAP, FaultCode.SERVO_OVERRUN})
 """What does not switch the motor off: current limiting only lowers the PWM value (PIC-SERVO manual, 4.3)."""
-
-LOSE_POSITION = frozenset({FaultCode.ENCODER_OR_HALL, FaultCode.POSITION_WRAP})
-"""What takes the meaning from the position: counts were missed, or the counter started again at its other end."""
 
 _REMEDIES = MappingProxyType(
     {
@@ -72,6 +73,10 @@ _REMEDIES = MappingProxyType(
         ),
         FaultCode.SENSOR_FAULT: "the analog position sensor is disconnected or at its end: check its cable, then reset",
         FaultCode.POWER_LOST: "the motor supply is off: switch it on, then reset",
+        FaultCode.LATCHED_FAULT: (
+            "the drive has tripped, and its status does not show why: check stop circuit, supply, motor, encoder and"
+            " temperature, then reset"
+        ),
         FaultCode.CURRENT_LIMIT: "the motor current was limited: if it lasts check for a jam; reset clears the flag",
         FaultCode.POSITION_WRAP: (
             "the 32-bit position counter wrapped around: reset, find the reference position again"
@@ -87,21 +92,57 @@ class Fault:
 
     Attributes:
         code: which.
-        latched: the drive remembers it, the cause may be gone; it takes Clear Sticky Bits (on Logosol drives with
-            Pic_ae = 0) to find out. Otherwise the cause is there at present.
+        latched: it switched the motor off, and the drive or the host remembers it: the cause may be gone; it takes
+            Clear Sticky Bits (on Logosol drives with Pic_ae = 0) to find out. Otherwise the cause is there at present.
+        loses_position: counts may have been missed.
     """
 
     code: FaultCode
     latched: bool
+    loses_position: bool = False
 
     @property
     def remedy(self) -> str:
         """What it means and what to do, for an operator."""
         return self.code.remedy
 
+    @property
+    def stops(self) -> bool:
+        """Whether the motor is off because of it, or cannot be switched on by the drive's own rules.
 
-def diagnose(profile: Profile, status: Status, *, pic_ae: bool, absolute_mode: bool) -> tuple[Fault, ...]:
-    """List what is wrong, worst first; empty when nothing is.
+        Motor power that is missing while the loop is open stops nothing, and its return moves nothing.
+        """
+        return self.code not in WARNINGS and (self.latched or self.code is not FaultCode.POWER_LOST)
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """What the host knows of a drive that its status does not say.
+
+    Attributes:
+        pic_ae: bit 0 of the last Stop Motor that the drive executed; None while that is not known.
+        nothing_latched: the power driver holds no cause: after a reset, after Clear Sticky Bits with Pic_ae = 0, and
+            once bit 3 was seen set with Pic_ae = 0.
+        latched: the cause that switched the motor off and was not cleared since; None without one.
+        closed: the loop was closed, and this host has not opened it since.
+        seen: the drive was watched since then; false after a time without readings.
+        absolute: a motion to an analog target was the last one started; None while that is not known.
+    """
+
+    pic_ae: bool | None = None
+    nothing_latched: bool = False
+    latched: Fault | None = None
+    closed: bool = False
+    seen: bool = True
+    absolute: bool | None = None
+
+
+AFTER_RESET = Knowledge(pic_ae=False, nothing_latched=True, absolute=False)
+"""Manuals, "Power-up and Reset Conditions"."""
+
+
+def diagnose(profile: Profile, status: Status, known: Knowledge) -> tuple[Fault, ...]:
+    """List what is wrong, worst first; empty when nothing is, or nothing is known to be.
 
     A servo that was switched off on purpose with the amplifier left on looks like one that a position error switched
     off: the drive makes no difference, so it is reported.
@@ -109,63 +150,92 @@ def diagnose(profile: Profile, status: Status, *, pic_ae: bool, absolute_mode: b
     Args:
         profile: the dialect.
         status: needs the auxiliary byte, and the A/D value for sensor faults. Without it the servo counts as off, and a
-            stop input cannot be told from a lost encoder: both are reported.
-        pic_ae: bit 0 of the last Stop Motor that the drive executed; false after reset.
-        absolute_mode: a motion to an analog target was the last one started.
+            stop input cannot be told from a lost encoder.
+        known: what the host remembers.
     """
     if not profile.pic_ae_diagnostics:
-        faults = _pic_servo_faults(profile, status, amp_enabled=pic_ae)
-    elif pic_ae:
-        faults = _latched_faults(profile, status, absolute_mode=absolute_mode)
+        faults = _pic_servo_faults(profile, status, known)
+    elif known.pic_ae or _servo_on(status):
+        faults = _power_driver_on(profile, status, known)
+    elif known.pic_ae is None:
+        faults = _power_driver_not_known(status, known)
     else:
-        faults = _present_faults(status)
+        faults = _power_driver_off(status, known)
     return tuple(faults + _warnings(status))
 
 
-def _present_faults(status: Status) -> list[Fault]:
+def _power_driver_off(status: Status, known: Knowledge) -> list[Fault]:
     """Read the rows of the table with Pic_ae = 0; a limit bit at 0 is no limit switch then."""
-    if not status.flags & StatusFlag.POWER_ON:
-        return [Fault(FaultCode.OVERVOLTAGE, latched=False)]
-    faults = []
-    if not status.flags & StatusFlag.LIMIT1:
-        faults.append(Fault(FaultCode.STOP_INPUT, latched=False))
-    if not status.flags & StatusFlag.LIMIT2:
-        faults.append(Fault(FaultCode.OVERHEAT, latched=False))
-    return faults
+    flags, cause = status.flags, known.latched
+    both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
+    if flags & StatusFlag.POWER_ON:
+        faults = [cause] if cause and cause.code in _DRIVER_STAYS else []  # the others would hold bit 3 at 0
+        if not flags & StatusFlag.LIMIT1:
+            faults.append(Fault(FaultCode.STOP_INPUT, latched=False))
+        if not flags & StatusFlag.LIMIT2:
+            faults.append(Fault(FaultCode.OVERHEAT, latched=False))
+        return faults
+    if known.nothing_latched:
+        # the chapter on the stop input says that it, too, clears bit 3
+        code = FaultCode.OVERVOLTAGE if flags & both == both else FaultCode.LATCHED_FAULT
+        present = Fault(code, latched=False)
+        return [cause, present] if cause else [present]
+    return [cause or _UNREADABLE]
 
 
-def _latched_faults(profile: Profile, status: Status, *, absolute_mode: bool) -> list[Fault]:
+def _power_driver_not_known(status: Status, known: Knowledge) -> list[Fault]:
+    """Read a status that means one thing with Pic_ae = 0 and another with 1, with the loop open."""
+    flags = status.flags
+    if known.latched:
+        return [known.latched]
+    if not flags & StatusFlag.POWER_ON:
+        return [_UNREADABLE]
+    both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
+    if flags & both != both and flags & StatusFlag.POSITION_ERROR:
+        return [Fault(FaultCode.LATCHED_FAULT, latched=True)]  # position error, or stop input or overheat
+    return []
+
+
+def _power_driver_on(profile: Profile, status: Status, known: Knowledge) -> list[Fault]:
     """Read the rows of the table with Pic_ae = 1."""
     flags = status.flags
     if not flags & StatusFlag.POWER_ON:
-        return [Fault(code, latched=True) for code in _power_driver_codes(status)]
+        return [_power_driver_cause(status)]
     if not _tripped(status):
         return []
+    if known.latched and known.latched.code in _DRIVER_STAYS:
+        return [known.latched]  # the sensor may be back
     both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
-    if absolute_mode and flags & both == both and sensor_lost(profile, status.adc):
-        return [Fault(FaultCode.SENSOR_FAULT, latched=True)]
+    if known.absolute is not False and flags & both == both and sensor_lost(profile, status.adc):
+        code = FaultCode.SENSOR_FAULT if known.absolute else FaultCode.LATCHED_FAULT
+        return [Fault(code, latched=True)]
     return [Fault(FaultCode.POSITION_ERROR, latched=True)]
 
 
-def _power_driver_codes(status: Status) -> tuple[FaultCode, ...]:
+def _power_driver_cause(status: Status) -> Fault:
     match bool(status.flags & StatusFlag.LIMIT2), bool(status.flags & StatusFlag.LIMIT1):
         case True, True:
-            return (FaultCode.OVERHEAT,)
+            return Fault(FaultCode.OVERHEAT, latched=True)
         case False, True:
-            return (FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE,)
+            return Fault(FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE, latched=True)
         case False, False:
-            return (FaultCode.OVERCURRENT,)
+            return Fault(FaultCode.OVERCURRENT, latched=True)
         case _ if status.aux is None:
-            return (FaultCode.STOP_INPUT, FaultCode.ENCODER_OR_HALL)
-    return (FaultCode.STOP_INPUT,) if status.aux & AuxFlag.INDEX else (FaultCode.ENCODER_OR_HALL,)
+            return _UNREADABLE
+    if status.aux & AuxFlag.INDEX:
+        return Fault(FaultCode.STOP_INPUT, latched=True)
+    return Fault(FaultCode.ENCODER_OR_HALL, latched=True, loses_position=True)
 
 
-def _pic_servo_faults(profile: Profile, status: Status, *, amp_enabled: bool) -> list[Fault]:
-    faults = []
-    if not status.flags & StatusFlag.POWER_ON:
-        faults.append(Fault(FaultCode.POWER_LOST, latched=False))  # switches the servo off, which sets pos_error
-    elif amp_enabled and _tripped(status):
-        faults.append(Fault(FaultCode.POSITION_ERROR, latched=True))
+def _pic_servo_faults(profile: Profile, status: Status, known: Knowledge) -> list[Fault]:
+    cause = known.latched
+    if cause is None and known.closed and _tripped(status):
+        # a loss of motor power opens the loop and sets the same flag, so the drive must have been watched
+        code = FaultCode.POSITION_ERROR if status.flags & StatusFlag.POWER_ON else FaultCode.POWER_LOST
+        cause = Fault(code if known.seen else FaultCode.LATCHED_FAULT, latched=True)
+    faults = [cause] if cause else []
+    if not status.flags & StatusFlag.POWER_ON and not (cause and cause.code is FaultCode.POWER_LOST):
+        faults.append(Fault(FaultCode.POWER_LOST, latched=False))
     if profile.current_limit and status.flags & StatusFlag.OVERCURRENT:
         faults.append(Fault(FaultCode.CURRENT_LIMIT, latched=True))
     return faults
@@ -174,7 +244,7 @@ def _pic_servo_faults(profile: Profile, status: Status, *, amp_enabled: bool) ->
 def _warnings(status: Status) -> list[Fault]:
     aux = status.aux or AuxFlag(0)
     return [
-        Fault(code, latched=True)
+        Fault(code, latched=True, loses_position=code is FaultCode.POSITION_WRAP)
         for flag, code in (
             (AuxFlag.POSITION_WRAP, FaultCode.POSITION_WRAP),
             (AuxFlag.SERVO_OVERRUN, FaultCode.SERVO_OVERRUN),
@@ -183,10 +253,19 @@ def _warnings(status: Status) -> list[Fault]:
     ]
 
 
+def _servo_on(status: Status) -> bool:
+    return status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
+
+
 def _tripped(status: Status) -> bool:
-    """Whether a position error has switched the servo off; with the servo on the flag is an old one."""
-    servo_on = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
-    return bool(status.flags & StatusFlag.POSITION_ERROR) and not servo_on
+    """Whether the drive has switched the servo off; with the servo on the flag is an old one."""
+    return bool(status.flags & StatusFlag.POSITION_ERROR) and not _servo_on(status)
+
+
+_DRIVER_STAYS = frozenset({FaultCode.POSITION_ERROR, FaultCode.SENSOR_FAULT, FaultCode.LATCHED_FAULT})
+"""Causes that a Logosol drive shows with bit 3 set."""
+_UNREADABLE = Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
+"""Encoder or Hall signals may be among what it can be."""
 
 
 def sensor_lost(profile: Profile, adc: int | None) -> bool:
@@ -211,12 +290,11 @@ _SERVO_ON, _MOTION_LOCKED = map(int, (AuxFlag.SERVO_ON, AuxFlag.MOTION_LOCKED))
 
 
 class DriveState:
-    """The memory of one drive.
+    """The memory of one drive: what it was told, and what it has shown.
 
     Attributes:
-        amp_enabled: bit 0 of the last Stop Motor that the drive acknowledged (Pic_ae).
+        known: what decides on the meaning of its status.
         homing_armed: a capture was armed and has not been seen to come.
-        absolute: a motion to an analog target was the last one loaded.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
         motion_locked: the drive refuses motion since it homed on a limit switch.
@@ -227,16 +305,54 @@ class DriveState:
         self._name = name
         self._profile = profile
         self._diagnosed: tuple[object, tuple[driver.Fault, ...]] = ((), ())  # the latest question, and the answer to it
-        self.forget()
+        self.restarted()
 
-    def forget(self) -> None:
-        """Take the state of a drive that was just reset."""
-        self.amp_enabled = False
+    # -- what was commanded ------------------------------------------------------------------------------------------
+
+    def restarted(self) -> None:
+        """The drive was reset or lost power: nothing that was sent before holds any more."""
+        self.known = AFTER_RESET
         self.homing_armed = False
-        self.absolute = False
         self.loop_may_open = False
         self.motion_locked = False
         self.servo_divisor = 1
+
+    def taken_over(self, status: Status) -> None:
+        """The drive is adopted as it is, and this host has never known it; the status packet has the auxiliary byte."""
+        self.restarted()
+        self.known = Knowledge(closed=_servo_on(status))
+        self.homing_armed = bool(status.flags & StatusFlag.HOME_IN_PROGRESS)
+
+    def unseen(self) -> None:
+        """The drive was out of reach for a while; nothing was sent to it meanwhile, by this host at least."""
+        self.known = replace(self.known, seen=False)
+
+    def switched_unconfirmed(self) -> None:
+        """A Stop Motor was sent, or may have been, that was not acknowledged: it may have opened the loop."""
+        self.known = replace(self.known, pic_ae=None, nothing_latched=False, closed=False)
+
+    def switched(self, *, pic_ae: bool, closed: bool) -> None:
+        """The drive acknowledged a Stop Motor that closes the loop, or opens it."""
+        self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, closed=closed, seen=True, absolute=False)
+        self.loop_may_open = False
+
+    def clearing(self) -> None:
+        """Clear Sticky Bits is on its way: a cause that was known may be gone before that is acknowledged."""
+        if self.known.latched and self.known.pic_ae is not True:
+            loses = self.known.latched.loses_position
+            self.known = replace(self.known, latched=Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=loses))
+
+    def cleared(self) -> None:
+        """The drive acknowledged Clear Sticky Bits; it forgets what switched it off only with Pic_ae = 0."""
+        if self.known.pic_ae is False:
+            self.known = replace(self.known, latched=None, nothing_latched=True)
+
+    def loaded(self, *, absolute: bool, opens_loop: bool) -> None:
+        """A motion was loaded: to an analog target or not; one that opens the loop on purpose, at once or at home."""
+        self.known = replace(self.known, absolute=absolute)
+        self.loop_may_open = opens_loop
+
+    # -- what it shows -----------------------------------------------------------------------------------------------
 
     def reading(self, status: Status, asked: frozenset[TelemetryItem] = frozenset()) -> AxisReading:
         """Interpret a status packet that was asked for because of these items.
@@ -249,9 +365,8 @@ class DriveState:
         flags, aux = int(status.flags), int(status.aux)
         if not flags & _HOMING:
             self.homing_armed = False
-        if aux & _SERVO_ON:
-            self.amp_enabled = True  # no drive closes its loop without; known also after somebody else enabled it
         self.motion_locked = self._profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED)
+        faults = self.faults(status)
         shows_limits = self._shows_limits(flags)
         reverse, forward = (_LIMIT2, _LIMIT1) if self._profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
         tick_s = SERVO_CYCLE_S * (self.servo_divisor if self._profile.divisor_slows_profile else 1)
@@ -264,7 +379,7 @@ class DriveState:
             enabled=bool(aux & _SERVO_ON),
             profile_done=bool(flags & _MOVE_DONE),
             homing=bool(flags & _HOMING),
-            faults=self.faults(status),
+            faults=faults,
             reverse_limit=bool(flags & reverse) if shows_limits else None,
             forward_limit=bool(flags & forward) if shows_limits else None,
             asked=asked,
@@ -272,26 +387,40 @@ class DriveState:
 
     def faults(self, status: Status) -> tuple[driver.Fault, ...]:
         """Return what the drive complains about; worked out anew only when something that it depends on has changed."""
-        adc = status.adc if self.absolute else None
-        question = (status.flags, status.aux, adc, self.amp_enabled, self.absolute, self.loop_may_open)
+        adc = status.adc if self.known.absolute is not False else None
+        question = (status.flags, status.aux, adc, self.known, self.loop_may_open)
         if question != self._diagnosed[0]:
-            self._diagnosed = (question, self._diagnose(status))
+            answer = self._diagnose(status)
+            self._diagnosed = ((*question[:3], self.known, self.loop_may_open), answer)
         return self._diagnosed[1]
 
     def _diagnose(self, status: Status) -> tuple[driver.Fault, ...]:
+        self._learn(status)
         open_on_purpose = self.loop_may_open and not status.flags & StatusFlag.HOME_IN_PROGRESS
-        return tuple(
-            driver.Fault(
-                fault.code.value,
-                fault.remedy,
-                stops=fault.code not in WARNINGS,
-                loses_position=fault.code in LOSE_POSITION,
-            )
-            for fault in diagnose(self._profile, status, pic_ae=self.amp_enabled, absolute_mode=self.absolute)
+        found = tuple(
+            fault
+            for fault in diagnose(self._profile, status, self.known)
             if not (open_on_purpose and fault.code is FaultCode.POSITION_ERROR)
         )
+        cause = next((fault for fault in found if fault.latched and fault.stops), None)
+        if status.aux is not None:
+            self.known = replace(self.known, latched=cause, seen=True)
+        return tuple(
+            driver.Fault(fault.code.value, fault.remedy, stops=fault.stops, loses_position=fault.loses_position)
+            for fault in found
+        )
+
+    def _learn(self, status: Status) -> None:
+        """Take from a status what it proves."""
+        logosol = self._profile.pic_ae_diagnostics
+        if _servo_on(status):
+            # PIC-SERVO closes its loop whatever the amplifier (manual, 5.2), a Logosol drive does not
+            pic_ae = True if logosol else self.known.pic_ae
+            self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)
+        elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
+            self.known = replace(self.known, nothing_latched=True)
 
     def _shows_limits(self, flags: int) -> bool:
         if not self._profile.pic_ae_diagnostics:
             return True
-        return self.amp_enabled and bool(flags & _POWER_ON)
+        return bool(self.known.pic_ae) and bool(flags & _POWER_ON)

@@ -57,7 +57,12 @@ class Groups:
         control = STOP_CONTROLS[mode]
         burst = b"".join(commands.stop_motor(commands.Group(group.address), control).request for group in groups)
         stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True)
-        await self._bus.execute(stop, Lane.STOP)
+        try:
+            await self._bus.execute(stop, Lane.STOP)
+        finally:
+            for group in groups:
+                for name in group.members:
+                    self._drives[name].state.switched_unconfirmed()
 
     async def start(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
         """See `Network.start_group`.

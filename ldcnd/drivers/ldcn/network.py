@@ -155,7 +155,7 @@ class LdcnNetwork(Network):
         """Learn what the drives are doing; return remarks."""
         self._rate.working = adopted.baud
         for address, drive in self._drives.items():
-            drive.adopted(adopted.states[address])
+            drive.adopted(adopted.states[address], known=self._was_up)
         remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
         if adopted.baud != self._baud:
             remarks.append(f"the configuration asks for {self._baud} baud; the line stays at {adopted.baud}")

@@ -126,7 +126,6 @@ class LdcnAxis(AxisDriver):
         self.state = DriveState(spec.name, profile)
         self._bus = bus
         self._node = Node(spec.address, profile)
-        self._stops = {mode: commands.stop_motor(self._node, control) for mode, control in STOP_CONTROLS.items()}
         self._loaded: Trajectory | None = None
         self._book = RegisterBook(profile)
         self._gains = spec.gains
@@ -134,20 +133,27 @@ class LdcnAxis(AxisDriver):
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
 
     def forget(self) -> None:
-        """The drive was reset: nothing that was sent before holds any more."""
-        self.state.forget()
+        """The drive was reset or lost power: nothing that was sent before holds any more."""
+        self.state.restarted()
         self._book.reset()
         self._initialised = False
 
-    def adopted(self, status: Status) -> None:
-        """The drive was taken over as it is; its status packet has the auxiliary byte. Gains count as configured."""
-        self.state.forget()
-        self.state.amp_enabled = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
-        self.state.homing_armed = bool(status.flags & StatusFlag.HOME_IN_PROGRESS)
+    def adopted(self, status: Status, *, known: bool) -> None:
+        """The drive was taken over as it is, with this status; gains count as configured.
+
+        Args:
+            status: flags and auxiliary byte.
+            known: this host had the line before: what it has sent still holds, as a drive that restarted meanwhile
+                would not answer at its address.
+        """
+        if known:
+            self.state.unseen()
+        else:
+            self.state.taken_over(status)
         self._book.assume(gain_values(self._gains) if self._gains else {})
         if self._gains:
             self.state.servo_divisor = self._gains.sr
-        self._initialised = self.state.amp_enabled
+        self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
 
     def registers(self) -> tuple[Register, ...]:
         """See `AxisDriver`."""
@@ -157,13 +163,13 @@ class LdcnAxis(AxisDriver):
 
     def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
         """See `AxisDriver`. Whether the analog sensor was lost can only be told with its value."""
-        asked = (items, self.state.absolute)
-        prepared = self._readings.get(asked)
+        senses = self.profile.analog_target and self.state.known.absolute is not False
+        prepared = self._readings.get((items, senses))
         if prepared is None:
             mask = reading_items(self.profile, items)
-            if self.state.absolute:
+            if senses:
                 mask |= StatusItem.ADC
-            prepared = self._readings[asked] = self._prepare_reading(mask, items)
+            prepared = self._readings[items, senses] = self._prepare_reading(mask, items)
         return prepared
 
     def _prepare_reading(self, mask: StatusItem, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
@@ -194,29 +200,70 @@ class LdcnAxis(AxisDriver):
         """See `AxisDriver`. Closing the loop is verified; it takes effect at the present position.
 
         Raises:
-            DriveFault: the drive did not close its loop.
+            DriveFault: the drive did not close its loop, or holds a fault that only a reset clears.
         """
         if not on:
             await self.stop(StopMode.OFF)
             return
         if self._gains and not self._book.written("kp"):
             await self.set_gains(self._gains)
+        if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
+            await self._check_without_power_driver()
         if self.profile.pic_ae_diagnostics and not self._initialised:
             await self._initialise_registers()
         self._initialised = True
-        await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.ABRUPT))
-        self.state.amp_enabled = True
-        self.state.loop_may_open = self.state.absolute = False
+        await self._stop_motor(StopControl.AMP_ENABLE | StopControl.ABRUPT)
         # pos_error is set while the loop is open, and sticky
-        await self._bus.execute(commands.clear_sticky_bits(self._node))
+        await self._clear_sticky_bits()
         status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        faults = self.state.faults(status)
         if status.aux is None or not status.aux & AuxFlag.SERVO_ON:
-            causes = "; ".join(fault.text for fault in self.state.faults(status)) or "it does not say why"
+            causes = "; ".join(fault.text for fault in faults) or "it does not say why"
             raise DriveFault(
                 f"axis {self.spec.name}: the drive did not close its loop: {causes}",
                 axis=self.spec.name,
                 remedy="remove the cause, then send reset",
             )
+
+    async def _check_without_power_driver(self) -> None:
+        """Switch the power driver off first where it may be on, so that the drive says what is wrong at present."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        if status.aux is not None and status.aux & AuxFlag.SERVO_ON:
+            return
+        await self.stop(StopMode.OFF)
+        await self._refuse_faults("not switched on, the drive reports")
+
+    async def _refuse_faults(self, refusal: str, again: str = "") -> None:
+        """Read the drive.
+
+        Raises:
+            DriveFault: it has a fault that keeps the motor off.
+        """
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        standing = [fault for fault in self.state.faults(status) if fault.stops]
+        if standing:
+            raise DriveFault(
+                f"axis {self.spec.name}: {refusal} {'; '.join(fault.text for fault in standing)}",
+                axis=self.spec.name,
+                value=standing[0].code,
+                remedy=f"remove the cause, then send reset{again}",
+            )
+
+    async def _stop_motor(self, control: StopControl, lane: Lane = Lane.COMMAND) -> None:
+        """Send Stop Motor, and take note of what became of power driver and loop."""
+        acknowledged = False
+        try:
+            await self._bus.execute(commands.stop_motor(self._node, control), lane)
+            acknowledged = True
+        finally:
+            if not acknowledged:
+                self.state.switched_unconfirmed()
+        self.state.switched(pic_ae=bool(control & StopControl.AMP_ENABLE), closed=not control & StopControl.MOTOR_OFF)
+
+    async def _clear_sticky_bits(self) -> None:
+        self.state.clearing()
+        await self._bus.execute(commands.clear_sticky_bits(self._node))
+        self.state.cleared()
 
     async def _initialise_registers(self) -> None:
         """Do what the LS-182AP manual asks for once after a reset: amplifier off, no distance to go."""
@@ -238,9 +285,7 @@ class LdcnAxis(AxisDriver):
     async def stop(self, mode: StopMode) -> None:
         """See `AxisDriver`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
         self._book.doubt(("velocity",))
-        await self._bus.execute(self._stops[mode], Lane.STOP)
-        self.state.amp_enabled = mode is not StopMode.OFF
-        self.state.loop_may_open = self.state.absolute = False
+        await self._stop_motor(STOP_CONTROLS[mode], Lane.STOP)
         if self.state.homing_armed:
             await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
             self.state.homing_armed = False
@@ -252,20 +297,12 @@ class LdcnAxis(AxisDriver):
             DriveFault: the cause still stands.
         """
         await self.stop(StopMode.OFF)
-        await self._bus.execute(commands.clear_sticky_bits(self._node))
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
-        standing = [fault for fault in self.state.faults(status) if fault.stops]
-        if standing:
-            raise DriveFault(
-                f"axis {self.spec.name}: still {'; '.join(fault.text for fault in standing)}",
-                axis=self.spec.name,
-                value=standing[0].code,
-                remedy="remove the cause, then send reset again",
-            )
+        await self._clear_sticky_bits()
+        await self._refuse_faults("still", " again")
 
     async def clear_warnings(self) -> None:
         """See `AxisDriver`: Clear Sticky Bits, nothing else."""
-        await self._bus.execute(commands.clear_sticky_bits(self._node))
+        await self._clear_sticky_bits()
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
@@ -293,9 +330,9 @@ class LdcnAxis(AxisDriver):
             self.state.homing_armed = True  # before it is, so that a stop in between disarms it
             await self._bus.execute(commands.set_homing(self._node, homing_control(self.profile, home)))
         await self._load(trajectory)
-        self.state.absolute = isinstance(motion, AnalogMotion)
-        self.state.loop_may_open = isinstance(motion, PwmOutput) or (
-            home is not None and opens_loop(self.profile, home)
+        self.state.loaded(
+            absolute=isinstance(motion, AnalogMotion),
+            opens_loop=isinstance(motion, PwmOutput) or (home is not None and opens_loop(self.profile, home)),
         )
 
     async def _load(self, trajectory: Trajectory) -> None:
@@ -374,7 +411,7 @@ class LdcnAxis(AxisDriver):
         """
         control = StopControl.AMP_ENABLE | StopControl.HERE
         exchange = commands.stop_motor(self._node, control, position_counts)
-        self.state.absolute = False
+        self.state.loaded(absolute=False, opens_loop=False)
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
         await self._bus.execute(replace(exchange, repeatable=False))
 

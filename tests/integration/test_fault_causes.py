@@ -1,0 +1,159 @@
+"""A fault keeps its name as long as the drive holds it, and is never given one that the drive does not have."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.drivers.ldcn.faults import FaultCode
+from ldcnd.errors import NotReferenced, WrongState
+from ldcnd.model.axes import AxisState, LinkState
+from ldcnd.model.requests import (
+    MoveAbsoluteRequest,
+    PowerRequest,
+    ResetRequest,
+    SetPositionRequest,
+    StopRequest,
+    Verb,
+)
+from ldcnd.sim.ldcn.power import Condition
+from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
+
+FAR = MoveAbsoluteRequest(position=18.0, velocity=10.0)
+LATCHED = {
+    Condition.STOP_INPUT: FaultCode.STOP_INPUT,
+    Condition.MOTOR_SHORT: FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE,
+    Condition.OVERHEAT: FaultCode.OVERHEAT,
+    Condition.OVERCURRENT: FaultCode.OVERCURRENT,
+    Condition.ENCODER_LOSS: FaultCode.ENCODER_OR_HALL,
+}
+latched = pytest.mark.parametrize("condition", LATCHED, ids=lambda condition: condition.value)
+logosol = pytest.mark.parametrize("dialect", [LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
+
+
+async def trip(rig: DialectRig, condition: Condition) -> None:
+    """Let something switch the moving motor off; it is over again when the drive has noticed."""
+    await rig.power_on()
+    await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+    await asyncio.sleep(0.3)
+    rig.condition(condition)
+    await rig.until_fault(lambda faults: faults.active)
+    rig.condition(condition, present=False)
+
+
+async def codes_later(rig: DialectRig) -> list[str]:
+    """Return what the drive complains about after some more polls."""
+    await asyncio.sleep(0.5)
+    sample = await rig.until_fault(lambda _: True)
+    return [fault.code for fault in sample.active]
+
+
+@logosol
+@latched
+async def test_a_stop_of_a_tripped_drive_leaves_the_fault_its_name(dialect, condition):
+    async with dialect_rig(dialect) as rig:
+        await trip(rig, condition)
+
+        await rig.send(Verb.STOP, StopRequest())
+
+        assert await codes_later(rig) == [LATCHED[condition]]
+
+
+@latched
+async def test_power_off_of_a_tripped_drive_leaves_the_fault_its_name(condition):
+    async with dialect_rig(LS_182AP) as rig:
+        await trip(rig, condition)
+
+        await rig.send(Verb.POWER, PowerRequest(on=False))
+
+        assert await codes_later(rig) == [LATCHED[condition]]
+
+
+@pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_stop_after_a_position_error_leaves_the_fault_its_name(dialect):
+    async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
+        await trip(rig, Condition.STALLED)
+
+        await rig.send(Verb.STOP, StopRequest())
+
+        assert await codes_later(rig) == ["position_error"]
+        await rig.send(Verb.RESET, ResetRequest())
+        assert await codes_later(rig) == []
+
+
+async def test_a_position_that_was_lost_stays_lost_after_a_stop():
+    async with dialect_rig(LS_182AP) as rig:
+        await trip(rig, Condition.ENCODER_LOSS)
+        await rig.send(Verb.STOP, StopRequest())
+        await asyncio.sleep(0.5)
+
+        with pytest.raises(WrongState, match="its position is lost"):
+            await rig.send(Verb.SET_POSITION, SetPositionRequest(position=3.0))
+
+        await rig.send(Verb.RESET, ResetRequest())
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        with pytest.raises(NotReferenced):
+            await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await rig.send(Verb.SET_POSITION, SetPositionRequest(position=3.0))
+        assert (await rig.rig.client.state(AXIS)).referenced
+
+
+@latched
+async def test_a_second_without_the_cable_leaves_the_fault_its_name(condition):
+    async with dialect_rig(LS_182AP) as rig:
+        await trip(rig, condition)
+
+        rig.chain.unplug(asyncio.get_running_loop().time(), 1.0)
+        await rig.until(lambda state: state.link is LinkState.DOWN)
+        await rig.until(lambda state: state.link is LinkState.UP)
+
+        assert await codes_later(rig) == [LATCHED[condition]]
+
+
+@pytest.mark.parametrize("condition", [*LATCHED, Condition.STALLED], ids=lambda condition: condition.value)
+async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(condition):
+    async with dialect_rig(LS_182AP, gains=GAINS | {"el": 500}) as rig:
+        await trip(rig, condition)
+
+    async with adopting_rig(LS_182AP, rig) as later:
+        await later.until(lambda state: state.state is AxisState.ERROR_STOP)
+        assert await codes_later(later) == ["latched_fault"]
+
+        await later.send(Verb.STOP, StopRequest())
+        assert await codes_later(later) == ["latched_fault"]
+
+        await later.send(Verb.RESET, ResetRequest())
+        assert await codes_later(later) == []
+
+
+async def test_nothing_is_said_of_a_drive_that_is_taken_over_switched_off():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.until(lambda state: state.state is AxisState.DISABLED)
+
+    async with adopting_rig(LS_182AP, rig) as later:
+        await later.until(lambda state: state.state is AxisState.DISABLED)
+        assert await codes_later(later) == []
+        await later.power_on()
+        assert (await later.rig.client.state(AXIS)).enabled
+
+
+@pytest.mark.parametrize("dialect", [V4, SC], ids=lambda dialect: dialect.name)
+async def test_lost_motor_power_keeps_its_name_when_the_power_is_back(dialect):
+    async with dialect_rig(dialect) as rig:
+        await trip(rig, Condition.MOTOR_POWER_OFF)
+
+        assert await codes_later(rig) == ["power_lost"]
+
+
+@pytest.mark.parametrize("dialect", [V4, SC], ids=lambda dialect: dialect.name)
+async def test_motor_power_that_is_off_while_the_axis_is_disabled_stops_nothing(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.until(lambda state: state.state is AxisState.DISABLED)
+        rig.condition(Condition.MOTOR_POWER_OFF)
+        sample = await rig.until_fault(lambda faults: faults.active)
+
+        assert [(fault.code, fault.stops) for fault in sample.active] == [("power_lost", False)]
+        await rig.send(Verb.RESET, ResetRequest())
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.DISABLED
+        rig.condition(Condition.MOTOR_POWER_OFF, present=False)
+        await rig.send(Verb.POWER, PowerRequest(on=True))
+        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).last_error is None
