@@ -1,0 +1,186 @@
+"""The plug is pulled at random instants of whatever a rig does.
+
+No stop is lost, no wrong value passes for a good one, no reference is kept that is wrong, and the line is always back
+without a restart of the daemon.
+"""
+
+import asyncio
+import contextlib
+import random
+from dataclasses import dataclass, field
+
+import pytest
+
+from ldcnd.errors import LdcndError
+from ldcnd.model.axes import AxisState, LinkState, Quality
+from ldcnd.model.requests import (
+    HaltRequest,
+    HomeRequest,
+    MoveAbsoluteRequest,
+    MoveVelocityRequest,
+    PowerRequest,
+    ResetRequest,
+    SetPositionRequest,
+    Verb,
+)
+from ldcnd.model.samples import PositionSample, TelemetryItem
+from tests.support.chain_rig import drive
+from tests.support.plugged_rig import Plugged, X, Y, plugged, slow_config
+
+AXES = {"x": X, "y": Y}
+BACK_S = 20.0
+REST_S = 2.0
+COUNTS_PER_MM = 1000
+FASTEST_MM_S = 50.0
+SEEN_LATE_S = 0.3
+"""A position that is published as good is no older."""
+AGAIN_S = 0.3
+"""How long a run of unplugging takes at least: nothing may depend on a line that has come to rest."""
+
+
+@dataclass
+class Judge:
+    """Compares what is published with what the machine does.
+
+    Attributes:
+        zero: the place of each axis, in counts of its shaft, that is its position 0 while it has a reference.
+        wrong: what was published as good and was not true.
+        kept: how many references outlived an outage, and were right.
+    """
+
+    line: Plugged
+    zero: dict[str, float] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+    kept: int = 0
+
+    def shaft_mm(self, axis: str) -> float:
+        return (drive(self.line.chain, AXES[axis]).shaft.position_counts - self.zero.get(axis, 0.0)) / COUNTS_PER_MM
+
+    def set_zero(self, axis: str) -> None:
+        self.zero[axis] = 0.0
+        self.zero[axis] = self.shaft_mm(axis) * COUNTS_PER_MM
+
+    async def watch(self) -> None:
+        """Judge every position while the axis claims to have a reference, until cancelled."""
+        async with self.line.rig.client.samples("*", TelemetryItem.POSITION) as samples:
+            async for axis, sample in samples:
+                if (
+                    not isinstance(sample, PositionSample)
+                    or sample.quality is not Quality.GOOD
+                    or axis not in self.zero
+                ):
+                    continue
+                tracker = self.line.rig.daemon.rig.axis(axis).tracker
+                if tracker.referenced and abs(sample.value - self.shaft_mm(axis)) > FASTEST_MM_S * SEEN_LATE_S:
+                    self.wrong.append(f"{axis}: {sample.value:.3f} is {self.shaft_mm(axis):.3f} mm")
+
+
+async def ready(line: Plugged, judge: Judge, axis: str) -> None:
+    """Clear what the last round left, and give the axis a reference in the middle of its travel."""
+    client = line.rig.client
+    await client.command(axis, Verb.RESET, ResetRequest())
+    await client.command(axis, Verb.POWER, PowerRequest(on=True))
+    await client.command(axis, Verb.SET_POSITION, SetPositionRequest(position=0.0))
+    judge.set_zero(axis)
+
+
+async def act(line: Plugged, judge: Judge, axis: str, dice: random.Random) -> None:
+    """Begin something."""
+    client = line.rig.client
+    velocity = dice.choice([0.8, 1.5, 5.0, 40.0])
+    match dice.choice(["move", "velocity", "home", "halt", "rest"]):
+        case "move":
+            target = dice.choice([-60.0, 60.0])
+            await client.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=target, velocity=velocity))
+        case "velocity":
+            await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=min(velocity, 5.0)))
+        case "home":
+            judge.zero.pop(axis)  # the reference is another one from now on, or none
+            await client.command(axis, Verb.HOME, HomeRequest())
+        case "halt":
+            await client.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=60.0, velocity=velocity))
+            await asyncio.sleep(dice.uniform(0.0, 0.4))
+            await client.command(axis, Verb.HALT, HaltRequest())
+
+
+async def stop(line: Plugged, after_s: float) -> None:
+    await asyncio.sleep(after_s)
+    with contextlib.suppress(LdcndError):  # not carried out yet: the answer says so, the stop stays latched
+        await line.rig.client.stop()
+
+
+async def round_of(line: Plugged, judge: Judge, dice: random.Random) -> None:
+    """Let two axes do something, pull the plug meanwhile, stop before, during or after the outage or not at all."""
+    loop = asyncio.get_running_loop()
+    for axis in AXES:
+        await ready(line, judge, axis)
+    outage_s = dice.choice([0.0, 0.05, dice.uniform(0.1, 1.5)])
+    stops_after_s = dice.choice([None, dice.uniform(0.0, 0.6), dice.uniform(0.0, 2.5)])
+    restarts = outage_s > 0.1 and dice.random() < 0.15
+    began_s = loop.time()
+    async with asyncio.TaskGroup() as group:
+        for axis in AXES:
+            group.create_task(attempt(act(line, judge, axis, dice)), name=f"act {axis}")
+        if stops_after_s is not None:
+            group.create_task(stop(line, stops_after_s), name="stop")
+        await asyncio.sleep(dice.uniform(0.0, 0.6))
+        line.plug.pull()
+        if restarts:
+            line.chain.modules[X - 1].power(on=False, at_s=loop.time())
+        await asyncio.sleep(outage_s)
+        if restarts:
+            line.chain.modules[X - 1].power(on=True, at_s=loop.time())
+        line.plug.push(f"ttyUSB{dice.randrange(3)}")
+    async with asyncio.timeout(BACK_S):
+        await asyncio.sleep(max(0.0, began_s + AGAIN_S - loop.time()))
+        for axis in ("x", "y", "z", "c"):
+            await line.rig.until(axis, lambda state: state.link is LinkState.UP)
+    await asyncio.sleep(REST_S)
+
+    for axis, address in AXES.items():
+        state = await line.rig.client.state(axis)
+        what = f"{axis}: {state.state}, stop {stops_after_s}, outage {outage_s:.3f}, restarted {restarts}"
+        if stops_after_s is not None:
+            assert state.stop_latched or restarts, what
+        if stops_after_s is not None or state.state is AxisState.ERROR_STOP:
+            assert await line.stands(address), what
+        if restarts and axis == "x":
+            assert not state.referenced, what
+        elif axis in judge.zero and await line.stands(address):
+            position = await line.rig.client.last(axis, TelemetryItem.POSITION)
+            assert not state.referenced or position.value == pytest.approx(judge.shaft_mm(axis), abs=0.01), what
+            judge.kept += state.referenced
+    assert judge.wrong == []
+
+
+async def attempt(action) -> None:
+    with contextlib.suppress(LdcndError):
+        await action
+
+
+async def unplug(times: int, seed: int, policy: str) -> None:
+    print(f"seed {seed}, loss.bus = {policy}")
+    dice = random.Random(seed)
+    async with plugged(settings=slow_config(loss={"bus": policy})) as line, asyncio.TaskGroup() as group:
+        judge = Judge(line)
+        watching = group.create_task(judge.watch(), name="judge")
+        for number in range(times):
+            try:
+                await round_of(line, judge, dice)
+            except AssertionError as error:
+                raise AssertionError(f"seed {seed}, round {number}: {error}") from error
+        watching.cancel()
+        assert line.rig.line.bus.statistics.openings > times
+        print(f"{judge.kept} references kept")
+
+
+@pytest.mark.parametrize("policy", ["halt", "run_to_target"])
+async def test_a_rig_survives_a_plug_that_is_pulled_at_any_instant(policy):
+    await unplug(times=8, seed=20, policy=policy)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("policy", ["halt", "run_to_target"])
+async def test_a_rig_survives_a_plug_that_is_pulled_two_hundred_times(policy):
+    await unplug(times=200, seed=random.SystemRandom().randrange(1_000_000), policy=policy)
