@@ -190,18 +190,21 @@ class AddressRefused(DriveFault):
     """The drive answers with an address error: it has nothing there, or nothing that can be set."""
 
     code = ErrorCode.ADDRESS_ERROR
+    way_out = "use a number that the manual of the drive lists"
 
 
 class DataRefused(DriveFault):
     """The drive answers with a data error: it does not take this value there."""
 
     code = ErrorCode.DATA_ERROR
+    way_out = "use a value of the range that the manual of the drive gives"
 
 
 class ByteCountRefused(DriveFault):
     """The drive answers with an error in the number of bytes."""
 
     code = ErrorCode.BYTE_COUNT_ERROR
+    way_out = "report it, with the log: the drive does not know this form of request"
 
 
 class BusyTracing(DriveFault):
@@ -209,6 +212,7 @@ class BusyTracing(DriveFault):
 
     code = ErrorCode.BUSY_TRACING
     retryable = True
+    way_out = "wait for the end of the trace, or send `trace_abort`"
 
 
 class RequestRefused(LdcndError):
@@ -261,6 +265,7 @@ class EepromBudgetSpent(RequestRefused):
     """The parameter was written to EEPROM so often that further writes are refused."""
 
     code = ErrorCode.EEPROM_BUDGET
+    way_out = "write to RAM, or raise the budget in the configuration"
 
 
 class ValueOutOfRange(RequestRefused):
