@@ -9,9 +9,10 @@ from ldcnd import smartstep_config
 from ldcnd.config_names import DeviceIdentity, Name
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
 from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
-from ldcnd.model.axes import AxisLimits, PollPriority
+from ldcnd.model.commands import HomeMethod, HomeStop
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.requests import HomeMethod, HomeStop
+from ldcnd.model.meta import AxisLimits
+from ldcnd.model.plan import PollPriority
 from ldcnd.smartstep_config import SmartStepUnitConfig
 
 

@@ -10,7 +10,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from ldcnd.config import RigConfig
-from ldcnd.model.docstrings import attribute_docstrings
+from ldcnd.model.frozen import attribute_docstrings
 
 PREFACE = """# Configuration
 

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from ldcnd.drivers.smartstep.profiles import EepromWrite, Framing, Verification, Wiring
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import MonitorName
 from ldcnd.smartstep_trace_config import SmartStepTraceConfig
 
 MODEL = "smartstep"

@@ -8,25 +8,22 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import NotSupported
-from ldcnd.model.axes import AxisInfo
-from ldcnd.model.parameters import AlarmReport, CounterName, DriveProfile
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import (
+from ldcnd.model.commands import (
+    AxisCommand,
     BufferMode,
-    ClearCounterRequest,
-    HaltRequest,
+    CommandReply,
+    Halt,
+    Home,
     HomeMethod,
-    HomeRequest,
-    MoveAbsoluteRequest,
-    MoveRelativeRequest,
-    MoveVelocityRequest,
-    PowerRequest,
-    ReadAlarmsRequest,
-    ReadProfileRequest,
-    Request,
-    ResetRequest,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Reset,
     Verb,
 )
+from ldcnd.model.meta import AxisInfo
+from ldcnd.model.parameters import AlarmReport, ClearCounter, CounterName, DriveProfile, ReadAlarms, ReadProfile
 from ldcnd.model.samples import (
     AdcSample,
     FaultSample,
@@ -86,7 +83,7 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
 @with_target
 def power(target: Target, axis: str, switch: str) -> None:
     """Close (on) or open (off) the position loop of AXIS; nothing moves."""
-    _send(target, axis, Verb.POWER, PowerRequest(on=switch == "on"))
+    _send(target, axis, Verb.POWER, Power(on=switch == "on"))
 
 
 @command.command(context_settings={"ignore_unknown_options": True})
@@ -117,19 +114,19 @@ def move(
     wait: bool,
 ) -> None:
     """Move AXIS to the position VALUE."""
-    request: Request
+    request: AxisCommand[CommandReply]
     if relative and at_velocity:
         raise click.UsageError("--relative and --at-velocity exclude each other")
     if at_velocity:
         if velocity is not None:
             raise click.UsageError("with --at-velocity, VALUE is the velocity; leave --velocity out")
-        verb, request = Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=value, acceleration=acceleration)
+        verb, request = Verb.MOVE_VELOCITY, MoveVelocity(velocity=value, acceleration=acceleration)
     elif relative:
         verb = Verb.MOVE_RELATIVE
-        request = MoveRelativeRequest(distance=value, velocity=velocity, acceleration=acceleration)
+        request = MoveRelative(distance=value, velocity=velocity, acceleration=acceleration)
     else:
         verb = Verb.MOVE_ABSOLUTE
-        request = MoveAbsoluteRequest(position=value, velocity=velocity, acceleration=acceleration)
+        request = MoveAbsolute(position=value, velocity=velocity, acceleration=acceleration)
     _send(target, axis, verb, request.model_copy(update={"buffer_mode": BufferMode(buffer_mode)}), wait=wait)
 
 
@@ -144,7 +141,7 @@ def home(
     target: Target, axis: str, method: str | None, velocity: float | None, position: float | None, *, wait: bool
 ) -> None:
     """Search the reference position of AXIS, as configured unless said otherwise."""
-    request = HomeRequest(method=HomeMethod(method) if method else None, velocity=velocity, position=position)
+    request = Home(method=HomeMethod(method) if method else None, velocity=velocity, position=position)
     _send(target, axis, Verb.HOME, request, wait=wait)
 
 
@@ -166,7 +163,7 @@ def stop(target: Target, axis: str | None) -> None:
 @with_target
 def halt(target: Target, axis: str) -> None:
     """Bring AXIS to rest; another command may follow."""
-    _send(target, axis, Verb.HALT, HaltRequest())
+    _send(target, axis, Verb.HALT, Halt())
 
 
 @command.command()
@@ -174,7 +171,7 @@ def halt(target: Target, axis: str) -> None:
 @with_target
 def reset(target: Target, axis: str) -> None:
     """Clear the stop latch and the faults of AXIS; nothing moves."""
-    _send(target, axis, Verb.RESET, ResetRequest())
+    _send(target, axis, Verb.RESET, Reset())
 
 
 @command.command()
@@ -182,7 +179,7 @@ def reset(target: Target, axis: str) -> None:
 @with_target
 def profile(target: Target, axis: str) -> None:
     """Show how the drive of AXIS is taken to behave, assumptions with their verification."""
-    reply = target.run(lambda client: client.command(axis, Verb.READ_PROFILE, ReadProfileRequest()))
+    reply = target.run(lambda client: client.command(axis, Verb.READ_PROFILE, ReadProfile()))
     if not isinstance(reply, DriveProfile):
         raise NotSupported(f"axis {axis} has no profile", axis=axis)
     hearing = ", HEARS ITSELF: nothing is written" if reply.self_hearing else ""
@@ -209,7 +206,7 @@ def monitors(target: Target, axis: str) -> None:
 @with_target
 def alarms(target: Target, axis: str) -> None:
     """Show the present alarm of AXIS and the history that its drive keeps."""
-    reply = target.run(lambda client: client.command(axis, Verb.READ_ALARMS, ReadAlarmsRequest(), timeout_s=30.0))
+    reply = target.run(lambda client: client.command(axis, Verb.READ_ALARMS, ReadAlarms(), timeout_s=30.0))
     if not isinstance(reply, AlarmReport):
         raise NotSupported(f"axis {axis} keeps no alarms", axis=axis)
     past = "".join(f"\n  {entry.code:04X}H {entry.text}" for entry in reply.history)
@@ -222,10 +219,10 @@ def alarms(target: Target, axis: str) -> None:
 @with_target
 def clear_counter(target: Target, axis: str, counter: str) -> None:
     """Set a pulse counter of AXIS to 0; its motor must stand."""
-    _send(target, axis, Verb.CLEAR_COUNTER, ClearCounterRequest(counter=CounterName(counter)))
+    _send(target, axis, Verb.CLEAR_COUNTER, ClearCounter(counter=CounterName(counter)))
 
 
-def _send(target: Target, axis: str, verb: Verb, request: Request, *, wait: bool = False) -> None:
+def _send(target: Target, axis: str, verb: Verb, request: AxisCommand[CommandReply], *, wait: bool = False) -> None:
     async def work(client: RigClient) -> tuple[CommandReply, StateSample | None]:
         reply = await client.command(axis, verb, request)
         target.show(reply, f"{axis}: {verb} accepted{_values(reply)}")

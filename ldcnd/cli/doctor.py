@@ -14,7 +14,7 @@ from ldcnd.daemon.line.smartstep_line import build_line
 from ldcnd.drivers.smartstep.commissioning import examine
 from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.errors import BusDown, ConfigError
-from ldcnd.model.findings import Finding, Verdict
+from ldcnd.model.health import Finding, Verdict
 
 OPEN_TIME_S = 5.0
 

@@ -9,11 +9,9 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import WrongState
-from ldcnd.model.authority import AcquireRequest, LeaseReply
-from ldcnd.model.axes import AxisState
-from ldcnd.model.rehearsal import RehearsalReply, RehearsalRequest
-from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, Verb
-from ldcnd.model.samples import StateSample, TelemetryItem
+from ldcnd.model.commands import MoveVelocity, Power, Verb
+from ldcnd.model.rig_commands import Acquire, LeaseReply, RehearsalReply, Rehearse
+from ldcnd.model.samples import AxisState, StateSample, TelemetryItem
 
 RUN_UP_S = 0.5
 """The axis moves for so long before somebody disappears."""
@@ -44,11 +42,11 @@ def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> N
     """Take control, jog, and disappear: how long until the axis reacts, and until it stands?"""
 
     async def work(client: RigClient) -> dict[str, float]:
-        request = AcquireRequest(client="drill", axes=(axis,), lease_s=lease_s)
+        request = Acquire(client="drill", axes=(axis,), lease_s=lease_s)
         lease = await client.rig_command("acquire", request, LeaseReply)
         began_s = asyncio.get_running_loop().time()
-        await client.command(axis, Verb.POWER, PowerRequest(on=True, lease=lease.lease))
-        await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=velocity, lease=lease.lease))
+        await client.command(axis, Verb.POWER, Power(on=True, lease=lease.lease))
+        await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=velocity, lease=lease.lease))
         reacted_s, stands_s = await _watch(client, axis)
         return {
             "lease_s": lease_s,
@@ -76,13 +74,13 @@ def bus_loss(target: Target, axis: str, velocity: float) -> None:
 
 
 async def _rehearse(client: RigClient, axis: str, velocity: float, kind: str) -> dict[str, float]:
-    await client.command(axis, Verb.POWER, PowerRequest(on=True))
-    await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=velocity))
+    await client.command(axis, Verb.POWER, Power(on=True))
+    await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=velocity))
     await asyncio.sleep(RUN_UP_S)
     loop = asyncio.get_running_loop()
     began_s = loop.time()
     await client.rig_command(
-        "rehearse", RehearsalRequest.model_validate({"kind": kind, "axis": axis}), RehearsalReply, PATIENCE_S
+        "rehearse", Rehearse.model_validate({"kind": kind, "axis": axis}), RehearsalReply, PATIENCE_S
     )
     answered_s = loop.time()
     reacted_s, stands_s = await _watch(client, axis)

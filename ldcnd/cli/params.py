@@ -10,15 +10,17 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError, InternalError, LdcndError
-from ldcnd.model.parameters import Memory, ParameterDump, ParameterList, ParameterReply, ParameterValue
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import (
-    ListParametersRequest,
-    ReadAllParametersRequest,
-    ReadParameterRequest,
-    Request,
-    Verb,
-    WriteParameterRequest,
+from ldcnd.model.commands import AxisCommand, CommandReply, Verb
+from ldcnd.model.parameters import (
+    ListParameters,
+    Memory,
+    ParameterDump,
+    ParameterList,
+    ParameterReply,
+    ParameterValue,
+    ReadAllParameters,
+    ReadParameter,
+    WriteParameter,
 )
 
 ReplyT = TypeVar("ReplyT", bound=CommandReply)
@@ -49,7 +51,7 @@ def command() -> None:
 @with_target
 def list_parameters(target: Target, axis: str) -> None:
     """Show what is known of the parameters of AXIS; ranges are hints, the drive decides."""
-    request = ListParametersRequest()
+    request = ListParameters()
     reply = target.run(lambda client: _ask(client, axis, Verb.LIST_PARAMETERS, request, ParameterList))
     for each in reply.parameters:
         limits = "-" if each.lowest is None else f"{each.lowest} to {each.highest}"
@@ -65,7 +67,7 @@ def list_parameters(target: Target, axis: str) -> None:
 @with_target
 def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
     """Show PARAMETER (Pn100, or its name) of AXIS in both memories."""
-    request = ReadParameterRequest(parameter=parameter, unlisted=unlisted)
+    request = ReadParameter(parameter=parameter, unlisted=unlisted)
     reply = target.run(lambda client: _ask(client, axis, Verb.READ_PARAMETER, request, ParameterReply))
     target.show(reply, _line(reply.value))
 
@@ -82,7 +84,7 @@ def set_parameter(
     target: Target, axis: str, parameter: str, value: int, confirm_unit: int | None, *, eeprom: bool, unlisted: bool
 ) -> None:
     """Write VALUE to PARAMETER of AXIS, in RAM unless --eeprom is given."""
-    request = WriteParameterRequest(
+    request = WriteParameter(
         parameter=parameter,
         value=value,
         memory=Memory.EEPROM if eeprom else Memory.RAM,
@@ -140,9 +142,7 @@ def restore(target: Target, axis: str, file: Path, *, eeprom: bool) -> None:
         outcomes: list[ParameterReply | LdcndError] = []
         for name, value in values.items():
             try:
-                outcomes.append(
-                    await _write(client, axis, WriteParameterRequest(parameter=name, value=value, memory=memory))
-                )
+                outcomes.append(await _write(client, axis, WriteParameter(parameter=name, value=value, memory=memory)))
             except LdcndError as error:
                 outcomes.append(error)
         return outcomes
@@ -184,7 +184,9 @@ def load_values(file: Path) -> dict[str, int]:
     return values
 
 
-async def _ask(client: RigClient, axis: str, verb: Verb, request: Request, model: type[ReplyT]) -> ReplyT:
+async def _ask(
+    client: RigClient, axis: str, verb: Verb, request: AxisCommand[CommandReply], model: type[ReplyT]
+) -> ReplyT:
     """Send a command whose reply is of this model."""
     reply = await client.command(axis, verb, request, PATIENCE_S)
     if not isinstance(reply, model):
@@ -193,10 +195,10 @@ async def _ask(client: RigClient, axis: str, verb: Verb, request: Request, model
 
 
 async def _read_all(client: RigClient, axis: str) -> ParameterDump:
-    return await _ask(client, axis, Verb.READ_ALL_PARAMETERS, ReadAllParametersRequest(), ParameterDump)
+    return await _ask(client, axis, Verb.READ_ALL_PARAMETERS, ReadAllParameters(), ParameterDump)
 
 
-async def _write(client: RigClient, axis: str, request: WriteParameterRequest) -> ParameterReply:
+async def _write(client: RigClient, axis: str, request: WriteParameter) -> ParameterReply:
     return await _ask(client, axis, Verb.WRITE_PARAMETER, request, ParameterReply)
 
 

@@ -12,8 +12,17 @@ from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
-from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
-from ldcnd.model.traces import LONGEST_WAIT_S, MOST_SAMPLES, TraceChannel, TraceReply, TraceTrigger, TriggerKind
+from ldcnd.model.commands import Verb
+from ldcnd.model.traces import (
+    LONGEST_WAIT_S,
+    MOST_SAMPLES,
+    AbortTrace,
+    TakeTrace,
+    TraceChannel,
+    TraceReply,
+    TraceTrigger,
+    TriggerKind,
+)
 
 UPLOAD_S = 600.0
 """A drive's memory over a busy line takes minutes at worst."""
@@ -82,7 +91,7 @@ def take(
     out: Path | None,
 ) -> None:
     """Record channels of AXIS; what it has is in `ldcnd axis list --json`. Ctrl-C and SIGTERM end the trace."""
-    request = TraceRequest(
+    request = TakeTrace(
         channels=channels,
         interval_s=FASTEST if isinstance(interval, str) else interval,
         samples=samples,
@@ -116,7 +125,7 @@ def last(target: Target, axis: str, out: Path | None) -> None:
 @with_target
 def abort(target: Target, axis: str) -> None:
     """End the trace of AXIS that is under way, or one that was left armed in its drive."""
-    reply = target.run(lambda client: client.command(axis, Verb.TRACE_ABORT, TraceAbortRequest(), ENDING_S))
+    reply = target.run(lambda client: client.command(axis, Verb.TRACE_ABORT, AbortTrace(), ENDING_S))
     target.show(reply, f"{axis}: trace ended")
 
 

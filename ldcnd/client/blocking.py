@@ -18,10 +18,10 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.model.commands import CommandReply
 from ldcnd.model.events import CommandEvent
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import TraceRequest
 from ldcnd.model.samples import Sample
+from ldcnd.model.traces import TakeTrace
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
@@ -152,7 +152,7 @@ class Rig(Facade[RigClient]):
         with self._loop.inside(events.follow_events(self._wrapped, axis, history=history)) as following:
             yield self._loop.each(following)
 
-    def take_trace(self, axis: str, request: TraceRequest, within_s: float) -> Trace:
+    def take_trace(self, axis: str, request: TakeTrace, within_s: float) -> Trace:
         """See `ldcnd.client.traces.take_trace`."""
         return self._loop.run(take_trace(self._wrapped, axis, request, within_s))
 

@@ -7,10 +7,9 @@ from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.client.trouble import axis_troubles
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.messaging.session import Session
-from ldcnd.model.axes import AxisInfo
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
-from ldcnd.model.meta import DaemonInfo
+from ldcnd.model.meta import AxisInfo, DaemonInfo
 from ldcnd.model.samples import FaultSample, StateSample
 
 ASKED_AT_ONCE = 8

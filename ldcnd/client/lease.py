@@ -8,11 +8,10 @@ from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError
-from ldcnd.model.authority import AcquireRequest, LeaseReply, LeaseRequest
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import Request, Verb
+from ldcnd.model.commands import AxisCommand, CommandReply, Verb
+from ldcnd.model.rig_commands import Acquire, LeaseReply, LeaseRequest
 
-RequestT = TypeVar("RequestT", bound=Request)
+RequestT = TypeVar("RequestT", bound=AxisCommand[CommandReply])
 
 RENEWALS_PER_LEASE = 4
 """So many renewals may be lost before a lease ends."""
@@ -32,7 +31,9 @@ class Control:
         self._client = client
         self._sequence = count(1)
 
-    async def command(self, axis: str, verb: Verb, request: Request, timeout_s: float = 5.0) -> CommandReply:
+    async def command(
+        self, axis: str, verb: Verb, request: AxisCommand[CommandReply], timeout_s: float = 5.0
+    ) -> CommandReply:
         """Send one command under the lease; see `RigClient.command`.
 
         Raises:
@@ -90,7 +91,7 @@ async def control(
     Raises:
         LeaseHeld: somebody else controls one of the axes.
     """
-    request = AcquireRequest(client=name, axes=axes, lease_s=lease_s, force=force)
+    request = Acquire(client=name, axes=axes, lease_s=lease_s, force=force)
     held = Control(client, await client.rig_command("acquire", request, LeaseReply))
     try:
         async with asyncio.TaskGroup() as group:

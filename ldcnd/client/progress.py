@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import OutcomeUnknown
-from ldcnd.model.axes import LinkState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.samples import PositionSample, StateSample
+from ldcnd.model.commands import CommandReply
+from ldcnd.model.samples import LinkState, PositionSample, StateSample
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,25 +10,40 @@ from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionErro
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Answer, Declaration, Sample, SampleKind, Session
-from ldcnd.model.axes import AxisInfo, LinkState
+from ldcnd.model.commands import (
+    LONGEST_NAME,
+    AxisCommand,
+    CommandReply,
+    PlanReply,
+    Preview,
+    Stop,
+    StopReply,
+    Verb,
+    Why,
+    WhyReply,
+)
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.meta import BusInfo, CommandList, DaemonInfo
-from ldcnd.model.monitors import MonitorName, MonitorSample
+from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.preview import PlanReply, PlanRequest
-from ldcnd.model.replies import CommandReply, StopReply
-from ldcnd.model.requests import LONGEST_NAME, REPLY_MODELS, Request, StopRequest, Verb
-from ldcnd.model.samples import SAMPLE_MODELS, FaultSample, StateSample, TelemetryItem
+from ldcnd.model.requests import REPLY_MODELS
+from ldcnd.model.samples import (
+    SAMPLE_MODELS,
+    FaultSample,
+    LinkState,
+    MonitorName,
+    MonitorSample,
+    StateSample,
+    TelemetryItem,
+)
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
 from ldcnd.model.verbs import PLAN, WHY
-from ldcnd.model.why import WhyReply, WhyRequest
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 
-NO_QUESTION = WhyRequest()
+NO_QUESTION = Why()
 ITEMS = frozenset(item.value for item in TelemetryItem)
 KEPT_SAMPLES = 256
 """A watcher that is too slow keeps so many samples; the oldest give way."""
@@ -171,7 +186,9 @@ class RigClient:
         sample = await self.last(axis, TelemetryItem.STATE)
         return sample if isinstance(sample, StateSample) else None
 
-    async def command(self, axis: str, verb: Verb, request: Request, timeout_s: float = 5.0) -> CommandReply:
+    async def command(
+        self, axis: str, verb: Verb, request: AxisCommand[CommandReply], timeout_s: float = 5.0
+    ) -> CommandReply:
         """Send one command; returns once the drive has acknowledged it.
 
         Raises:
@@ -217,17 +234,17 @@ class RigClient:
         payload, encoding = encode(request, Encoding.MSGPACK)
         return self._one(await self._session.query(self._keys.command(axis, verb), payload, encoding=encoding), reply)
 
-    async def why(self, axis: str, request: WhyRequest = NO_QUESTION) -> WhyReply:
+    async def why(self, axis: str, request: Why = NO_QUESTION) -> WhyReply:
         """Ask why a motion of an axis would be refused now, and what would clear that."""
         return await self.axis_question(axis, WHY, request, WhyReply)
 
-    async def plan(self, axis: str, request: PlanRequest) -> PlanReply:
+    async def plan(self, axis: str, request: Preview) -> PlanReply:
         """Ask what a motion would do; no effect."""
         return await self.axis_question(axis, PLAN, request, PlanReply)
 
     async def stop(self, axis: str | None = None, timeout_s: float = 5.0, client: str | None = None) -> StopReply:
         """Stop one axis, or the whole rig; the events tell the first 64 characters of `client` as who it was."""
-        request = StopRequest(client=client[:LONGEST_NAME] if client else None)
+        request = Stop(client=client[:LONGEST_NAME] if client else None)
         payload, encoding = encode(request, Encoding.MSGPACK)
         answers = await self._session.query(
             self._keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True

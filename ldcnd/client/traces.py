@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import DriveFault, InternalError, LdcndError, OutcomeUnknown, WrongState
-from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
-from ldcnd.model.traces import TraceChunk, TraceHeader, TracePhase, TraceReply
+from ldcnd.model.commands import Verb
+from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 LOOK_S = 0.1
 ARMING_S = 30.0
@@ -34,7 +34,7 @@ class Trace:
     raw: tuple[tuple[int | float | None, ...], ...]
 
 
-async def take_trace(client: RigClient, axis: str, request: TraceRequest, within_s: float) -> Trace:
+async def take_trace(client: RigClient, axis: str, request: TakeTrace, within_s: float) -> Trace:
     """Arm a trace, wait for its end, and return it; when cancelled meanwhile, end it.
 
     Args:
@@ -53,7 +53,7 @@ async def take_trace(client: RigClient, axis: str, request: TraceRequest, within
         return await fetch_trace(client, axis, reply.trace_id)
 
 
-async def arm_trace(client: RigClient, axis: str, request: TraceRequest) -> TraceReply:
+async def arm_trace(client: RigClient, axis: str, request: TakeTrace) -> TraceReply:
     """Arm a trace and return what it will be."""
     reply = await client.command(axis, Verb.TRACE, request, ARMING_S)
     if not isinstance(reply, TraceReply):
@@ -62,7 +62,7 @@ async def arm_trace(client: RigClient, axis: str, request: TraceRequest) -> Trac
 
 
 @asynccontextmanager
-async def armed_trace(client: RigClient, axis: str, request: TraceRequest) -> AsyncIterator[TraceReply]:
+async def armed_trace(client: RigClient, axis: str, request: TakeTrace) -> AsyncIterator[TraceReply]:
     """Arm a trace that is ended when the context is cancelled; yields what it will be.
 
     Raises:
@@ -81,7 +81,7 @@ async def _end(client: RigClient, axis: str, trace_id: str) -> None:
     """End a trace, unless it has ended or given way to another one."""
     header = await client.trace_header(axis)
     if header and header.trace_id == trace_id and header.phase in UNDER_WAY:
-        await client.command(axis, Verb.TRACE_ABORT, TraceAbortRequest(), ENDING_S)
+        await client.command(axis, Verb.TRACE_ABORT, AbortTrace(), ENDING_S)
 
 
 async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: float) -> TraceHeader:

@@ -6,9 +6,8 @@ The console says it in the same words (`console/static/parts/problems.js`).
 from dataclasses import dataclass
 from enum import IntEnum
 
-from ldcnd.model.axes import AxisState, LinkState
 from ldcnd.model.health import AxisHealth
-from ldcnd.model.samples import FaultEntry, FaultSample, StateSample, TelemetryItem
+from ldcnd.model.samples import AxisState, FaultEntry, FaultSample, LinkState, StateSample, TelemetryItem
 
 ENOUGH = 0.9
 """A rate counts as kept from this share of the one that is asked for on."""

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
+from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
 from ldcnd.model.verbs import WIRE_LOG
-from ldcnd.model.wire_log import WireLogReply, WireLogRequest
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +38,13 @@ async def fetch_wire_log(client: RigClient, bus: str, seconds: float) -> Fetched
     Raises:
         LdcndError: as the daemon refused it, of the same class.
     """
-    page = await client.rig_command(WIRE_LOG, WireLogRequest(bus=bus, seconds=seconds), WireLogReply)
+    page = await client.rig_command(WIRE_LOG, ReadWireLog(bus=bus, seconds=seconds), WireLogReply)
     first, end = page, page.end_record
     lines = list(page.lines)
     lost = 0
     while page.next_record < end:
         wanted = page.next_record
-        request = WireLogRequest(bus=bus, seconds=seconds, from_record=wanted)
+        request = ReadWireLog(bus=bus, seconds=seconds, from_record=wanted)
         page = await client.rig_command(WIRE_LOG, request, WireLogReply)
         lost += min(page.first_record, end) - wanted
         lines += page.lines[: max(0, end - page.first_record)]

@@ -19,13 +19,11 @@ from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
 from ldcnd.errors import LdcndError, UnknownVerb
 from ldcnd.messaging.codec import Encoding, decode, error_reply
-from ldcnd.model.errors import ErrorReply
+from ldcnd.model.commands import ErrorReply, StopReply, Verb, Why
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.group_moves import AxisMove, MoveTogetherRequest
-from ldcnd.model.replies import StopReply
-from ldcnd.model.requests import REQUEST_MODELS, Verb
+from ldcnd.model.requests import REQUEST_MODELS
+from ldcnd.model.rig_commands import AxisMove, MoveTogether
 from ldcnd.model.verbs import ACQUIRE, AXIS_QUESTIONS, RELEASE, RENEW, RIG_VERBS
-from ldcnd.model.why import WhyRequest
 
 ANSWER_TIME_S = 5.0
 SLOW_VERBS_S: Mapping[str, float] = MappingProxyType(
@@ -73,7 +71,7 @@ class Envelope:
         if not isinstance(request, dict):
             return body
         moves = request.get("moves")
-        if model is MoveTogetherRequest and isinstance(moves, list):
+        if model is MoveTogether and isinstance(moves, list):
             request["moves"] = [self._on(move, AxisMove) if isinstance(move, dict) else move for move in moves]
         return json.dumps(self._on(request, model)).encode()
 
@@ -92,7 +90,7 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         page = page_of(request, pages) if PAGE_HEADER in request.headers else None
         if verb in AXIS_QUESTIONS:
             asked = decode(AXIS_QUESTIONS[verb].request, body, Encoding.JSON)
-            if isinstance(asked, WhyRequest) and page:
+            if isinstance(asked, Why) and page:
                 asked = asked.model_copy(update={"lease": page.lease(rig, axis)})
             return json_reply(await client.axis_question(axis, verb, asked, AXIS_QUESTIONS[verb].reply))
         if verb not in set(Verb):
@@ -115,7 +113,7 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         page = page_of(request, pages) if PAGE_HEADER in request.headers else None
         envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
         asked = decode(models.request, envelope.around(await body_of(request), models.request), Encoding.JSON)
-        if isinstance(asked, MoveTogetherRequest):
+        if isinstance(asked, MoveTogether):
             if page is None:
                 raise control_needed(asked.moves[0].axis)
             return json_reply(await page.move_together(rig, asked))

@@ -17,12 +17,10 @@ from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor
 from ldcnd.errors import LdcndError, LeaseExpired, LeaseRequired, NotSupported, TooManyRequests, UnknownAxis
 from ldcnd.log import get_logger
-from ldcnd.model.authority import AcquireRequest, LeaseReply
-from ldcnd.model.axes import Moving
+from ldcnd.model.commands import AxisCommand, CommandReply, Halt, Verb
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.group_moves import MoveTogetherReply, MoveTogetherRequest
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import HaltRequest, Request, Verb
+from ldcnd.model.rig_commands import Acquire, LeaseReply, MoveTogether, MoveTogetherReply
+from ldcnd.model.samples import Moving
 from ldcnd.model.verbs import ACQUIRE, MOVE_TOGETHER
 
 log = get_logger("console")
@@ -128,7 +126,7 @@ class PageControl:
         client = self._rigs.client(rig)
         if axis not in self._rigs.axes(rig):
             raise UnknownAxis(f"rig {rig} has no axis {axis[:64]!r}", axis=axis[:64], value=axis[:64])
-        request = AcquireRequest(client=self.client, axes=(axis,), lease_s=LEASE_S, force=force)
+        request = Acquire(client=self.client, axes=(axis,), lease_s=LEASE_S, force=force)
         control = Control(client, await client.rig_command(ACQUIRE, request, LeaseReply))
         if self._gone:
             await control.release()
@@ -143,7 +141,9 @@ class PageControl:
         if hold := self._held.pop((rig, axis), None):
             await _give_up(hold, self.client)
 
-    async def command(self, rig: str, axis: str, verb: Verb, request: Request, timeout_s: float) -> CommandReply:
+    async def command(
+        self, rig: str, axis: str, verb: Verb, request: AxisCommand[CommandReply], timeout_s: float
+    ) -> CommandReply:
         """Send one command, under the page's lease where it has one.
 
         Raises:
@@ -157,7 +157,7 @@ class PageControl:
         with hold.in_flight(moves=verb in MOTIONS):
             return await hold.control.command(axis, verb, request, timeout_s)
 
-    async def move_together(self, rig: str, request: MoveTogetherRequest) -> MoveTogetherReply:
+    async def move_together(self, rig: str, request: MoveTogether) -> MoveTogetherReply:
         """Start the moves of a group under the page's leases.
 
         Raises:
@@ -284,7 +284,7 @@ async def _bring_to_rest(hold: _Hold, client: str) -> None:
         if not hold.moved and await _stands(hold):
             return
         try:
-            await hold.client.command(hold.axis, Verb.HALT, HaltRequest(client=client), HALT_TIME_S)
+            await hold.client.command(hold.axis, Verb.HALT, Halt(client=client), HALT_TIME_S)
         except NotSupported:
             return  # no command of ours moves it
         stands = False

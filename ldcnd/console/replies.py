@@ -1,11 +1,9 @@
 """What the console answers that is no public model of the daemon."""
 
-from ldcnd.model.axes import AxisInfo
-from ldcnd.model.errors import ErrorReply
+from ldcnd.model.commands import ErrorReply, StopReply
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.meta import BusInfo, CommandList, DaemonInfo
+from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.replies import StopReply
 
 
 class RigReply(Frozen):

@@ -16,11 +16,9 @@ from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BusError, NotSupported
 from ldcnd.exchange import Exchange, Timing
-from ldcnd.model.axes import Provenance
-from ldcnd.model.monitors import MonitorName
-from ldcnd.model.requests import HomeMethod, PinMode
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.verb import Verb
+from ldcnd.model.commands import HomeMethod, PinMode, Verb
+from ldcnd.model.meta import Provenance
+from ldcnd.model.samples import MonitorName, TelemetryItem
 
 
 class StopMode(Enum):

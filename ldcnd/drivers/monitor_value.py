@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import MonitorName
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,14 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from ldcnd.model.parameters import AlarmEntry, AssumptionInfo, CounterName, ParameterInfo, ParameterValue
-from ldcnd.model.requests import WriteParameterRequest
+from ldcnd.model.parameters import (
+    AlarmEntry,
+    AssumptionInfo,
+    CounterName,
+    ParameterInfo,
+    ParameterValue,
+    WriteParameter,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +51,7 @@ class ParameterAccess(ABC):
         """Read all listed parameters that the drive has."""
 
     @abstractmethod
-    async def write(self, request: WriteParameterRequest) -> Written:
+    async def write(self, request: WriteParameter) -> Written:
         """Write one parameter unless it has the value already, and read both memories afterwards.
 
         Raises:

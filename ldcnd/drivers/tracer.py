@@ -5,8 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ldcnd.errors import DriveFault, ValueOutOfRange
-from ldcnd.model.requests import TraceRequest
-from ldcnd.model.traces import DriveTraceInfo, TraceChannel, TracePhase, TraceSource
+from ldcnd.model.traces import DriveTraceInfo, TakeTrace, TraceChannel, TracePhase, TraceSource
 
 Progress = Callable[[TracePhase], None]
 """Told of each new phase of a trace; does not wait."""
@@ -16,7 +15,7 @@ class TraceTimedOut(DriveFault):
     """The trigger did not come, or the samples did not, in the time allowed."""
 
 
-def require_channels(axis: str, request: TraceRequest, known: tuple[str, ...]) -> None:
+def require_channels(axis: str, request: TakeTrace, known: tuple[str, ...]) -> None:
     """Check the channels of a request and of its trigger.
 
     Raises:
@@ -115,7 +114,7 @@ class Tracer(ABC):
     channels: tuple[str, ...]
 
     @abstractmethod
-    async def arm(self, request: TraceRequest) -> ArmedTrace:
+    async def arm(self, request: TakeTrace) -> ArmedTrace:
         """Begin a trace, or make it wait for its trigger; moves nothing.
 
         Raises:

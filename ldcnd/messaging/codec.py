@@ -16,9 +16,8 @@ import pydantic
 import pydantic_core
 
 from ldcnd.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge
-from ldcnd.model.errors import ErrorReply, ReceivedError
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.schemas import schema_name
+from ldcnd.model.commands import ErrorReply, ReceivedError
+from ldcnd.model.frozen import Frozen, schema_name
 
 MAX_PAYLOAD_BYTES = 16 * 1024
 """No request is longer: the largest has a quarter of this."""

@@ -9,8 +9,8 @@ from itertools import accumulate
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ldcnd.model.axes import LinkState
 from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.model.samples import LinkState
 
 SHORTEST_LATENCY_S = 64e-6
 """Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""

@@ -7,10 +7,8 @@ from mcap.records import Channel, Message
 from pydantic import ValidationError
 
 from ldcnd.errors import UnknownAxis
-from ldcnd.model.axes import Quality
 from ldcnd.model.events import CommandEvent
-from ldcnd.model.monitors import MonitorSample
-from ldcnd.model.samples import AdcSample, FaultSample, PositionSample, Sample, VelocitySample
+from ldcnd.model.samples import AdcSample, FaultSample, MonitorSample, PositionSample, Quality, Sample, VelocitySample
 from ldcnd.recording.messages import LogMessage
 from ldcnd.recording.reading import Recording
 from ldcnd.recording.topics import axis_of, model_of

@@ -11,8 +11,7 @@ from types import MappingProxyType
 from pydantic import Field
 
 from ldcnd.model.events import CommandEvent, CommandStatus
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.schemas import schema_text
+from ldcnd.model.frozen import Frozen, schema_text
 from ldcnd.recording.topics import Published
 
 NS_PER_S = 10**9

@@ -5,8 +5,7 @@ from ldcnd.messaging.keys import ROOT
 from ldcnd.messaging.session import Sample
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.monitors import MonitorSample
-from ldcnd.model.samples import SAMPLE_MODELS
+from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
 

@@ -11,12 +11,19 @@ from ldcnd.client.trouble import Severity, Trouble, axis_troubles
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.authority import HolderList
-from ldcnd.model.axes import AxisInfo, Moving
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, LaneHealth
-from ldcnd.model.meta import DaemonInfo
-from ldcnd.model.samples import AdcSample, FaultSample, PositionSample, StateSample, TelemetryItem, VelocitySample
+from ldcnd.model.meta import AxisInfo, DaemonInfo
+from ldcnd.model.rig_commands import HolderList
+from ldcnd.model.samples import (
+    AdcSample,
+    FaultSample,
+    Moving,
+    PositionSample,
+    StateSample,
+    TelemetryItem,
+    VelocitySample,
+)
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 SILENT_S = 3.0

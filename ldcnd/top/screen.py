@@ -13,7 +13,7 @@ from textual.widgets import DataTable, Footer, Static
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trouble import Severity
 from ldcnd.errors import LdcndError
-from ldcnd.model.replies import StopReply
+from ldcnd.model.commands import StopReply
 from ldcnd.top.columns import AXIS_TITLES, BUS_TITLES, axis_cells, bus_cells, headline
 from ldcnd.top.follow import follow
 from ldcnd.top.rig_view import RigView

@@ -19,8 +19,7 @@ from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.axes import Quality
-from ldcnd.model.samples import PositionSample, TelemetryItem
+from ldcnd.model.samples import PositionSample, Quality, TelemetryItem
 from tests.bench.report import Row, table
 from tests.support.process import free_port
 from tests.support.router import PROGRAM as ROUTER

@@ -10,7 +10,7 @@ from ldcnd.config import RigConfig
 from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, Function
 from ldcnd.drivers.smartstep.trace_data import chunk_plan
-from ldcnd.model.requests import TraceRequest
+from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.smartstep.unit import CHARACTER_S
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.bench.report import Row
@@ -23,7 +23,7 @@ SHARE = 0.99
 """Of the limit, at least."""
 AS_A_RULE_BYTES = 200
 SELDOM = RatesConfig(position=0.001, velocity=0.001, state=0.001)
-TRACE = TraceRequest(channels=("speed_feedback", "torque_reference"))
+TRACE = TakeTrace(channels=("speed_feedback", "torque_reference"))
 MEMORIES, READINGS = 2, 2
 
 

@@ -4,8 +4,9 @@ import re
 
 import pytest
 
-from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply
-from ldcnd.model.requests import MoveVelocityRequest, PowerRequest, ReadParameterRequest, Verb
+from ldcnd.model.commands import MoveVelocity, Power, Verb
+from ldcnd.model.parameters import ReadParameter
+from ldcnd.model.rig_commands import Acquire, HolderList, LeaseReply, ListHolders
 from ldcnd.model.samples import TelemetryItem
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -15,13 +16,13 @@ pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), 
 
 
 async def holder(daemon, axis):
-    told = await daemon.rig.rig_command("holders", HoldersRequest(), HolderList)
+    told = await daemon.rig.rig_command("holders", ListHolders(), HolderList)
     return next(each.client for each in told.holders if each.axis == axis)
 
 
 async def running(daemon, axis, velocity):
-    await daemon.rig.command(axis, Verb.POWER, PowerRequest(on=True))
-    await daemon.rig.command(axis, Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=velocity))
+    await daemon.rig.command(axis, Verb.POWER, Power(on=True))
+    await daemon.rig.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=velocity))
 
 
 async def test_an_axis_is_taken_enabled_and_moved_and_its_number_arrives(house):
@@ -149,7 +150,7 @@ async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
         await desk.button("Take control").click()
         await expect(desk.panel("Control")).to_contain_text("Held by this page")
 
-        taken = AcquireRequest(client="another operator", axes=("c",), lease_s=60, force=True)
+        taken = Acquire(client="another operator", axes=("c",), lease_s=60, force=True)
         lease = await house.sim.rig.rig_command("acquire", taken, LeaseReply)
 
         await expect(desk.page.get_by_text("Control of c is lost")).to_be_visible()
@@ -200,6 +201,6 @@ async def test_parameters_are_read_compared_and_written(house, tmp_path):
         await desk.button("Write 1 value").click()
 
         await expect(desk.panel("Restore from the file")).to_contain_text("1 of 1 written.")
-        request = ReadParameterRequest(parameter="Pn100")
+        request = ReadParameter(parameter="Pn100")
         reading = await house.mixed.rig.command("feed", Verb.READ_PARAMETER, request, 60)
         assert (reading.value.active, reading.value.stored) == (90, 80)

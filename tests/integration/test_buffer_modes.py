@@ -5,28 +5,27 @@ import asyncio
 import pytest
 
 from ldcnd.errors import StopLatched, WrongState
-from ldcnd.model.axes import AxisState, LinkState
-from ldcnd.model.events import CommandOutcome, CommandStatus, OutcomeRequest
-from ldcnd.model.requests import BufferMode, MoveAbsoluteRequest, MoveVelocityRequest, PowerRequest, Verb
-from ldcnd.model.samples import PositionSample, TelemetryItem
+from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power, Verb
+from ldcnd.model.events import CommandOutcome, CommandStatus, ReadOutcome
+from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.rig import RunningRig, running_rig
 
 
 async def moving(rig: RunningRig, target: float = 40.0) -> str:
     """Have axis x move, and return the command's id."""
     await rig.until("x", lambda state: state.link is LinkState.UP)
-    await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-    reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=target))
+    await rig.client.command("x", Verb.POWER, Power(on=True))
+    reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=target))
     await asyncio.sleep(0.5)
     return reply.command_id
 
 
 async def outcome(rig: RunningRig, command_id: str) -> CommandOutcome:
-    return await rig.client.rig_command("outcome", OutcomeRequest(command_id=command_id), CommandOutcome)
+    return await rig.client.rig_command("outcome", ReadOutcome(command_id=command_id), CommandOutcome)
 
 
 async def move(rig: RunningRig, position: float, mode: BufferMode) -> str:
-    request = MoveAbsoluteRequest(position=position, buffer_mode=mode)
+    request = MoveAbsolute(position=position, buffer_mode=mode)
     return (await rig.client.command("x", Verb.MOVE_ABSOLUTE, request, timeout_s=30.0)).command_id
 
 
@@ -93,9 +92,9 @@ async def test_a_stop_also_ends_what_waits():
 async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.POWER, Power(on=True))
 
-        request = MoveVelocityRequest(velocity=5.0, buffer_mode=BufferMode.ABORTING)
+        request = MoveVelocity(velocity=5.0, buffer_mode=BufferMode.ABORTING)
         await rig.client.command("x", Verb.MOVE_VELOCITY, request)
 
         assert (await rig.client.state("x")).state is AxisState.CONTINUOUS_MOTION

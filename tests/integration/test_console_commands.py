@@ -7,9 +7,9 @@ import pytest
 from ldcnd.client.events import latest_events
 from ldcnd.client.traces import arm_trace, fetch_trace, wait_for_trace
 from ldcnd.console import reading
-from ldcnd.model.axes import AxisState
-from ldcnd.model.events import EventList, EventsRequest
-from ldcnd.model.requests import TraceRequest
+from ldcnd.model.events import EventList, ReadEvents
+from ldcnd.model.samples import AxisState
+from ldcnd.model.traces import TakeTrace
 from tests.support.console_rig import open_page, running_console
 
 X = "/api/rigs/sim/axes/x"
@@ -48,7 +48,7 @@ async def test_questions_about_an_axis_are_answered(console):
 async def test_commands_go_under_the_visitor_s_name_whatever_they_say(console):
     await console.browser.post(f"{X}/power", {"on": True, "client": "another"})
 
-    events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
+    events = (await console.rig.client.rig_command("events", ReadEvents(), EventList)).events
     assert {event.client for event in events} == {"console-1"}
 
 
@@ -59,7 +59,7 @@ async def test_moves_together_go_under_the_page_s_name_and_leases(console):
         await page.take("sim", "x", "y")
         answer = await page.post(f"{RIG}/move_together", {"moves": moves})
 
-        events = (await console.rig.client.rig_command("events", EventsRequest(), EventList)).events
+        events = (await console.rig.client.rig_command("events", ReadEvents(), EventList)).events
     assert answer.document["code"] == "wrong_state"  # as the daemon says: nothing is enabled
     assert {event.axis for event in events} == {"x", "y"}
     assert {event.client for event in events} == {page.client}
@@ -149,7 +149,7 @@ async def test_the_rigs_are_described(console):
 
 async def test_a_trace_is_served_as_document_and_as_table(console):
     none = await console.browser.get(f"{X}/trace")
-    reply = await arm_trace(console.rig.client, "x", TraceRequest(channels=("position",), samples=50))
+    reply = await arm_trace(console.rig.client, "x", TakeTrace(channels=("position",), samples=50))
     await wait_for_trace(console.rig.client, "x", reply.trace_id, 60)
 
     document = (await console.browser.get(f"{X}/trace")).document

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.model.authority import AcquireRequest, HolderList, HoldersRequest, LeaseReply
-from ldcnd.model.axes import AxisState, Moving
+from ldcnd.model.rig_commands import Acquire, HolderList, LeaseReply, ListHolders
+from ldcnd.model.samples import AxisState, Moving
 from tests.support.console_rig import open_page, running_console
 
 X = "/api/rigs/sim/axes/x"
@@ -19,7 +19,7 @@ async def console():
 
 
 async def holder(console, axis):
-    told = await console.rig.client.rig_command("holders", HoldersRequest(), HolderList)
+    told = await console.rig.client.rig_command("holders", ListHolders(), HolderList)
     return next(each.client for each in told.holders if each.axis == axis)
 
 
@@ -106,7 +106,7 @@ async def test_nothing_moves_through_the_console_without_a_page_that_has_control
 async def test_a_page_is_told_when_its_control_is_lost(console):
     async with open_page(console.app, console.browser) as page:
         await page.take("sim", "x")
-        force = AcquireRequest(client="another", axes=("x",), lease_s=60, force=True)
+        force = Acquire(client="another", axes=("x",), lease_s=60, force=True)
         await console.rig.client.rig_command("acquire", force, LeaseReply)
 
         told = await page.told()

@@ -17,8 +17,8 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Qos
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.model.commands import StopReply
 from ldcnd.model.meta import DaemonInfo
-from ldcnd.model.replies import StopReply
 from ldcnd.pki.certificates import issue_daemon, new_authority
 from tests.support.browser import console, entries, feed, hanging_page, path_of
 from tests.support.process import LDCND, ROOT, answering, free_port, process

@@ -7,7 +7,7 @@ import pytest
 from ldcnd.cli.doctor import examine_line
 from ldcnd.config import load_config
 from ldcnd.errors import BusDown
-from ldcnd.model.findings import Finding, Verdict
+from ldcnd.model.health import Finding, Verdict
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
 

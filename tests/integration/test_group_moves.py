@@ -7,9 +7,9 @@ import pytest
 from ldcnd.daemon.command.dispatch import move_together
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import MalformedRequest, NotSupported, PositionLimit, StopLatched, UnknownAxis
-from ldcnd.model.axes import AxisState, LinkState
-from ldcnd.model.group_moves import AxisMove, MoveTogetherReply, MoveTogetherRequest
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.rig_commands import AxisMove, MoveTogether, MoveTogetherReply
+from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 
@@ -24,13 +24,13 @@ def chain_of():
 async def powered(rig, *names):
     for name in names:
         await rig.until(name, lambda state: state.link is LinkState.UP)
-        await rig.client.command(name, Verb.POWER, PowerRequest(on=True))
+        await rig.client.command(name, Verb.POWER, Power(on=True))
 
 
 async def together(rig, **targets):
     """Ask for a group move."""
     axes = rig.daemon.rig.axes
-    moves = {name: MoveAbsoluteRequest(position=target) for name, target in targets.items()}
+    moves = {name: MoveAbsolute(position=target) for name, target in targets.items()}
     return await move_together(rig.daemon.rig, moves, lambda name, verb, share: axes[name].execute(verb, share))
 
 
@@ -109,7 +109,7 @@ async def test_a_query_of_the_rig_starts_a_group_once():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
         await powered(rig, "x", "y")
-        request = MoveTogetherRequest(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="y", position=6.0)))
+        request = MoveTogether(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="y", position=6.0)))
 
         reply = await rig.client.rig_command("move_together", request, MoveTogetherReply)
 
@@ -121,7 +121,7 @@ async def test_an_axis_named_twice_is_refused():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
         await powered(rig, "x", "y")
-        request = MoveTogetherRequest(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="x", position=6.0)))
+        request = MoveTogether(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="x", position=6.0)))
 
         with pytest.raises(MalformedRequest):
             await rig.client.rig_command("move_together", request, MoveTogetherReply)

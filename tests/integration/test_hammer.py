@@ -6,16 +6,8 @@ from collections import Counter
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError
-from ldcnd.model.axes import AxisState
-from ldcnd.model.requests import (
-    HaltRequest,
-    MoveAbsoluteRequest,
-    MoveRelativeRequest,
-    MoveVelocityRequest,
-    PowerRequest,
-    ResetRequest,
-    Verb,
-)
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, Verb
+from ldcnd.model.samples import AxisState
 from tests.support.rig import running_rig
 
 CLIENTS = 200
@@ -25,12 +17,12 @@ LONGEST_EXCHANGE_S = (5 + 12) * 10 / 115_200 + 0.000512 + 0.0015
 STOP_EXCHANGES = 2
 """The stop itself, and disarming a homing."""
 REQUESTS = (
-    (Verb.POWER, PowerRequest(on=True)),
-    (Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=20.0)),
-    (Verb.MOVE_RELATIVE, MoveRelativeRequest(distance=-1.0)),
-    (Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=-10.0)),
-    (Verb.HALT, HaltRequest()),
-    (Verb.RESET, ResetRequest()),
+    (Verb.POWER, Power(on=True)),
+    (Verb.MOVE_ABSOLUTE, MoveAbsolute(position=20.0)),
+    (Verb.MOVE_RELATIVE, MoveRelative(distance=-1.0)),
+    (Verb.MOVE_VELOCITY, MoveVelocity(velocity=-10.0)),
+    (Verb.HALT, Halt()),
+    (Verb.RESET, Reset()),
 )
 
 

@@ -13,8 +13,8 @@ from ldcnd.daemon.line.smartstep_line import LEDGER_FILE
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import PENDING_QUERIES, SampleKind
-from ldcnd.model.axes import LinkState
 from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.model.samples import LinkState
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig
 

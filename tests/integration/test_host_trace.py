@@ -9,15 +9,9 @@ import pytest
 from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, wait_for_trace
 from ldcnd.config import load_config
 from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
-from ldcnd.model.requests import (
-    MoveAbsoluteRequest,
-    PowerRequest,
-    TraceAbortRequest,
-    TraceRequest,
-    Verb,
-)
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.traces import TracePhase, TraceTrigger, TriggerKind
+from ldcnd.model.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig
@@ -25,7 +19,7 @@ from tests.support.rig import SIMULATED, running_rig
 
 async def ready(rig):
     await rig.until("x", lambda state: state.link == "up")
-    await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+    await rig.client.command("x", Verb.POWER, Power(on=True))
 
 
 def rising(level, channel="velocity"):
@@ -36,11 +30,11 @@ async def test_fastest_trace_follows_a_move_with_a_true_time_for_every_sample():
     async with running_rig() as rig:
         await ready(rig)
 
-        request = TraceRequest(
+        request = TakeTrace(
             channels=("position", "velocity", "following_error"), samples=400, pre_trigger=50, trigger=rising(2.0)
         )
         reply = await arm_trace(rig.client, "x", request)
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
         await wait_for_trace(rig.client, "x", reply.trace_id, 60)
         trace = await fetch_trace(rig.client, "x", reply.trace_id)
 
@@ -61,7 +55,7 @@ async def test_asked_interval_is_kept_on_a_grid():
         await ready(rig)
 
         trace = await take_trace(
-            rig.client, "x", TraceRequest(channels=("position",), interval_s=0.02, samples=50), within_s=60
+            rig.client, "x", TakeTrace(channels=("position",), interval_s=0.02, samples=50), within_s=60
         )
 
     assert trace.header.interval_s == 0.02
@@ -84,7 +78,7 @@ async def test_other_axes_keep_their_rates_while_one_is_traced_as_fast_as_possib
         longest_s = max(
             bus.longest_s(axis.driver.reading(frozenset(TelemetryItem))) for axis in rig.daemon.rig.buses[0].axes
         )
-        reply = await arm_trace(rig.client, "x", TraceRequest(channels=("position",), samples=10_000))
+        reply = await arm_trace(rig.client, "x", TakeTrace(channels=("position",), samples=10_000))
 
         gaps = {axis: await gaps_s(rig, axis) for axis in ("y", "z")}
         header = await rig.client.trace_header("x")
@@ -102,7 +96,7 @@ async def test_level_trigger_fires_on_a_signal_that_is_there_already():
 
         above = TraceTrigger(channel="enabled", kind=TriggerKind.ABOVE)
         trace = await take_trace(
-            rig.client, "x", TraceRequest(channels=("enabled",), samples=20, pre_trigger=5, trigger=above), within_s=60
+            rig.client, "x", TakeTrace(channels=("enabled",), samples=20, pre_trigger=5, trigger=above), within_s=60
         )
 
     assert trace.header.trigger_index == 5
@@ -112,7 +106,7 @@ async def test_trace_tells_when_a_trigger_counts():
     async with running_rig() as rig:
         await ready(rig)
         phases = []
-        request = TraceRequest(channels=("velocity",), samples=60, pre_trigger=50, trigger=rising(2.0), interval_s=0.02)
+        request = TakeTrace(channels=("velocity",), samples=60, pre_trigger=50, trigger=rising(2.0), interval_s=0.02)
         armed_at = asyncio.get_running_loop().time()
 
         await arm_trace(rig.client, "x", request)
@@ -129,7 +123,7 @@ async def test_trace_tells_when_a_trigger_counts():
 async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_the_line():
     async with running_rig() as rig:
         await ready(rig)
-        request = TraceRequest(channels=("velocity",), trigger=rising(40.0), timeout_s=2.0)
+        request = TakeTrace(channels=("velocity",), trigger=rising(40.0), timeout_s=2.0)
 
         with pytest.raises(DriveFault, match="the trigger did not come within 2 s"):
             await take_trace(rig.client, "x", request, within_s=60)
@@ -145,17 +139,17 @@ async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_t
 async def test_second_trace_is_refused_until_the_first_is_aborted():
     async with running_rig() as rig:
         await ready(rig)
-        request = TraceRequest(channels=("velocity",), trigger=rising(40.0))
+        request = TakeTrace(channels=("velocity",), trigger=rising(40.0))
         first = await arm_trace(rig.client, "x", request)
 
         with pytest.raises(BusyTracing, match=first.trace_id):
             await arm_trace(rig.client, "x", request)
-        aborted = await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+        aborted = await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
         header = await rig.client.trace_header("x")
         again = await arm_trace(rig.client, "x", request)
-        await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+        await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
         with pytest.raises(WrongState, match="no trace is under way"):
-            await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+            await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
 
     assert (aborted.trace_id, header.phase) == (first.trace_id, TracePhase.ABORTED)
     assert again.trace_id != first.trace_id
@@ -165,12 +159,12 @@ async def test_second_trace_is_refused_until_the_first_is_aborted():
 async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
     async with running_rig() as rig:
         await ready(rig)
-        request = TraceRequest(channels=("velocity",), trigger=rising(40.0))
+        request = TakeTrace(channels=("velocity",), trigger=rising(40.0))
 
         async def wait() -> None:
             async with armed_trace(rig.client, "x", request):
                 if replaced:
-                    await rig.client.command("x", Verb.TRACE_ABORT, TraceAbortRequest())
+                    await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
                     await arm_trace(rig.client, "x", request)
                 await asyncio.Event().wait()
 
@@ -184,11 +178,11 @@ async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
 @pytest.mark.parametrize(
     ("request_", "reason"),
     [
-        (TraceRequest(channels=("torque",)), "cannot trace 'torque'; there are position, velocity"),
-        (TraceRequest(channels=("position", "position")), "named twice"),
-        (TraceRequest(channels=("position",), trigger=rising(1.0)), "which is not recorded"),
-        (TraceRequest(channels=("velocity",), trigger=rising(1.0), pre_trigger=500), "leave none of 500"),
-        (TraceRequest(channels=("position",), interval_s=0.0001), "a poll takes up to"),
+        (TakeTrace(channels=("torque",)), "cannot trace 'torque'; there are position, velocity"),
+        (TakeTrace(channels=("position", "position")), "named twice"),
+        (TakeTrace(channels=("position",), trigger=rising(1.0)), "which is not recorded"),
+        (TakeTrace(channels=("velocity",), trigger=rising(1.0), pre_trigger=500), "leave none of 500"),
+        (TakeTrace(channels=("position",), interval_s=0.0001), "a poll takes up to"),
     ],
 )
 async def test_impossible_request_is_refused_with_the_reason(request_, reason):
@@ -216,7 +210,7 @@ async def test_every_ldcn_and_nmc_drive_of_the_rig_is_traced_faster_than_it_is_p
         for axis in ("x", "y", "z", "c"):
             await rig.until(axis, lambda state: state.link == "up")
             trace = await take_trace(
-                rig.client, axis, TraceRequest(channels=("position", "velocity", "enabled"), samples=200), within_s=60
+                rig.client, axis, TakeTrace(channels=("position", "velocity", "enabled"), samples=200), within_s=60
             )
             rates_hz[axis] = 199 / (trace.offsets_ns[-1] * 1e-9)
 
@@ -230,12 +224,12 @@ async def test_a_lost_line_ends_the_trace_at_once_and_the_next_one_works():
     chain = build_chain(replace(line.spec(), faults=FaultPlan((unplugged,))))
     async with running_rig(config, {line.name: chain}) as rig:
         await rig.until("x", lambda state: state.link == "up")
-        request = TraceRequest(channels=("position",), samples=10_000)
+        request = TakeTrace(channels=("position",), samples=10_000)
         reply = await arm_trace(rig.client, "x", request)
         header = await wait_for_trace(rig.client, "x", reply.trace_id, 60)
         ended_at_s = asyncio.get_running_loop().time()
         await rig.until("x", lambda state: state.link == "up")
-        again = await take_trace(rig.client, "x", TraceRequest(channels=("position",), samples=20), within_s=60)
+        again = await take_trace(rig.client, "x", TakeTrace(channels=("position",), samples=20), within_s=60)
 
     assert (header.phase, header.chunks) == (TracePhase.FAILED, 0)
     assert "was lost while it was traced" in header.problem
@@ -252,7 +246,7 @@ async def test_a_stop_on_the_traced_line_waits_for_the_poll_on_the_wire_only():
         began_s = loop.time()
         await rig.client.stop("y")
         alone_s = loop.time() - began_s
-        await arm_trace(rig.client, "x", TraceRequest(channels=("position",), samples=10_000))
+        await arm_trace(rig.client, "x", TakeTrace(channels=("position",), samples=10_000))
 
         waits_s = []
         for _ in range(50):

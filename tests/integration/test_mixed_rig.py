@@ -11,32 +11,36 @@ from ldcnd.bus.exchange_queue import Lane
 from ldcnd.config import load_config
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
-from ldcnd.model.monitors import MonitorName
+from ldcnd.model.commands import MoveVelocity, Power, Reset, Verb
 from ldcnd.model.parameters import (
     AlarmReport,
+    ClearCounter,
     CounterName,
     CounterReply,
     DriveProfile,
+    ListParameters,
     Memory,
     ParameterDump,
     ParameterList,
     ParameterReply,
+    ReadAlarms,
+    ReadAllParameters,
+    ReadParameter,
+    ReadProfile,
+    WriteParameter,
 )
-from ldcnd.model.requests import (
-    ClearCounterRequest,
-    ListParametersRequest,
-    MoveVelocityRequest,
-    PowerRequest,
-    ReadAlarmsRequest,
-    ReadAllParametersRequest,
-    ReadParameterRequest,
-    ReadProfileRequest,
-    ResetRequest,
-    Verb,
-    WriteParameterRequest,
+from ldcnd.model.samples import (
+    AxisState,
+    FaultSample,
+    LinkState,
+    MonitorName,
+    Moving,
+    PositionSample,
+    Quality,
+    StateSample,
+    TelemetryItem,
+    VelocitySample,
 )
-from ldcnd.model.samples import FaultSample, PositionSample, StateSample, TelemetryItem, VelocitySample
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.rig import RunningRig, running_rig
@@ -99,7 +103,7 @@ async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
         units[0].drive.provoke(0x0070, loop.time())
         stopped = await rig.until("feed", lambda state: state.state is AxisState.ERROR_STOP)
         fault = await rig.client.last("feed", TelemetryItem.FAULT)
-        report = await rig.client.command("feed", Verb.READ_ALARMS, ReadAlarmsRequest())
+        report = await rig.client.command("feed", Verb.READ_ALARMS, ReadAlarms())
         units[0].drive.press_reset(loop.time())
         again = await rig.until("feed", lambda state: state.state is not AxisState.ERROR_STOP)
         cleared = await rig.client.last("feed", TelemetryItem.FAULT)
@@ -115,9 +119,9 @@ async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
 @pytest.mark.parametrize(
     ("verb", "request_"),
     [
-        (Verb.POWER, PowerRequest(on=True)),
-        (Verb.MOVE_VELOCITY, MoveVelocityRequest(velocity=1.0)),
-        (Verb.RESET, ResetRequest()),
+        (Verb.POWER, Power(on=True)),
+        (Verb.MOVE_VELOCITY, MoveVelocity(velocity=1.0)),
+        (Verb.RESET, Reset()),
     ],
 )
 async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, verb, request_):
@@ -135,18 +139,18 @@ async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, ver
 async def test_parameters_are_refused_on_a_drive_without_them(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         with pytest.raises(NotSupported):
-            await rig.client.command("x", Verb.READ_PARAMETER, ReadParameterRequest(parameter="Pn100"))
+            await rig.client.command("x", Verb.READ_PARAMETER, ReadParameter(parameter="Pn100"))
 
 
 async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:
-        listed = await rig.client.command("feed", Verb.LIST_PARAMETERS, ListParametersRequest())
-        await rig.client.command("feed", Verb.WRITE_PARAMETER, WriteParameterRequest(parameter="Pn100", value=120))
+        listed = await rig.client.command("feed", Verb.LIST_PARAMETERS, ListParameters())
+        await rig.client.command("feed", Verb.WRITE_PARAMETER, WriteParameter(parameter="Pn100", value=120))
         saved = await rig.client.command(
-            "feed", Verb.WRITE_PARAMETER, WriteParameterRequest(parameter="Pn102", value=50, memory=Memory.EEPROM)
+            "feed", Verb.WRITE_PARAMETER, WriteParameter(parameter="Pn102", value=50, memory=Memory.EEPROM)
         )
-        dump = await rig.client.command("feed", Verb.READ_ALL_PARAMETERS, ReadAllParametersRequest(), timeout_s=60)
+        dump = await rig.client.command("feed", Verb.READ_ALL_PARAMETERS, ReadAllParameters(), timeout_s=60)
 
     assert isinstance(listed, ParameterList)
     assert len(listed.parameters) == 22
@@ -162,8 +166,8 @@ async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
 @pytest.mark.parametrize(
     ("write", "error"),
     [
-        (WriteParameterRequest(parameter="Pn100", value=3000), DataRefused),
-        (WriteParameterRequest(parameter="Pn999", value=1), ValueOutOfRange),
+        (WriteParameter(parameter="Pn100", value=3000), DataRefused),
+        (WriteParameter(parameter="Pn999", value=1), ValueOutOfRange),
     ],
 )
 async def test_a_refused_write_comes_back_as_its_own_error(tmp_path, write, error):
@@ -178,7 +182,7 @@ async def test_the_same_command_id_never_writes_eeprom_twice(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:
         for value in (101, 101):
-            request = WriteParameterRequest(parameter="Pn100", value=value, memory=Memory.EEPROM, command_id="save-1")
+            request = WriteParameter(parameter="Pn100", value=value, memory=Memory.EEPROM, command_id="save-1")
             await rig.client.command("feed", Verb.WRITE_PARAMETER, request)
 
     assert units[0].drive.memory.writes[PN100.number] == 1
@@ -189,7 +193,7 @@ async def test_the_budget_outlives_the_daemon(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         with pytest.raises(EepromBudgetSpent):
             await rig.client.command(
-                "feed", Verb.WRITE_PARAMETER, WriteParameterRequest(parameter="Pn100", value=1, memory=Memory.EEPROM)
+                "feed", Verb.WRITE_PARAMETER, WriteParameter(parameter="Pn100", value=1, memory=Memory.EEPROM)
             )
 
 
@@ -199,7 +203,7 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
         await rig.until("feed", lambda state: state.moving is Moving.YES)
         units[0].drive.set_pulse_rate(0.0, asyncio.get_running_loop().time())
         await rig.until("feed", lambda state: state.moving is Moving.NO)
-        reply = await rig.client.command("feed", Verb.CLEAR_COUNTER, ClearCounterRequest(counter=CounterName.FEEDBACK))
+        reply = await rig.client.command("feed", Verb.CLEAR_COUNTER, ClearCounter(counter=CounterName.FEEDBACK))
         await asyncio.sleep(3.0)
         position = await rig.client.last("feed", TelemetryItem.POSITION)
 
@@ -210,7 +214,7 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
 
 async def test_the_profile_lists_its_assumptions(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
-        reply = await rig.client.command("feed", Verb.READ_PROFILE, ReadProfileRequest())
+        reply = await rig.client.command("feed", Verb.READ_PROFILE, ReadProfile())
 
     assert isinstance(reply, DriveProfile)
     assumptions = {assumption.key: assumption for assumption in reply.assumptions}
@@ -225,7 +229,7 @@ async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):
             async with asyncio.TaskGroup() as group:
                 if busy:
                     for axis in ("feed", "spool"):
-                        dump = rig.client.command(axis, Verb.READ_ALL_PARAMETERS, ReadAllParametersRequest(), 60.0)
+                        dump = rig.client.command(axis, Verb.READ_ALL_PARAMETERS, ReadAllParameters(), 60.0)
                         group.create_task(dump, name=f"dump {axis}")
                 for _ in range(20):
                     await asyncio.sleep(0.05)

@@ -4,8 +4,7 @@ import pytest
 
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.errors import MalformedRequest
-from ldcnd.model.preview import PlanRequest
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.commands import MoveAbsolute, Power, Preview, Verb
 from tests.support.rig import RunningRig, running_rig
 
 
@@ -17,11 +16,11 @@ def sent(rig: RunningRig) -> list[str]:
 async def test_a_plan_is_what_the_move_then_is():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.client.command("x", Verb.POWER, Power(on=True))
 
-        plan = await rig.client.plan("x", PlanRequest(position=12.3456, velocity=7.0))
+        plan = await rig.client.plan("x", Preview(position=12.3456, velocity=7.0))
         before = len(sent(rig))
-        move = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=12.3456, velocity=7.0))
+        move = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=12.3456, velocity=7.0))
 
         assert plan.refusal is None
         assert plan.obstacles == ()
@@ -42,7 +41,7 @@ async def test_a_plan_sends_nothing():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
 
-        plan = await rig.client.plan("x", PlanRequest(distance=1.0))
+        plan = await rig.client.plan("x", Preview(distance=1.0))
 
         assert not set(plan.packets) & set(sent(rig))
         assert plan.obstacles == ("axis x is disabled",)
@@ -52,8 +51,8 @@ async def test_a_plan_that_cannot_be_names_the_nearest_that_can():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
 
-        far = await rig.client.plan("x", PlanRequest(position=500.0))
-        fast = await rig.client.plan("x", PlanRequest(velocity=-60.0))
+        far = await rig.client.plan("x", Preview(position=500.0))
+        fast = await rig.client.plan("x", Preview(velocity=-60.0))
 
         assert (far.refusal.code, far.refusal.nearest) == ("position_limit", 100)
         assert (fast.refusal.code, fast.refusal.nearest) == ("velocity_limit", -50)
@@ -63,6 +62,6 @@ async def test_a_plan_says_which_motion_is_meant():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
 
-        for vague in (PlanRequest(), PlanRequest(position=1.0, distance=1.0)):
+        for vague in (Preview(), Preview(position=1.0, distance=1.0)):
             with pytest.raises(MalformedRequest):
                 await rig.client.plan("x", vague)

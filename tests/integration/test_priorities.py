@@ -13,9 +13,9 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.codec import decode
-from ldcnd.model.axes import AxisInfo
+from ldcnd.model.meta import AxisInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import TraceRequest
+from ldcnd.model.traces import TakeTrace
 from ldcnd.planning.plan import plan_rig
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -94,7 +94,7 @@ async def test_a_trace_as_fast_as_possible_takes_nothing_from_high_axes_of_a_ful
     async with running_rig(ranked_config(asked, order=order)) as rig:
         await asyncio.sleep(2.0)
         before = await granted(rig, 4)
-        await arm_trace(rig.client, "low23", TraceRequest(channels=("position",), samples=5000))
+        await arm_trace(rig.client, "low23", TakeTrace(channels=("position",), samples=5000))
         await asyncio.sleep(1.0)
         seen = await granted(rig, 4)
 

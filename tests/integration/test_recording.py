@@ -14,10 +14,10 @@ from ldcnd.config import RigConfig
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.axes import AxisState
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.events import CommandEvent, CommandStatus
 from ldcnd.model.health import DaemonHealth
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import AxisState
 from ldcnd.recording.mcap_file import FACTS
 from ldcnd.recording.recorder import FLUSH_PERIOD_S, Recorder
 from ldcnd.recording.recovery import recover
@@ -51,8 +51,8 @@ async def record_a_move(path, seconds, **options):
     """Record a rig whose axis x moves to 5 mm; return how many values were published on each key."""
     async with recorded_rig(path, **options) as recorded:
         await recorded.rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        await recorded.rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-        await recorded.rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await recorded.rig.client.command("x", Verb.POWER, Power(on=True))
+        await recorded.rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
         await asyncio.sleep(seconds)
     return recorded.published
 
@@ -60,7 +60,7 @@ async def record_a_move(path, seconds, **options):
 async def thirty_one_axes_are_in_the_file(path, seconds, position_hz):
     async with recorded_rig(path, thirty_one_axes(position_hz)) as recorded:
         await recorded.rig.until("a7", lambda state: state.state is AxisState.DISABLED)
-        await recorded.rig.client.command("a7", Verb.POWER, PowerRequest(on=True))
+        await recorded.rig.client.command("a7", Verb.POWER, Power(on=True))
         await asyncio.sleep(seconds)
 
     topics = checked_topics(path)

@@ -8,9 +8,9 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.config import load_config
-from ldcnd.model.axes import AxisState
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import AxisState
 from ldcnd.recording.axis_history import AxisHistory, axis_history
 from ldcnd.recording.reading import Recording
 from ldcnd.sim.ldcn.chain import build_chain
@@ -23,8 +23,8 @@ async def record_a_move_and_an_outage(path):
     async with recorded_rig(path, chains={"line0": chain}) as recorded:
         rig = recorded.rig
         await rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
         await asyncio.sleep(3.0)
         chain.unplug(asyncio.get_running_loop().time(), for_s=1.0)
         await asyncio.sleep(4.0)

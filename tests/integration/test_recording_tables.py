@@ -7,9 +7,9 @@ import json
 import pytest
 
 from ldcnd.errors import ConfigError
-from ldcnd.model.axes import AxisState
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.samples import AxisState
 from ldcnd.recording.tables import export_tables
 from tests.support.recordings import recorded_rig
 from tests.support.rig import EPOCH_NS
@@ -19,8 +19,8 @@ async def record_a_move(path):
     async with recorded_rig(path) as recorded:
         rig = recorded.rig
         await rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=5.0))
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
         await rig.client.wait_for_end("x", reply.command_id)
         await asyncio.sleep(3.0)
     return reply.command_id

@@ -16,10 +16,8 @@ from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import MoveRelativeRequest, PowerRequest, Verb
-from ldcnd.model.samples import PositionSample, StateSample
+from ldcnd.model.commands import CommandReply, MoveRelative, Power, Verb
+from ldcnd.model.samples import AxisState, PositionSample, StateSample
 from tests.support.process import LDCND, free_port
 from tests.support.rig import SIMULATED
 from tests.support.router import router
@@ -79,7 +77,7 @@ async def position_after(positions: Samples, seq: int) -> PositionSample:
 
 async def ready(client: RigClient) -> None:
     """Close the loop of x."""
-    await client.command("x", Verb.POWER, PowerRequest(on=True))
+    await client.command("x", Verb.POWER, Power(on=True))
     async with client.samples("x", "state") as states:
         while True:
             _, state = await anext(states)
@@ -98,7 +96,7 @@ async def insist(ask: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
 
 async def move(client: RigClient, number: int) -> CommandReply:
     """Send one move, under one id, until it is answered, and wait for its end; what a careful client does."""
-    request = MoveRelativeRequest(distance=STEP, command_id=f"move-{number}", instance="routed")
+    request = MoveRelative(distance=STEP, command_id=f"move-{number}", instance="routed")
     reply = await insist(lambda: client.command("x", Verb.MOVE_RELATIVE, request, timeout_s=0.5))
     await insist(lambda: client.wait_for_end("x", reply.command_id))
     return reply

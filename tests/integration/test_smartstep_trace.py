@@ -10,10 +10,11 @@ from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, StringChecksu
 from ldcnd.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys
+from ldcnd.model.commands import Verb
+from ldcnd.model.parameters import WriteParameter
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb, WriteParameterRequest
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.traces import TracePhase, TraceTrigger, TriggerKind
+from ldcnd.model.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.rig import EPOCH_NS
 from tests.support.trace_rig import trace_rig, trace_rig_over_zenoh
@@ -24,7 +25,7 @@ SPEEDING_UP = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, le
 
 
 def trace_request(**changes):
-    return TraceRequest(
+    return TakeTrace(
         **{"channels": CHANNELS, "interval_s": 0.002, "pre_trigger": 100, "trigger": SPEEDING_UP, **changes}
     )
 
@@ -110,7 +111,7 @@ async def test_untriggered_trace_is_read_rightly_from_every_kind_of_drive(varian
         trace = await take_trace(
             under_test.rig.client,
             "feed",
-            TraceRequest(channels=("torque_reference", "speed_feedback", "bkir", "run")),
+            TakeTrace(channels=("torque_reference", "speed_feedback", "bkir", "run")),
             within_s=60,
         )
         points = under_test.witness.points
@@ -129,7 +130,7 @@ async def test_command_pulses_are_geared_to_motor_speed_as_configured(gear, rpm)
     async with trace_rig(assumed={"command_pulse_gear": gear}) as under_test:
         under_test.pulses(8_000.0)
         trace = await take_trace(
-            under_test.rig.client, "feed", TraceRequest(channels=("speed_feedback", "command_pulse_speed")), within_s=60
+            under_test.rig.client, "feed", TakeTrace(channels=("speed_feedback", "command_pulse_speed")), within_s=60
         )
 
     # 8,000 units a second, a gear of 4 counts to a unit, 8,000 counts to a turn
@@ -151,7 +152,7 @@ async def test_unknown_layout_leaves_words_undecoded():
     config = {"word_layout": TraceWordLayout.RAW}
     async with trace_rig(assumed=config) as under_test:
         trace = await take_trace(
-            under_test.rig.client, "feed", TraceRequest(channels=("position_deviation", "inp")), within_s=60
+            under_test.rig.client, "feed", TakeTrace(channels=("position_deviation", "inp")), within_s=60
         )
 
     assert trace.values[0] == trace.raw[0]
@@ -162,10 +163,8 @@ async def test_unknown_layout_leaves_words_undecoded():
 async def test_values_that_cannot_be_make_the_layout_uncertain():
     async with trace_rig(assumed={"word_layout": TraceWordLayout.LSB_IO_SHIFT}) as under_test:
         under_test.pulses(-8_000.0)
-        trace = await take_trace(under_test.rig.client, "feed", TraceRequest(channels=("speed_feedback",)), within_s=60)
-        honest = await take_trace(
-            under_test.rig.client, "feed", TraceRequest(channels=("speed_feedback",)), within_s=60
-        )
+        trace = await take_trace(under_test.rig.client, "feed", TakeTrace(channels=("speed_feedback",)), within_s=60)
+        honest = await take_trace(under_test.rig.client, "feed", TakeTrace(channels=("speed_feedback",)), within_s=60)
 
     assert honest.header.quality == trace.header.quality == "uncertain"
     assert "hardly laid out as lsb-io-shift" in trace.header.problem
@@ -197,7 +196,7 @@ async def test_second_unit_keeps_its_rate_while_a_trace_uploads():
     async with trace_rig(loaded=True) as under_test:
         rig = under_test.rig
         quiet = await gaps_s(rig, 20)
-        reply = await arm_trace(rig.client, "feed", TraceRequest(channels=("speed_feedback", "inp")))
+        reply = await arm_trace(rig.client, "feed", TakeTrace(channels=("speed_feedback", "inp")))
         await asyncio.sleep(1.0)
         uploading = await rig.client.trace_header("feed")
 
@@ -232,7 +231,7 @@ async def test_stop_on_another_bus_is_not_delayed_by_an_upload():
         (answer,) = await rig.session.query(Keys("mixed").plan)
         plan = decode(RigPlan, answer.payload, answer.encoding)
         (bound_s,) = [bus.stop_s for bus in plan.buses if bus.bus == "line0"]
-        await arm_trace(rig.client, "feed", TraceRequest(channels=CHANNELS))
+        await arm_trace(rig.client, "feed", TakeTrace(channels=CHANNELS))
         await asyncio.sleep(0.6)
 
         busy = await stop_times_s(rig, 100)
@@ -246,14 +245,14 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
     async with trace_rig() as under_test:
         client = under_test.rig.client
         await arm_trace(client, "feed", trace_request())
-        write = WriteParameterRequest(parameter="Pn102", value=50)
+        write = WriteParameter(parameter="Pn102", value=50)
 
         with pytest.raises(BusyTracing, match="e=9"):
             await client.command("feed", Verb.WRITE_PARAMETER, write)
         reply = await client.command("spool", Verb.WRITE_PARAMETER, write)
         with pytest.raises(BusyTracing, match="trace test-1 is waiting"):
             await arm_trace(client, "feed", trace_request())
-        aborted = await client.command("feed", Verb.TRACE_ABORT, TraceAbortRequest(), 10)
+        aborted = await client.command("feed", Verb.TRACE_ABORT, AbortTrace(), 10)
         after = await client.command("feed", Verb.WRITE_PARAMETER, write)
         header = await client.trace_header("feed")
 
@@ -264,15 +263,15 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
 @pytest.mark.parametrize(
     ("request_", "error", "reason"),
     [
-        (TraceRequest(channels=("position",)), ValueOutOfRange, "cannot trace 'position'; there are torque_reference"),
+        (TakeTrace(channels=("position",)), ValueOutOfRange, "cannot trace 'position'; there are torque_reference"),
         (
-            TraceRequest(channels=("torque_reference", "speed_feedback", "position_deviation")),
+            TakeTrace(channels=("torque_reference", "speed_feedback", "position_deviation")),
             ValueOutOfRange,
             "the drive traces 2",
         ),
-        (TraceRequest(channels=("run",), samples=501), ValueOutOfRange, "has room for 500"),
-        (TraceRequest(channels=("run",), interval_s=1e-7), ValueOutOfRange, "no drive samples every"),
-        (TraceRequest(channels=("run",), interval_s=5000.0), ValueOutOfRange, "no drive samples every"),
+        (TakeTrace(channels=("run",), samples=501), ValueOutOfRange, "has room for 500"),
+        (TakeTrace(channels=("run",), interval_s=1e-7), ValueOutOfRange, "no drive samples every"),
+        (TakeTrace(channels=("run",), interval_s=5000.0), ValueOutOfRange, "no drive samples every"),
         (trace_request(pre_trigger=500), ValueOutOfRange, "are not 0 to 499"),
         (
             trace_request(trigger=TraceTrigger(channel="inp", kind=TriggerKind.ABOVE)),
@@ -342,9 +341,9 @@ async def test_trace_that_was_left_armed_in_the_drive_is_ended_on_request_only()
         with pytest.raises(BusyTracing, match="busy tracing"):
             await arm_trace(client, "feed", trace_request())
         left = drive.mode
-        reply = await client.command("feed", Verb.TRACE_ABORT, TraceAbortRequest())
+        reply = await client.command("feed", Verb.TRACE_ABORT, AbortTrace())
         ended = drive.mode
         with pytest.raises(WrongState, match="no trace is under way"):
-            await client.command("feed", Verb.TRACE_ABORT, TraceAbortRequest())
+            await client.command("feed", Verb.TRACE_ABORT, AbortTrace())
 
     assert (left, ended, reply.trace_id) == (0x2000, 0, None)

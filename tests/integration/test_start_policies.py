@@ -3,9 +3,8 @@
 import asyncio
 
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.model.axes import AxisState, LinkState
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 from tests.support.rig import running_rig
@@ -27,9 +26,9 @@ async def leave_x_moving(chain, config, *, to=50.0):
     """Let a first daemon start a motion of x, with z enabled, and kill it in the middle."""
     async with rig_on(chain, config) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-        await rig.client.command("z", Verb.POWER, PowerRequest(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=to))
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("z", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=to))
         await asyncio.sleep(0.5)
         await rig.kill()
 
@@ -134,8 +133,8 @@ async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():
     chain = chain_of()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, PowerRequest(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=50.0))
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))
         await asyncio.sleep(0.5)
 
         chain.unplug(asyncio.get_running_loop().time(), 1.0)

@@ -14,7 +14,7 @@ from ldcnd.drivers.smartstep.costs import words_of
 from ldcnd.drivers.smartstep.monitors import OUTPUT_SIGNALS, SPEED_FEEDBACK, WORDS
 from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP
-from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import MonitorName
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 

@@ -23,7 +23,7 @@ from ldcnd.messaging.session import Query, Session
 from ldcnd.messaging.zenoh_config import endpoints, zenoh_config
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import LEASE_MS, ZenohSettings
-from ldcnd.model.errors import ErrorReply
+from ldcnd.model.commands import ErrorReply
 from tests.support.rig import SIMULATED
 from tests.support.router import router
 from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, until

@@ -16,7 +16,7 @@ from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import LdcndError, RequestRefused
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.requests import MoveRelativeRequest, PowerRequest, Verb
+from ldcnd.model.commands import MoveRelative, Power, Verb
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop
@@ -88,10 +88,10 @@ async def live(chain: Chain, dice: random.Random) -> tuple[int, list[str]]:
     async def client(rig: RigClient) -> None:
         while not (state := await rig.state("x")) or state.link != "up":
             await asyncio.sleep(0.05)
-        await rig.command("x", Verb.POWER, PowerRequest(on=True))
+        await rig.command("x", Verb.POWER, Power(on=True))
         await asyncio.sleep(max(0.0, FAULTS_FROM_S - loop.time()))
         meant = (await rig.daemon()).instance
-        step = MoveRelativeRequest(distance=500, command_id="step", instance=meant)
+        step = MoveRelative(distance=500, command_id="step", instance=meant)
         for _ in range(ATTEMPTS):
             try:
                 await rig.command("x", Verb.MOVE_RELATIVE, step, timeout_s=dice.choice((0.01, 0.05, 0.5)))

@@ -16,7 +16,7 @@ from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.replay import config_of, overheard, play, published_line, virtual_time
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
-from ldcnd.model.requests import MoveAbsoluteRequest, PowerRequest, Verb
+from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.sim.jumping_loop import JumpingLoop
 
 FOLDER = Path(__file__).parents[1] / "captures"
@@ -70,9 +70,9 @@ async def _record(name: str) -> Recording:
         await daemon.wait_up()
         client = RigClient(clients, config.rig)
         await asyncio.sleep(STARTS_AT_S + POWERED_AT_S - loop.time())
-        await client.command("x", Verb.POWER, PowerRequest(on=True))
+        await client.command("x", Verb.POWER, Power(on=True))
         await asyncio.sleep(STARTS_AT_S + MOVED_AT_S - loop.time())
-        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=15.0, client="bench"))
+        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=15.0, client="bench"))
         await asyncio.sleep(STARTS_AT_S + LENGTH_S - loop.time())
         capture = daemon.capture("line0", "test data")
         kept = tuple(published)

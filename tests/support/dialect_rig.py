@@ -6,10 +6,8 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 from ldcnd.config import RigConfig
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import PowerRequest, Request, Verb
-from ldcnd.model.samples import FaultSample, StateSample, TelemetryItem
+from ldcnd.model.commands import AxisCommand, CommandReply, Power, Verb
+from ldcnd.model.samples import AxisState, FaultSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
@@ -57,11 +55,11 @@ class DialectRig:
     chain: Chain
     drive: SimulatedDrive
 
-    async def send(self, verb: Verb, request: Request) -> CommandReply:
+    async def send(self, verb: Verb, request: AxisCommand[CommandReply]) -> CommandReply:
         """Send a command to the axis."""
         return await self.rig.client.command(AXIS, verb, request)
 
-    async def done(self, verb: Verb, request: Request) -> StateSample:
+    async def done(self, verb: Verb, request: AxisCommand[CommandReply]) -> StateSample:
         """Send a command, wait until it is over, and return the state after it."""
         reply = await self.send(verb, request)
         return await self.rig.client.wait_for_end(AXIS, reply.command_id)
@@ -69,7 +67,7 @@ class DialectRig:
     async def power_on(self) -> None:
         """Close the loop."""
         await self.until(lambda state: state.state is AxisState.DISABLED)
-        await self.send(Verb.POWER, PowerRequest(on=True))
+        await self.send(Verb.POWER, Power(on=True))
 
     async def until(self, wanted: Callable[[StateSample], bool]) -> StateSample:
         """Wait for a state of the axis."""

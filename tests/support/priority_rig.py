@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from ldcnd.config import RigConfig
 from ldcnd.messaging.codec import decode
-from ldcnd.model.axes import PollPriority
 from ldcnd.model.health import AxisHealth, BusHealth
+from ldcnd.model.plan import PollPriority
 from tests.support.rig import RunningRig
 
 

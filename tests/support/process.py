@@ -16,7 +16,7 @@ from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.axes import LinkState
+from ldcnd.model.samples import LinkState
 
 ROOT = Path(__file__).parents[2]
 LDCND = (sys.executable, "-m", "ldcnd")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ldcnd.messaging.codec import Encoding, decode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Answer, Qos, Query, Sample, Session
-from ldcnd.model.errors import ErrorReply
+from ldcnd.model.commands import ErrorReply
 
 KEYS = Keys("bench1")
 JSON = Encoding.JSON.value

@@ -5,8 +5,8 @@ import pytest
 from ldcnd.daemon.axis.state import MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
-from ldcnd.model.requests import Verb
+from ldcnd.model.commands import Verb
+from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
 
 OFF = AxisReading(
     position_counts=0,

@@ -24,12 +24,20 @@ from ldcnd.messaging.codec import (
     reply_encoding,
     to_json,
 )
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
-from ldcnd.model.errors import ErrorReply
+from ldcnd.model.commands import ErrorReply, Home, MoveAbsolute, Power, Reset
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import REQUEST_MODELS, HomeRequest, MoveAbsoluteRequest, PowerRequest, ResetRequest
-from ldcnd.model.samples import CurrentCommand, FaultEntry, FaultSample, StateSample
+from ldcnd.model.requests import REQUEST_MODELS
+from ldcnd.model.samples import (
+    AxisState,
+    CurrentCommand,
+    FaultEntry,
+    FaultSample,
+    LinkState,
+    Moving,
+    Quality,
+    StateSample,
+)
 
 STATE = StateSample(
     t=1_700_000_000_123_456_789, t_error_ns=5, seq=3, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True,
@@ -38,7 +46,7 @@ STATE = StateSample(
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.none() | st.floats(min_value=1e-300, max_value=1e300)
-moves = st.builds(MoveAbsoluteRequest, position=finite, velocity=positive, acceleration=positive)
+moves = st.builds(MoveAbsolute, position=finite, velocity=positive, acceleration=positive)
 anything = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
@@ -81,19 +89,19 @@ def test_both_encodings_say_the_same_of_models_within_models() -> None:
 
 
 @given(moves, st.sampled_from(list(Encoding)))
-def test_every_request_survives_either_encoding(move: MoveAbsoluteRequest, encoding: Encoding) -> None:
-    assert decode(MoveAbsoluteRequest, *encode(move, encoding)) == move
+def test_every_request_survives_either_encoding(move: MoveAbsolute, encoding: Encoding) -> None:
+    assert decode(MoveAbsolute, *encode(move, encoding)) == move
 
 
 @pytest.mark.parametrize("name", ["", "zenoh/bytes", "zenoh/string", "text/plain"])
 @pytest.mark.parametrize("payload", [b'{"on":true}', b' \n{"on":true}', msgpack.packb({"on": True})])
 def test_a_payload_of_no_named_encoding_is_recognised(payload: bytes, name: str) -> None:
-    assert decode(PowerRequest, payload, name) == PowerRequest(on=True)
+    assert decode(Power, payload, name) == Power(on=True)
 
 
 @pytest.mark.parametrize("name", ["application/json", "application/msgpack", ""])
 def test_an_empty_payload_has_no_fields(name: str) -> None:
-    assert decode(ResetRequest, b"", name) == ResetRequest()
+    assert decode(Reset, b"", name) == Reset()
 
 
 @pytest.mark.parametrize(
@@ -127,7 +135,7 @@ def test_a_wrong_field_is_named_with_what_is_allowed(payload: object, words: lis
     raw = json.dumps(payload).encode() if encoding is Encoding.JSON else msgpack.packb(payload)
 
     with pytest.raises(MalformedRequest) as caught:
-        decode(MoveAbsoluteRequest, raw, encoding.value)
+        decode(MoveAbsolute, raw, encoding.value)
 
     for word in words:
         assert word in caught.value.message
@@ -140,29 +148,29 @@ def test_no_position_is_infinite_or_no_number(value: float, encoding: Encoding) 
     raw = {Encoding.JSON: json.dumps, Encoding.MSGPACK: msgpack.packb}[encoding]({"position": value})
 
     with pytest.raises(MalformedRequest, match=r"position: .*finite") as caught:
-        decode(MoveAbsoluteRequest, raw.encode() if isinstance(raw, str) else raw, encoding.value)
+        decode(MoveAbsolute, raw.encode() if isinstance(raw, str) else raw, encoding.value)
 
     assert error_reply(caught.value).code is ErrorCode.MALFORMED_REQUEST
 
 
 def test_a_limit_that_was_broken_is_told_by_itself() -> None:
     with pytest.raises(MalformedRequest) as caught:
-        decode(HomeRequest, b'{"timeout_s": 4000}', "application/json")
+        decode(Home, b'{"timeout_s": 4000}', "application/json")
 
     assert (caught.value.value, caught.value.limit) == (4000, 3600)
 
 
 def test_broken_json_is_no_msgpack() -> None:
     with pytest.raises(MalformedRequest, match="not valid JSON"):
-        decode(PowerRequest, b'{"on":', "application/json")
+        decode(Power, b'{"on":', "application/json")
 
 
 def test_the_longest_payload_is_taken_and_one_byte_more_is_not() -> None:
     longest = b'{"on":true}'.ljust(MAX_PAYLOAD_BYTES)
 
-    assert decode(PowerRequest, longest, "application/json").on
+    assert decode(Power, longest, "application/json").on
     with pytest.raises(PayloadTooLarge) as caught:
-        decode(PowerRequest, longest + b" ", "application/json")
+        decode(Power, longest + b" ", "application/json")
     assert caught.value.limit == MAX_PAYLOAD_BYTES
 
 
@@ -212,7 +220,7 @@ def test_any_bytes_are_a_request_or_a_refusal_that_can_be_sent(model: type, payl
 )
 def test_hostile_payloads_are_refused_in_a_short_sentence(payload: bytes, name: str) -> None:
     with pytest.raises(MalformedRequest) as caught:
-        decode(MoveAbsoluteRequest, payload, name)
+        decode(MoveAbsolute, payload, name)
 
     assert len(encode(error_reply(caught.value), Encoding.JSON)[0]) < 1000
 

@@ -1,7 +1,6 @@
 """The strings below the fields of a model describe them in its schema."""
 
-from ldcnd.model.docstrings import attribute_docstrings
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import Frozen, attribute_docstrings
 
 
 class Base(Frozen):

@@ -9,8 +9,8 @@ from ldcnd.daemon.command.ledger import Entry
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import BusDown, SessionError
 from ldcnd.messaging.codec import to_json
-from ldcnd.model.events import CommandStatus, EventsRequest
-from ldcnd.model.requests import PowerRequest, Verb
+from ldcnd.model.commands import Power, Verb
+from ldcnd.model.events import CommandStatus, ReadEvents
 
 
 class Told:
@@ -24,7 +24,7 @@ class Told:
     def happens(
         self, status: CommandStatus = CommandStatus.ACCEPTED, error: BusDown | None = None, client: str | None = None
     ) -> None:
-        entry = Entry("c1", "x", Verb.POWER, PowerRequest(on=False), client=client, status=status)
+        entry = Entry("c1", "x", Verb.POWER, Power(on=False), client=client, status=status)
         self.log.changed(entry, error)
 
     def published(self) -> list[tuple[int, int, int, str, str | None]]:
@@ -48,7 +48,7 @@ async def test_who_asks_is_told_at_once_and_nobody_twice():
     told = Told()
     told.happens()
 
-    page = told.log.page(EventsRequest())
+    page = told.log.page(ReadEvents())
     await asyncio.sleep(2 * TOLD_AFTER_S)
 
     assert [event.number for event in page.events] == [0]
@@ -80,7 +80,7 @@ async def test_what_the_network_does_not_take_keeps_nothing_else_back():
     await asyncio.sleep(2 * TOLD_AFTER_S)
 
     assert len(told.published()) == 2
-    assert [event.number for event in told.log.page(EventsRequest()).events] == [0, 1]
+    assert [event.number for event in told.log.page(ReadEvents()).events] == [0, 1]
 
 
 async def test_a_page_of_events_fits_in_bytes_whatever_their_clients_are_called():
@@ -88,7 +88,7 @@ async def test_a_page_of_events_fits_in_bytes_whatever_their_clients_are_called(
     for _ in range(200):
         told.happens(client="ü" * 64)
 
-    page = told.log.page(EventsRequest(count=200))
+    page = told.log.page(ReadEvents(count=200))
 
     assert 10 < len(page.events) < 200
     assert sum(len(to_json(event)) + 1 for event in page.events) <= PAGE_BYTES

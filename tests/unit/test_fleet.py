@@ -18,7 +18,7 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.axes import LinkState
+from ldcnd.model.samples import LinkState
 from tests.support.process import LDCND
 from tests.support.rig import EPOCH_NS, SIMULATED
 from tests.support.session_pair import free_endpoint

@@ -13,7 +13,8 @@ from ldcnd.errors import (
     VelocityLimit,
     WrongState,
 )
-from ldcnd.model.axes import AxisLimits, AxisState, LinkState
+from ldcnd.model.meta import AxisLimits
+from ldcnd.model.samples import AxisState, LinkState
 
 READY = AxisView(
     name="x",

@@ -8,7 +8,7 @@ from ldcnd.daemon.axis.procedures.home import plan_search
 from ldcnd.drivers.driver import StopMode
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
-from ldcnd.model.requests import HomeMethod, HomeRequest
+from ldcnd.model.commands import Home, HomeMethod
 
 PRESET = {
     "method": "reverse_limit",
@@ -47,7 +47,7 @@ def planned(request, **more):
 
 
 def test_what_a_request_leaves_out_comes_from_the_configuration():
-    search = planned(HomeRequest(), home=PRESET)
+    search = planned(Home(), home=PRESET)
 
     assert (search.method, search.velocity, search.position) == (HomeMethod.REVERSE_LIMIT, -5.0, 3.0)
     assert (search.distance, search.stop, search.move_to, search.timeout_s) == (40.0, StopMode.ABRUPT, 1.0, 60.0)
@@ -55,9 +55,7 @@ def test_what_a_request_leaves_out_comes_from_the_configuration():
 
 
 def test_what_a_request_says_goes_before_the_configuration():
-    request = HomeRequest(
-        method="index", velocity=1.0, position=0.0, timeout_s=5, distance=2, stop="smooth", move_to=0.0
-    )
+    request = Home(method="index", velocity=1.0, position=0.0, timeout_s=5, distance=2, stop="smooth", move_to=0.0)
 
     search = planned(request, home=PRESET)
 
@@ -65,9 +63,7 @@ def test_what_a_request_says_goes_before_the_configuration():
     assert (search.distance, search.stop, search.move_to, search.timeout_s) == (2.0, StopMode.SMOOTH, 0.0, 5.0)
 
 
-@pytest.mark.parametrize(
-    ("request_", "missing"), [(HomeRequest(velocity=1.0), "method"), (HomeRequest(method="index"), "velocity")]
-)
+@pytest.mark.parametrize(("request_", "missing"), [(Home(velocity=1.0), "method"), (Home(method="index"), "velocity")])
 def test_a_search_without_method_or_velocity_says_which_is_missing(request_, missing):
     with pytest.raises(MalformedRequest, match=f"needs a {missing}"):
         planned(request_)
@@ -75,7 +71,7 @@ def test_a_search_without_method_or_velocity_says_which_is_missing(request_, mis
 
 def test_a_capture_that_the_drive_lacks_is_refused_with_those_it_has():
     with pytest.raises(NotSupported, match="it can on index, reverse_limit"):
-        planned(HomeRequest(method="current", velocity=1.0))
+        planned(Home(method="current", velocity=1.0))
 
 
 @pytest.mark.parametrize(
@@ -92,7 +88,7 @@ def test_a_capture_that_the_drive_lacks_is_refused_with_those_it_has():
 def test_limit_switches_are_those_of_the_drive_whatever_the_axis_calls_forward(method, velocity, reverse, onto):
     drive = _Drive()
     drive.home_methods = frozenset(HomeMethod)
-    search = plan_search(axis(), drive, HomeRequest(method=method, velocity=velocity))
+    search = plan_search(axis(), drive, Home(method=method, velocity=velocity))
 
     assert search.runs_onto_switch(Scale(1000, reverse=reverse)) is onto
 

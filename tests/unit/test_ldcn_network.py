@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn.registers import actual_baud
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.line import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
 from ldcnd.errors import NetworkMismatch, NotSupported, StopLatched
-from ldcnd.model.requests import HomeMethod
+from ldcnd.model.commands import HomeMethod
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -13,8 +13,8 @@ from ldcnd.drivers.ldcn.servo import home_methods, homing_control, opens_loop
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
 from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
-from ldcnd.model.axes import Provenance
-from ldcnd.model.requests import HomeMethod, PinMode
+from ldcnd.model.commands import HomeMethod, PinMode
+from ldcnd.model.meta import Provenance
 
 CLOSED = AuxFlag.SERVO_ON | AuxFlag.INDEX
 

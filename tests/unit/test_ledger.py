@@ -2,11 +2,10 @@ import pytest
 
 from ldcnd.daemon.command.ledger import REMEMBERED, Entry, Ledger
 from ldcnd.errors import CommandIdReused, StopLatched, UnknownCommand
+from ldcnd.model.commands import CommandReply, Halt, MoveAbsolute, Verb
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import HaltRequest, MoveAbsoluteRequest, Verb
 
-MOVE = MoveAbsoluteRequest(position=1.0)
+MOVE = MoveAbsolute(position=1.0)
 
 
 def entry(command_id="c1", request=MOVE, verb=Verb.MOVE_ABSOLUTE) -> Entry:
@@ -46,8 +45,8 @@ def test_a_repeated_id_is_known_whatever_proves_that_it_may(ledger):
     ("axis", "verb", "request_"),
     [
         ("y", Verb.MOVE_ABSOLUTE, MOVE),
-        ("x", Verb.HALT, HaltRequest()),
-        ("x", Verb.MOVE_ABSOLUTE, MoveAbsoluteRequest(position=2.0)),
+        ("x", Verb.HALT, Halt()),
+        ("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=2.0)),
     ],
 )
 def test_an_id_belongs_to_one_command(ledger, axis, verb, request_):

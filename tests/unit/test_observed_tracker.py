@@ -1,7 +1,7 @@
 from ldcnd.daemon.axis.state import ObservedTracker
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
-from ldcnd.model.axes import AxisState, LinkState, Moving
+from ldcnd.model.samples import AxisState, LinkState, Moving
 
 ALARM = Fault("alarm_0010", "Overcurrent")
 

@@ -10,11 +10,11 @@ from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.messaging.session import Declaration, Qos, Query
-from ldcnd.model.requests import PowerRequest, Verb
+from ldcnd.model.commands import Power, Verb
 from ldcnd.model.samples import PositionSample
 from tests.support.session_pair import JSON, KEYS, POSITION
 
-POWER = PowerRequest(on=True)
+POWER = Power(on=True)
 DAEMON = {
     "rig": "bench1", "version": "9", "api": 1, "instance": "i1", "started": 1, "encoding": "json", "axes": ["x"],
     "buses": [], "moon_phase": "full",

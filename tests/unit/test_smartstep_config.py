@@ -4,7 +4,7 @@ import pytest
 
 from ldcnd.config import load_config
 from ldcnd.errors import ConfigError
-from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import MonitorName
 
 GOOD = """
 rig = "bench"

@@ -16,8 +16,7 @@ from ldcnd.drivers.smartstep.poller import Basic, Listeners, UnitPoller
 from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, Wiring
 from ldcnd.errors import NetworkMismatch, NotSupported, WrongState
 from ldcnd.exchange import Timing
-from ldcnd.model.monitors import MonitorName
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.samples import MonitorName, TelemetryItem
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line
 

@@ -21,19 +21,18 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.parameters import Memory
-from ldcnd.model.requests import WriteParameterRequest
+from ldcnd.model.parameters import Memory, WriteParameter
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 
 
-def to_ram(parameter: str, value: int) -> WriteParameterRequest:
-    return WriteParameterRequest(parameter=parameter, value=value)
+def to_ram(parameter: str, value: int) -> WriteParameter:
+    return WriteParameter(parameter=parameter, value=value)
 
 
-def to_eeprom(parameter: str, value: int, confirm_unit: int | None = None) -> WriteParameterRequest:
-    return WriteParameterRequest(parameter=parameter, value=value, memory=Memory.EEPROM, confirm_unit=confirm_unit)
+def to_eeprom(parameter: str, value: int, confirm_unit: int | None = None) -> WriteParameter:
+    return WriteParameter(parameter=parameter, value=value, memory=Memory.EEPROM, confirm_unit=confirm_unit)
 
 
 async def test_a_parameter_is_found_by_number_and_by_name():

@@ -8,8 +8,7 @@ from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum, TriggerWordSource
 from ldcnd.drivers.smartstep.trace import TraceUpload
 from ldcnd.errors import BadReply, BusError, ByteCountRefused, DriveFault, ValueOutOfRange, WrongState
-from ldcnd.model.requests import TraceRequest
-from ldcnd.model.traces import TraceTrigger, TriggerKind
+from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
@@ -113,7 +112,7 @@ def frames(line):
 
 async def test_arming_sends_the_frames_of_the_manual_in_its_order():
     async with smartstep_line([simulated(1)]) as line:
-        request = TraceRequest(channels=("speed_feedback", "position_deviation", "inp", "alm"), interval_s=0.002)
+        request = TakeTrace(channels=("speed_feedback", "position_deviation", "inp", "alm"), interval_s=0.002)
         await line.axis("u1").tracer.arm(request)
         settings = [frame for frame in frames(line) if frame[2:3] == b"1"]
 
@@ -132,7 +131,7 @@ async def test_arming_sends_the_frames_of_the_manual_in_its_order():
 async def test_readings_while_armed_need_no_setting_and_the_trigger_level_is_scaled():
     drive = simulated(1)
     async with smartstep_line([drive], profile=TRIGGERED) as line:
-        request = TraceRequest(channels=("torque_reference", "speed_feedback"), trigger=NEVER)
+        request = TakeTrace(channels=("torque_reference", "speed_feedback"), trigger=NEVER)
         armed = await line.axis("u1").tracer.arm(request)
         read = drive.drive.recorder.read
 
@@ -143,7 +142,7 @@ async def test_readings_while_armed_need_no_setting_and_the_trigger_level_is_sca
 async def test_cancelled_recording_leaves_the_drive_in_its_normal_mode():
     drive = simulated(1)
     async with smartstep_line([drive], profile=TRIGGERED) as line:
-        armed = await line.axis("u1").tracer.arm(TraceRequest(channels=("speed_feedback",), trigger=NEVER))
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), trigger=NEVER))
         before = drive.drive.mode
 
         async with asyncio.TaskGroup() as group:
@@ -160,7 +159,7 @@ async def test_nothing_is_set_on_wires_where_the_drive_hears_itself():
         axis.words.self_hearing = True
 
         with pytest.raises(WrongState, match="its own replies"):
-            await axis.tracer.arm(TraceRequest(channels=("run",)))
+            await axis.tracer.arm(TakeTrace(channels=("run",)))
 
         assert frames(line) == []
 
@@ -168,7 +167,7 @@ async def test_nothing_is_set_on_wires_where_the_drive_hears_itself():
 async def test_interval_is_judged_by_the_unit_of_this_drive():
     async with smartstep_line([simulated(1)]) as line:
         with pytest.raises(ValueOutOfRange, match=r"is not 0\.0005 to 16\.38375 s"):
-            await line.axis("u1").tracer.arm(TraceRequest(channels=("run",), interval_s=17.0))
+            await line.axis("u1").tracer.arm(TakeTrace(channels=("run",), interval_s=17.0))
 
         assert not [frame for frame in frames(line) if frame[2:3] == b"1"]
 
@@ -183,7 +182,7 @@ async def test_a_bad_line_gives_the_true_trace_or_an_error_and_executes_once_at_
     recorded = None
     async with smartstep_line([drive], faults=faults) as line:
         try:
-            armed = await line.axis("u1").tracer.arm(TraceRequest(channels=("speed_feedback",)))
+            armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",)))
             recorded = await armed.record(ignore)
         except (BusError, DriveFault):
             pass

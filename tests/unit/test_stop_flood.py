@@ -11,7 +11,7 @@ from ldcnd.daemon.command.requests import STOPS_AT_ONCE, Requests
 from ldcnd.errors import InternalError
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Answer, Query
-from ldcnd.model.requests import StopRequest
+from ldcnd.model.commands import Stop
 from tests.support.session_pair import error_of
 
 KEYS = Keys("bench1")
@@ -163,7 +163,7 @@ async def test_who_has_stopped_is_entered_once_the_drives_have_confirmed_it():
         rig.confirmed.set()
 
     assert (sent, entered) == (1, 0)
-    flood.desk.stopped.assert_called_once_with(("x",), ("x",), StopRequest(), None)
+    flood.desk.stopped.assert_called_once_with(("x",), ("x",), Stop(), None)
 
 
 async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():

@@ -9,7 +9,7 @@ import pytest
 
 from ldcnd.cli.trace import command
 from ldcnd.messaging.codec import decode
-from ldcnd.model.requests import TraceRequest
+from ldcnd.model.traces import TakeTrace
 from ldcnd.smartstep_trace_config import SmartStepTraceConfig
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "take-a-trace.md").read_text(encoding="utf-8")
@@ -40,7 +40,7 @@ def test_every_subcommand_is_on_the_page():
 def test_the_payload_of_the_page_is_a_request():
     (payload,) = blocks("json")
 
-    assert decode(TraceRequest, payload.encode(), "application/json").samples == 300
+    assert decode(TakeTrace, payload.encode(), "application/json").samples == 300
 
 
 def test_the_settings_of_the_page_are_those_that_hold_anyway():

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from ldcnd.client.trace_file import load_trace, require_suffix, save_trace
 from ldcnd.client.traces import Trace
 from ldcnd.errors import ConfigError
-from ldcnd.model.axes import Quality
+from ldcnd.model.samples import Quality
 from ldcnd.model.traces import TraceChannel, TraceHeader, TracePhase, TraceSource
 
 HEADER = TraceHeader(

@@ -14,11 +14,11 @@ from ldcnd.errors import OutcomeUnknown
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, encode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.requests import TraceAbortRequest, TraceRequest, Verb
-from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TraceChannel, TracePhase, TraceSource
+from ldcnd.model.commands import Verb
+from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, AbortTrace, TakeTrace, TraceChannel, TracePhase, TraceSource
 
 LONG = -1.2345678901234567e-300
-REQUEST = TraceRequest(channels=("c0",))
+REQUEST = TakeTrace(channels=("c0",))
 
 
 class FakeTrace(ArmedTrace):
@@ -135,7 +135,7 @@ async def test_an_abort_in_the_same_moment_as_the_arming_still_ends_the_trace():
     tracer = FakeTracer()
     async with recording(tracer) as (recorder, publisher):
         await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
-        reply = await recorder.carry_out("t-2", Verb.TRACE_ABORT, TraceAbortRequest())
+        reply = await recorder.carry_out("t-2", Verb.TRACE_ABORT, AbortTrace())
 
         assert (reply.trace_id, header(publisher).phase) == ("t-1", TracePhase.ABORTED)
 
@@ -147,6 +147,6 @@ async def test_an_abort_that_takes_too_long_says_that_nobody_knows():
         tracer.traces[0].stubborn = True
 
         with pytest.raises(OutcomeUnknown, match="did not leave its trace"):
-            await recorder.carry_out("t-2", Verb.TRACE_ABORT, TraceAbortRequest())
+            await recorder.carry_out("t-2", Verb.TRACE_ABORT, AbortTrace())
 
         assert header(publisher).phase is TracePhase.RECORDING

@@ -5,9 +5,8 @@ from importlib import resources
 import pytest
 
 from ldcnd.client.trouble import Severity, Trouble, axis_troubles
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.health import AxisHealth, ItemHealth
-from ldcnd.model.samples import FaultEntry, FaultSample, StateSample
+from ldcnd.model.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
 
 
 def state(**changes) -> StateSample:

@@ -13,10 +13,10 @@ from ldcnd.daemon.publish.asyncapi import asyncapi_document, asyncapi_text
 from ldcnd.daemon.publish.contract import Kind, all_schemas, as_markdown, channels
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding
 from ldcnd.messaging.keys import Keys, matches
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.requests import REQUEST_MODELS, Verb
+from ldcnd.model.commands import Verb
+from ldcnd.model.frozen import Frozen, schema_name
+from ldcnd.model.requests import REQUEST_MODELS
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.schemas import schema_name
 from ldcnd.model.verbs import RIG_VERBS
 from ldcnd.pki.access import RULES
 

@@ -31,11 +31,8 @@ from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, LdcndError, NotSupported, ShuttingDown, StopLatched, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
-from ldcnd.model.axes import Moving
-from ldcnd.model.preview import PlanReply, PlanRequest
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import BufferMode, Request, Verb
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, PlanReply, Preview, Verb
+from ldcnd.model.samples import Moving, TelemetryItem
 
 log = get_logger("axis")
 
@@ -44,7 +41,7 @@ STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
 
 
-Obey = Callable[[Turn, Request], Awaitable[CommandReply]]
+Obey = Callable[[Turn, AxisCommand[CommandReply]], Awaitable[CommandReply]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +49,7 @@ class WaitingCommand:
     """A command that found the axis at work, and the caller who waits for its answer."""
 
     turn: Turn
-    request: Request
+    request: AxisCommand[CommandReply]
     future: "asyncio.Future[CommandReply]"
 
     async def carry_out(self, obey: Obey) -> None:
@@ -91,7 +88,7 @@ class AxisTurns:
         """Whether a command that comes now need not wait for another one, or for a step."""
         return not (self._waiting or self.at_work.locked())
 
-    async def wait(self, turn: Turn, request: Request) -> CommandReply:
+    async def wait(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
         """Wait behind all others; return the answer.
 
         Raises:
@@ -247,7 +244,9 @@ class AxisService:
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
-    async def execute(self, verb: Verb, request: Request, command_id: str | None = None) -> CommandReply:
+    async def execute(
+        self, verb: Verb, request: AxisCommand[CommandReply], command_id: str | None = None
+    ) -> CommandReply:
         """Carry out a command in its turn; returns once the drive has acknowledged it.
 
         Args:
@@ -296,7 +295,7 @@ class AxisService:
                 still_wanted()
             return await execute()
 
-    def preview(self, request: PlanRequest, obstacles: tuple[str, ...]) -> PlanReply:
+    def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PlanReply:
         """Tell what a motion would do; no effect. See `preview`."""
         return preview(self._motion, self._bus, request, obstacles)
 
@@ -356,7 +355,7 @@ class AxisService:
 
         return Turn(command_id, verb, still_wanted)
 
-    async def _obey(self, turn: Turn, request: Request) -> CommandReply:
+    async def _obey(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
         turn.still_wanted()
         if turn.verb in TRACE_VERBS:
             return await self.traces.carry_out(turn.command_id, turn.verb, request)

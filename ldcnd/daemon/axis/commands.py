@@ -12,25 +12,25 @@ from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, Gains, StopMode
 from ldcnd.errors import DriveFault, NotSupported, OutcomeUnknown, RequestRefused, StopLatched, WrongState
 from ldcnd.exchange import Timing
-from ldcnd.model.axes import AxisState, LinkState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import (
-    HaltRequest,
-    HomeRequest,
-    MoveAbsoluteRequest,
-    MoveAnalogRequest,
-    MoveRelativeRequest,
-    MoveVelocityRequest,
-    PowerRequest,
-    Request,
-    ResetRequest,
-    SetGainsRequest,
-    SetOutputsRequest,
-    SetPositionRequest,
-    SetPwmRequest,
-    TrackRequest,
+from ldcnd.model.commands import (
+    AxisCommand,
+    CommandReply,
+    Halt,
+    Home,
+    MoveAbsolute,
+    MoveAnalog,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Reset,
+    SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
+    Track,
     Verb,
 )
+from ldcnd.model.samples import AxisState, LinkState
 
 STEP_RETRY_S = 0.2
 """A step whose packets were lost is taken again so much later,"""
@@ -54,7 +54,7 @@ class AxisCommands:
         self._gains = motion.driver.spec.gains
         self._procedure: Procedure | None = None
 
-    async def carry_out(self, turn: Turn, request: Request) -> CommandReply:
+    async def carry_out(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says; returns once the drive has acknowledged it.
 
         Raises:
@@ -66,39 +66,39 @@ class AxisCommands:
         if procedure := self._procedure_for(turn, request):
             return await self._undertake(procedure)
         match request:
-            case PowerRequest():
+            case Power():
                 return await self._power(turn, on=request.on)
-            case MoveAbsoluteRequest():
+            case MoveAbsolute():
                 return await self._move_absolute(turn, request)
-            case MoveRelativeRequest():
+            case MoveRelative():
                 return await self._move_relative(turn, request)
-            case MoveVelocityRequest():
+            case MoveVelocity():
                 return await self._move_velocity(turn, request)
-            case SetPositionRequest():
+            case SetPosition():
                 return self._set_position(turn, request.position)
-            case SetGainsRequest():
+            case SetGains():
                 return await self._set_gains(turn, request)
-            case SetOutputsRequest():
+            case SetOutputs():
                 return await self._set_outputs(turn, request)
-            case HaltRequest():
+            case Halt():
                 return await self._halt(turn)
-            case ResetRequest():
+            case Reset():
                 return await self._reset(turn)
             case _:
                 raise NotSupported(f"axis {self._config.name} cannot {turn.verb}", axis=self._config.name)
 
-    def _procedure_for(self, turn: Turn, request: Request) -> Procedure | None:
+    def _procedure_for(self, turn: Turn, request: AxisCommand[CommandReply]) -> Procedure | None:
         """Return what carries out a request that takes more than one step."""
         match request:
             case GroupMoveRequest():
                 return GroupMember(self._motion, turn, request)
-            case HomeRequest():
+            case Home():
                 return HomeSequence(self._motion, turn, request)
-            case MoveAnalogRequest():
+            case MoveAnalog():
                 return AnalogMove(self._motion, turn, request)
-            case SetPwmRequest():
+            case SetPwm():
                 return PwmRun(self._motion, turn, request)
-            case TrackRequest():
+            case Track():
                 return SetPoint(self._motion, turn, request, self._procedure)
             case _:
                 return None
@@ -228,14 +228,14 @@ class AxisCommands:
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
-    async def _move_absolute(self, turn: Turn, request: MoveAbsoluteRequest) -> CommandReply:
+    async def _move_absolute(self, turn: Turn, request: MoveAbsolute) -> CommandReply:
         view = self._tracker.view()
         guards.check_may_move(view)
         guards.check_referenced(view)
         plan = self._motion.plan_to(request.position, request.velocity, request.acceleration)
         return await self._move(turn, plan, AxisState.DISCRETE_MOTION)
 
-    async def _move_relative(self, turn: Turn, request: MoveRelativeRequest) -> CommandReply:
+    async def _move_relative(self, turn: Turn, request: MoveRelative) -> CommandReply:
         motion = self._motion
         guards.check_may_move(self._tracker.view())
         from_counts = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
@@ -243,7 +243,7 @@ class AxisCommands:
         plan = motion.plan_to(position, request.velocity, request.acceleration)
         return await self._move(turn, plan, AxisState.DISCRETE_MOTION)
 
-    async def _move_velocity(self, turn: Turn, request: MoveVelocityRequest) -> CommandReply:
+    async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
         view, planner = self._tracker.view(), self._motion.planner
         guards.check_may_move(view)
         plan = planner.at_velocity(view, request.velocity, request.acceleration)
@@ -288,7 +288,7 @@ class AxisCommands:
         motion.publish_state()
         return motion.reply(turn).model_copy(update={"position": position})
 
-    async def _set_gains(self, turn: Turn, request: SetGainsRequest) -> CommandReply:
+    async def _set_gains(self, turn: Turn, request: SetGains) -> CommandReply:
         view = self._tracker.view()
         guards.check_reachable(view)
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name)) is not None}
@@ -304,7 +304,7 @@ class AxisCommands:
         self._gains = changed
         return self._motion.reply(turn)
 
-    async def _set_outputs(self, turn: Turn, request: SetOutputsRequest) -> CommandReply:
+    async def _set_outputs(self, turn: Turn, request: SetOutputs) -> CommandReply:
         guards.check_reachable(self._tracker.view())
         await self._driver.set_outputs(request.limit1, request.limit2)
         return self._motion.reply(turn)

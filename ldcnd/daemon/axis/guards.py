@@ -11,7 +11,8 @@ from ldcnd.errors import (
     VelocityLimit,
     WrongState,
 )
-from ldcnd.model.axes import AxisLimits, AxisState, LinkState
+from ldcnd.model.meta import AxisLimits
+from ldcnd.model.samples import AxisState, LinkState
 
 MOTION_STATES = frozenset(
     {AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING}

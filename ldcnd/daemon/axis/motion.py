@@ -20,10 +20,8 @@ from ldcnd.drivers.driver import AxisDriver, AxisReading, Motion
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, MalformedRequest, OutcomeUnknown, RequestRefused, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import error_reply
-from ldcnd.model.axes import AxisState
-from ldcnd.model.preview import PlanReply, PlanRequest
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import Verb
+from ldcnd.model.commands import CommandReply, PlanReply, Preview, Verb
+from ldcnd.model.samples import AxisState
 
 LARGEST_COUNT = 0x7FFFFFFF
 
@@ -279,7 +277,7 @@ class AxisMotion:
         return CommandReply(command_id=turn.command_id, axis=self.config.name, verb=turn.verb)
 
 
-def preview(motion: AxisMotion, bus: Bus, request: PlanRequest, obstacles: tuple[str, ...]) -> PlanReply:
+def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PlanReply:
     """Plan a motion without sending anything.
 
     Args:
@@ -317,7 +315,7 @@ def preview(motion: AxisMotion, bus: Bus, request: PlanRequest, obstacles: tuple
     )
 
 
-def _plan(motion: AxisMotion, request: PlanRequest) -> MotionPlan:
+def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
     match request.position, request.distance, request.velocity:
         case float() as position, None, velocity:
             return motion.plan_to(position, velocity, request.acceleration)

@@ -3,23 +3,19 @@
 from ldcnd.drivers.driver import AxisDriver
 from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.errors import NotSupported
+from ldcnd.model.commands import AxisCommand, CommandReply, Verb
 from ldcnd.model.parameters import (
     AlarmReport,
+    ClearCounter,
     CounterReply,
     DriveProfile,
     ParameterDump,
     ParameterList,
     ParameterReply,
+    ReadParameter,
+    WriteParameter,
 )
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import (
-    REPLY_MODELS,
-    ClearCounterRequest,
-    ReadParameterRequest,
-    Request,
-    Verb,
-    WriteParameterRequest,
-)
+from ldcnd.model.requests import REPLY_MODELS
 
 
 class Parameters:
@@ -34,7 +30,7 @@ class Parameters:
         """Tell whether a verb is one of these."""
         return verb in REPLY_MODELS
 
-    async def carry_out(self, command_id: str, verb: Verb, request: Request) -> CommandReply:
+    async def carry_out(self, command_id: str, verb: Verb, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says.
 
         Raises:
@@ -44,10 +40,10 @@ class Parameters:
         """
         axis, access = self._driver.spec.name, self._access
         match request:
-            case ReadParameterRequest():
+            case ReadParameter():
                 value = await access.read(request.parameter, unlisted=request.unlisted)
                 return ParameterReply(command_id=command_id, axis=axis, verb=verb, value=value)
-            case WriteParameterRequest():
+            case WriteParameter():
                 done = await access.write(request)
                 return ParameterReply(
                     command_id=command_id,
@@ -57,7 +53,7 @@ class Parameters:
                     written=done.written,
                     remarks=done.remarks,
                 )
-            case ClearCounterRequest(counter=counter):
+            case ClearCounter(counter=counter):
                 count = await access.clear_counter(counter)
                 return CounterReply(command_id=command_id, axis=axis, verb=verb, counter=counter, value=count)
             case _:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.driver import AxisReading
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import Verb
+from ldcnd.model.commands import CommandReply, Verb
 
 NEVER_S = float("inf")
 

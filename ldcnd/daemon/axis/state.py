@@ -8,10 +8,9 @@ from ldcnd.daemon.axis.guards import MOTION_STATES, AxisView
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 from ldcnd.fault_pages import page_of
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
+from ldcnd.model.commands import Verb
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.requests import Verb
-from ldcnd.model.samples import FaultEntry
+from ldcnd.model.samples import AxisState, FaultEntry, LinkState, Moving, Quality
 
 MISSES_UNTIL_DOWN = 3
 """So many polls in a row must fail before the drive counts as gone."""

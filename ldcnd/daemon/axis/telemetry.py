@@ -5,15 +5,18 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
-from ldcnd.model.axes import AxisState, LinkState, Moving, Quality
 from ldcnd.model.frozen import unchecked
-from ldcnd.model.monitors import MonitorSample
 from ldcnd.model.samples import (
     AdcSample,
+    AxisState,
     CurrentCommand,
     FaultEntry,
     FaultSample,
+    LinkState,
+    MonitorSample,
+    Moving,
     PositionSample,
+    Quality,
     StateSample,
     TelemetryItem,
     VelocitySample,

@@ -16,7 +16,7 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.messaging.codec import to_json
 from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.wire_log import WireLogReply, WireLogRequest
+from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
 
 PAGE_BYTES = 12_000
 """Text in one reply: with its other fields it stays below what a payload may have."""
@@ -61,7 +61,7 @@ def fingerprint(token: str) -> str:
     return hashlib.sha256(token.encode()).hexdigest()[:16]
 
 
-def wire_page(rig: Rig, request: WireLogRequest, clock: Clock) -> WireLogReply:
+def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:
     """Return the records of one line that were asked for, the oldest first, as many as one reply takes.
 
     Raises:

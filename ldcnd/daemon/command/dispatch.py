@@ -26,13 +26,19 @@ from ldcnd.log import get_logger
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model import verbs
-from ldcnd.model.authority import AcquireRequest, Holder, HolderList, HoldersRequest, LeaseReply, LeaseRequest
-from ldcnd.model.events import CommandOutcome, CommandStatus, EventList, EventsRequest, OutcomeRequest
+from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Move, MoveAbsolute, Stop, Verb, Why, WhyReply
+from ldcnd.model.events import CommandOutcome, CommandStatus, EventList, ReadEvents, ReadOutcome
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import BufferMode, MoveAbsoluteRequest, MoveRequest, Request, StopRequest, Verb
-from ldcnd.model.why import WhyReply, WhyRequest
-from ldcnd.model.wire_log import WireLogReply, WireLogRequest
+from ldcnd.model.rig_commands import (
+    Acquire,
+    Holder,
+    HolderList,
+    LeaseReply,
+    LeaseRequest,
+    ListHolders,
+    ReadWireLog,
+    WireLogReply,
+)
 
 log = get_logger("authority")
 
@@ -72,7 +78,9 @@ class CommandDesk:
         self._next_command_id = next_command_id
         self._under_way: dict[str, asyncio.Event] = {}
 
-    async def carry_out(self, axis_name: str, verb: Verb, request: Request, login: str | None = None) -> CommandReply:
+    async def carry_out(
+        self, axis_name: str, verb: Verb, request: AxisCommand[CommandReply], login: str | None = None
+    ) -> CommandReply:
         """Carry out a command that has just arrived, or answer as the first time when its id is known.
 
         Args:
@@ -107,21 +115,23 @@ class CommandDesk:
             del self._under_way[command_id]
             over.set()
 
-    async def _execute(self, axis: AxisService, verb: Verb, request: Request, command_id: str) -> CommandReply:
-        if isinstance(request, MoveRequest) and request.buffer_mode is not BufferMode.REFUSE:
+    async def _execute(
+        self, axis: AxisService, verb: Verb, request: AxisCommand[CommandReply], command_id: str
+    ) -> CommandReply:
+        if isinstance(request, Move) and request.buffer_mode is not BufferMode.REFUSE:
             return await axis.in_turn(request.buffer_mode, lambda: self._start(axis, verb, request, command_id))
         return await self._start(axis, verb, request, command_id)
 
-    async def _start(self, axis: AxisService, verb: Verb, request: Request, command_id: str) -> CommandReply:
+    async def _start(
+        self, axis: AxisService, verb: Verb, request: AxisCommand[CommandReply], command_id: str
+    ) -> CommandReply:
         reply = await axis.execute(verb, request, command_id)
         moving = axis.tracker.command is not None and axis.tracker.command.command_id == command_id
         status = CommandStatus.DONE if verb in AT_ONCE or not moving else CommandStatus.EXECUTING
         self._ledger.answered(command_id, reply, status)
         return reply
 
-    def stopped(
-        self, names: tuple[str, ...], confirmed: tuple[str, ...], request: StopRequest, login: str | None
-    ) -> None:
+    def stopped(self, names: tuple[str, ...], confirmed: tuple[str, ...], request: Stop, login: str | None) -> None:
         """Enter stops that were carried out already, with who has asked for them: one event for each axis.
 
         Args:
@@ -139,7 +149,7 @@ class CommandDesk:
             command_id = self._next_command_id()
             self._ledger.open(Entry(command_id, name, Verb.STOP, request, request.client, login, status, reason))
 
-    def why(self, axis: AxisService, request: WhyRequest) -> WhyReply:
+    def why(self, axis: AxisService, request: Why) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that; no effect."""
 
         def admit() -> None:
@@ -157,7 +167,7 @@ class CommandDesk:
             return entry.answer
         raise entry.answer or OutcomeUnknown(f"axis {entry.axis}: nobody knows how {entry.verb} went", axis=entry.axis)
 
-    def _admit(self, axis: str, verb: Verb, request: Request) -> str | None:
+    def _admit(self, axis: str, verb: Verb, request: AxisCommand[CommandReply]) -> str | None:
         """Refuse what is stale, late or somebody else's; return who sends it, if it says so."""
         if verb in FREE:
             return None
@@ -233,7 +243,7 @@ class RigDesk:
         return handler(payload, encoding)
 
     def _acquire(self, payload: bytes, encoding: str) -> LeaseReply:
-        request = decode(AcquireRequest, payload, encoding)
+        request = decode(Acquire, payload, encoding)
         lease, displaced = self._authority.acquire(
             request.client, self._rig.members(request.axes), request.lease_s, self._clock.now_s(), force=request.force
         )
@@ -257,7 +267,7 @@ class RigDesk:
         return _reply(lease)
 
     def _holders(self, payload: bytes, encoding: str) -> HolderList:
-        decode(HoldersRequest, payload, encoding)
+        decode(ListHolders, payload, encoding)
         holders = [(axis, self._authority.holder(axis)) for axis in self._rig.axes]
         return HolderList(
             required=self._authority.required,
@@ -265,7 +275,7 @@ class RigDesk:
         )
 
     def _outcome(self, payload: bytes, encoding: str) -> CommandOutcome:
-        entry = self._ledger.get(decode(OutcomeRequest, payload, encoding).command_id)
+        entry = self._ledger.get(decode(ReadOutcome, payload, encoding).command_id)
         return CommandOutcome(
             command_id=entry.command_id,
             axis=entry.axis,
@@ -275,23 +285,21 @@ class RigDesk:
         )
 
     def _latest(self, payload: bytes, encoding: str) -> EventList:
-        return self._events.page(decode(EventsRequest, payload, encoding))
+        return self._events.page(decode(ReadEvents, payload, encoding))
 
     def _wire_log(self, payload: bytes, encoding: str) -> WireLogReply:
-        return wire_page(self._rig, decode(WireLogRequest, payload, encoding), self._clock)
+        return wire_page(self._rig, decode(ReadWireLog, payload, encoding), self._clock)
 
 
 def _reply(lease: Lease) -> LeaseReply:
     return LeaseReply(lease=lease.token, client=lease.client, axes=tuple(sorted(lease.axes)), lease_s=lease.duration_s)
 
 
-Execute = Callable[[str, Verb, Request], Awaitable[CommandReply]]
+Execute = Callable[[str, Verb, AxisCommand[CommandReply]], Awaitable[CommandReply]]
 """Carries out a command of an axis, with whatever the daemon asks before it does."""
 
 
-async def move_together(
-    rig: Rig, moves: Mapping[str, MoveAbsoluteRequest], execute: Execute
-) -> tuple[CommandReply, ...]:
+async def move_together(rig: Rig, moves: Mapping[str, MoveAbsolute], execute: Execute) -> tuple[CommandReply, ...]:
     """Start absolute moves of several axes together; returns once every drive has proven that it started.
 
     Args:
@@ -311,7 +319,7 @@ async def move_together(
     (line,) = lines
     meeting = Meeting(line.network, frozenset(moves))
 
-    async def take_part(name: str, move: MoveAbsoluteRequest) -> CommandReply | LdcndError:
+    async def take_part(name: str, move: MoveAbsolute) -> CommandReply | LdcndError:
         try:
             return await execute(name, Verb.MOVE_ABSOLUTE, GroupMoveRequest.of(move, meeting))
         except LdcndError as error:

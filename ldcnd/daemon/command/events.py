@@ -11,7 +11,7 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import LdcndError, SessionError
 from ldcnd.log import get_logger
 from ldcnd.messaging.codec import to_json
-from ldcnd.model.events import CommandEvent, EventList, EventsRequest
+from ldcnd.model.events import CommandEvent, EventList, ReadEvents
 
 log = get_logger("events")
 
@@ -100,7 +100,7 @@ class EventLog:
             reason=entry.reason,
         )
 
-    def page(self, request: EventsRequest) -> EventList:
+    def page(self, request: ReadEvents) -> EventList:
         """Return the events that were asked for, as many as one reply takes."""
         self.tell()
         oldest = self._end - len(self._kept)

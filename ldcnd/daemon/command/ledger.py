@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from ldcnd.daemon.axis.state import ActiveCommand
 from ldcnd.errors import CommandIdReused, LdcndError, UnknownCommand
+from ldcnd.model.commands import AxisCommand, CommandReply, Verb
 from ldcnd.model.events import FINAL, CommandStatus
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import Request, Verb
 
 REMEMBERED = 4096
 """So many commands are remembered; those that are not final are never forgotten."""
@@ -30,7 +29,7 @@ class Entry:
     command_id: str
     axis: str
     verb: Verb
-    request: Request
+    request: AxisCommand[CommandReply]
     client: str | None
     login: str | None = None
     status: CommandStatus = CommandStatus.ACCEPTED
@@ -50,7 +49,7 @@ class Ledger:
         self._entries: OrderedDict[str, Entry] = OrderedDict()
         self._changed = changed
 
-    def repeated(self, command_id: str, axis: str, verb: Verb, request: Request) -> Entry | None:
+    def repeated(self, command_id: str, axis: str, verb: Verb, request: AxisCommand[CommandReply]) -> Entry | None:
         """Return the entry that this id has already, or None when it is new.
 
         Raises:
@@ -136,7 +135,7 @@ class Ledger:
                 return
 
 
-def _content(request: Request) -> Request:
+def _content(request: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:
     """Return what a request asks for, without what only proves that it may."""
     proofs = dict.fromkeys(("client", "lease", "sequence", "instance", "not_after"))
     return request.model_copy(update=proofs)

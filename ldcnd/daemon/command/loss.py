@@ -10,9 +10,8 @@ from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.drivers.driver import StopMode
 from ldcnd.log import get_logger
-from ldcnd.model.authority import SHORTEST_LEASE_S
-from ldcnd.model.axes import Moving
-from ldcnd.model.rehearsal import Rehearsal, RehearsalReply, RehearsalRequest
+from ldcnd.model.rig_commands import SHORTEST_LEASE_S, Rehearsal, RehearsalReply, Rehearse
+from ldcnd.model.samples import Moving
 
 log = get_logger("loss")
 
@@ -59,7 +58,7 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> Non
     await axis.bring_to_rest(STOP_MODES[policy])
 
 
-async def rehearse(rig: Rig, request: RehearsalRequest) -> RehearsalReply:
+async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
     """Play a loss; returns once it was played, the axis may still be coming to rest.
 
     Raises:

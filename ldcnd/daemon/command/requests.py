@@ -14,14 +14,11 @@ from ldcnd.log import get_logger
 from ldcnd.messaging.codec import decode, encode, reply_encoding
 from ldcnd.messaging.keys import RIG_ITSELF, Keys
 from ldcnd.messaging.session import Query
+from ldcnd.model.commands import MoveAbsolute, PlanReply, Preview, Stop, StopReply, Verb, Why
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.group_moves import MoveTogetherReply, MoveTogetherRequest
-from ldcnd.model.preview import PlanReply, PlanRequest
-from ldcnd.model.rehearsal import RehearsalRequest
-from ldcnd.model.replies import StopReply
-from ldcnd.model.requests import REQUEST_MODELS, MoveAbsoluteRequest, StopRequest, Verb
+from ldcnd.model.requests import REQUEST_MODELS
+from ldcnd.model.rig_commands import MoveTogether, MoveTogetherReply, Rehearse
 from ldcnd.model.verbs import MOVE_TOGETHER, PLAN, REHEARSE, WHY
-from ldcnd.model.why import WhyRequest
 
 log = get_logger("requests")
 
@@ -92,20 +89,20 @@ class Requests:
         if self._closing:
             raise ShuttingDown("the daemon is stopping", axis=address.axis)
         if address.axis == RIG_ITSELF and address.verb == REHEARSE:
-            rehearsal = decode(RehearsalRequest, query.payload, query.encoding)
+            rehearsal = decode(Rehearse, query.payload, query.encoding)
             self._journal.asked(RIG_ITSELF, REHEARSE, rehearsal)
             return await rehearse(self._rig, rehearsal)
         if address.axis == RIG_ITSELF and address.verb == MOVE_TOGETHER:
-            request = decode(MoveTogetherRequest, query.payload, query.encoding)
+            request = decode(MoveTogether, query.payload, query.encoding)
             self._journal.asked(RIG_ITSELF, MOVE_TOGETHER, request)
             return await self._move_together(request, query.login)
         if address.axis == RIG_ITSELF:
             return self._control.rig.answer(address.verb, query.payload, query.encoding)
         axis = self._rig.axis(address.axis)
         if address.verb == WHY:
-            return self._control.commands.why(axis, decode(WhyRequest, query.payload, query.encoding))
+            return self._control.commands.why(axis, decode(Why, query.payload, query.encoding))
         if address.verb == PLAN:
-            return self._plan(axis, decode(PlanRequest, query.payload, query.encoding))
+            return self._plan(axis, decode(Preview, query.payload, query.encoding))
         try:
             verb = Verb(address.verb)
         except ValueError:
@@ -118,15 +115,15 @@ class Requests:
         self._journal.asked(address.axis, verb, command)
         return await self._control.commands.carry_out(address.axis, verb, command, query.login)
 
-    async def _move_together(self, request: MoveTogetherRequest, login: str | None) -> MoveTogetherReply:
-        moves = {move.axis: MoveAbsoluteRequest(**move.model_dump(exclude={"axis"})) for move in request.moves}
+    async def _move_together(self, request: MoveTogether, login: str | None) -> MoveTogetherReply:
+        moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in request.moves}
         if len(moves) < len(request.moves):
             raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
         replies = await move_together(self._rig, moves, partial(self._control.commands.carry_out, login=login))
         return MoveTogetherReply(replies=replies)
 
-    def _plan(self, axis: AxisService, request: PlanRequest) -> PlanReply:
-        why = self._control.commands.why(axis, WhyRequest(absolute=request.position is not None))
+    def _plan(self, axis: AxisService, request: Preview) -> PlanReply:
+        why = self._control.commands.why(axis, Why(absolute=request.position is not None))
         return axis.preview(request, tuple(cause.text for cause in why.causes))
 
     async def _stop(self, query: Query) -> Frozen:
@@ -173,9 +170,9 @@ class Requests:
     def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
         """Tell in the events who has asked for a stop, as far as that can be read; nothing has waited for this."""
         try:
-            request = decode(StopRequest, query.payload, query.encoding)
+            request = decode(Stop, query.payload, query.encoding)
         except LdcndError:
-            request = StopRequest()
+            request = Stop()
         try:
             self._control.commands.stopped(names, confirmed, request, query.login)
         except Exception:

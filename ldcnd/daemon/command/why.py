@@ -5,8 +5,8 @@ from collections.abc import Callable
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.errors import DriveFault, LdcndError
+from ldcnd.model.commands import Cause, WhyReply
 from ldcnd.model.samples import FaultEntry
-from ldcnd.model.why import Cause, WhyReply
 
 
 def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) -> WhyReply:

@@ -18,9 +18,9 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.log import get_logger
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Declaration, Load, Session
-from ldcnd.model.axes import LinkState
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.plan import RigPlan
+from ldcnd.model.samples import LinkState
 from ldcnd.planning.plan import plan_rig
 from ldcnd.version import version
 

@@ -22,8 +22,8 @@ from ldcnd.daemon.process.reload import Reload, plan_reload
 from ldcnd.daemon.process.systemd import Notifier
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
-from ldcnd.model.axes import LinkState
 from ldcnd.model.plan import RigPlan
+from ldcnd.model.samples import LinkState
 from ldcnd.planning.plan import require_plan
 
 log = get_logger("service")

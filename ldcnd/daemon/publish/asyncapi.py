@@ -8,9 +8,8 @@ import json
 
 from ldcnd.daemon.publish.contract import Channel, Kind, channels
 from ldcnd.messaging.codec import Encoding
-from ldcnd.model.errors import ErrorReply
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.schemas import schema_name
+from ldcnd.model.commands import ErrorReply
+from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.version import version
 
 ASYNCAPI = "3.0.0"

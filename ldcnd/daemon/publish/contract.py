@@ -12,17 +12,15 @@ from types import MappingProxyType
 
 from ldcnd.config import RigConfig
 from ldcnd.messaging.keys import EVENT, RIG_ITSELF, Keys
-from ldcnd.model.axes import AxisInfo
+from ldcnd.model.catalogue import PUBLIC_MODELS
+from ldcnd.model.commands import CommandReply, Stop, StopReply
 from ldcnd.model.events import CommandEvent
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import Frozen, schema_name, schema_text
 from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.meta import BusInfo, CommandList, DaemonInfo
-from ldcnd.model.monitors import MonitorSample
+from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.replies import CommandReply, StopReply
-from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS, StopRequest
-from ldcnd.model.samples import SAMPLE_MODELS
-from ldcnd.model.schemas import PUBLIC_MODELS, schema_name, schema_text
+from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
+from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.model.traces import TraceChunk, TraceHeader
 from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
@@ -122,8 +120,8 @@ def _rig_commands() -> Iterator[Channel]:
 
 def _stops() -> Iterator[Channel]:
     said = "Of the payload, which may be missing or nonsense, `client` is entered into the events."
-    yield _channel(_KEYS.stop(), Kind.STOP, StopReply, StopRequest, f"Stop every axis, and latch. {said}")
-    yield _channel(_KEYS.stop(_AXIS), Kind.STOP, StopReply, StopRequest, f"Stop one axis, and latch. {said}")
+    yield _channel(_KEYS.stop(), Kind.STOP, StopReply, Stop, f"Stop every axis, and latch. {said}")
+    yield _channel(_KEYS.stop(_AXIS), Kind.STOP, StopReply, Stop, f"Stop one axis, and latch. {said}")
 
 
 def _channel(key: str, kind: Kind, sent: type[Frozen], taken: type[Frozen] | None = None, summary: str = "") -> Channel:

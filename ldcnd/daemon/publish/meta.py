@@ -15,15 +15,12 @@ from ldcnd.errors import ErrorCode
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
 from ldcnd.messaging.session import Query
-from ldcnd.model.axes import AxisInfo, RegisterInfo
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.meta import BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo
+from ldcnd.model.commands import CommandReply, Verb
+from ldcnd.model.frozen import Frozen, schema_name
+from ldcnd.model.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo, RegisterInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.replies import CommandReply
 from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.schemas import schema_name
-from ldcnd.model.verb import Verb
 from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
 

@@ -3,11 +3,9 @@
 from ldcnd.messaging.codec import Encoder, Encoding
 from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.session import Qos, Session
-from ldcnd.model.axes import Quality
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.monitors import MonitorName
-from ldcnd.model.samples import Sample, TelemetryItem
+from ldcnd.model.samples import MonitorName, Quality, Sample, TelemetryItem
 from ldcnd.model.traces import TraceChunk, TraceHeader
 
 QOS = {

@@ -16,9 +16,8 @@ from ldcnd.drivers.scaling import Scale
 from ldcnd.drivers.tracer import ArmedTrace, Granted, Progress, Recorded, Tracer, TraceTimedOut, require_channels
 from ldcnd.errors import BusDown, BusError, ValueOutOfRange
 from ldcnd.exchange import Exchange, Timing
-from ldcnd.model.requests import TraceRequest
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.traces import TraceChannel, TracePhase, TraceSource, TraceTrigger, TriggerKind
+from ldcnd.model.traces import TakeTrace, TraceChannel, TracePhase, TraceSource, TraceTrigger, TriggerKind
 
 SIGNAL_LEVEL = 0.5
 """Between the two values of a signal."""
@@ -258,7 +257,7 @@ class HostTracer(Tracer):
         self._require_reachable = require_reachable
         self._capture: HostCapture | None = None
 
-    async def arm(self, request: TraceRequest) -> ArmedTrace:
+    async def arm(self, request: TakeTrace) -> ArmedTrace:
         """See `Tracer`."""
         axis = self._driver.spec.name
         require_channels(axis, request, self.channels)

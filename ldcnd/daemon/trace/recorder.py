@@ -12,10 +12,9 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.tracer import ArmedTrace, Recorded, Tracer, TraceTimedOut
 from ldcnd.errors import BusyTracing, InternalError, LdcndError, NotSupported, OutcomeUnknown, WrongState
 from ldcnd.log import get_logger
-from ldcnd.model.axes import Quality
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import Request, TraceAbortRequest, TraceRequest, Verb
-from ldcnd.model.traces import TraceAbortReply, TraceChunk, TraceHeader, TracePhase, TraceReply
+from ldcnd.model.commands import AxisCommand, CommandReply, Verb
+from ldcnd.model.samples import Quality
+from ldcnd.model.traces import AbortTrace, TakeTrace, TraceAbortReply, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 log = get_logger("trace")
 
@@ -61,7 +60,7 @@ class TraceRecorder:
         """What can be recorded."""
         return self._tracer.channels
 
-    async def carry_out(self, command_id: str, verb: Verb, request: Request) -> CommandReply:
+    async def carry_out(self, command_id: str, verb: Verb, request: AxisCommand[CommandReply]) -> CommandReply:
         """Arm or abort a trace; called by the axis in turn with its other commands.
 
         Raises:
@@ -72,9 +71,9 @@ class TraceRecorder:
             BusError: the line failed.
         """
         match request:
-            case TraceRequest():
+            case TakeTrace():
                 return await self._arm(command_id, request)
-            case TraceAbortRequest():
+            case AbortTrace():
                 return await self._abort(command_id)
             case _:
                 raise NotSupported(f"axis {self._axis}: {verb} is not for traces", axis=self._axis, value=verb.value)
@@ -95,7 +94,7 @@ class TraceRecorder:
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
-    async def _arm(self, command_id: str, request: TraceRequest) -> TraceReply:
+    async def _arm(self, command_id: str, request: TakeTrace) -> TraceReply:
         if self._current:
             raise BusyTracing(
                 f"axis {self._axis}: trace {self._current.header.trace_id} is {self._current.header.phase.value}",

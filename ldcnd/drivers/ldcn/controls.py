@@ -8,7 +8,7 @@ from enum import IntEnum, IntFlag
 
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
-from ldcnd.model.requests import HomeMethod, PinMode
+from ldcnd.model.commands import HomeMethod, PinMode
 
 
 class StopControl(IntFlag):

@@ -18,7 +18,7 @@ from ldcnd.drivers.ldcn.controls import INPUTS
 from ldcnd.drivers.ldcn.packet import Field
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
-from ldcnd.model.axes import Provenance
+from ldcnd.model.meta import Provenance
 
 SERVO_CYCLE_S = 0.000512
 """The servo period at divisor 1; commands are executed at its end whatever the divisor is."""

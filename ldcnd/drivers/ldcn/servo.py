@@ -37,9 +37,9 @@ from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, s
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
 from ldcnd.exchange import Exchange
-from ldcnd.model.requests import HomeMethod, PinMode
+from ldcnd.model.commands import HomeMethod, PinMode, Verb
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.verb import PARAMETER_CAPABILITIES, Verb
+from ldcnd.model.verb import PARAMETER_CAPABILITIES
 
 SOURCES = MappingProxyType(
     {

@@ -22,7 +22,7 @@ from ldcnd.drivers.smartstep.monitors import (
 from ldcnd.drivers.smartstep.network import hears_itself
 from ldcnd.drivers.smartstep.parameters import PN000, unit_number
 from ldcnd.errors import BadReply, BusError, DriveFault
-from ldcnd.model.findings import Finding, Verdict
+from ldcnd.model.health import Finding, Verdict
 
 
 async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:

@@ -15,8 +15,7 @@ from ldcnd.drivers.smartstep.monitors import COUNTERS
 from ldcnd.drivers.smartstep.poller import BASIC_WORDS, Item
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.exchange import Exchange
-from ldcnd.model.monitors import MonitorName
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.samples import MonitorName, TelemetryItem
 
 BAUD = 9600
 COUNTER_WORDS = 3

@@ -36,9 +36,8 @@ from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.trace import SmartStepTracer
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.exchange import Timing
-from ldcnd.model.monitors import MonitorName
-from ldcnd.model.requests import HomeMethod
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.commands import HomeMethod
+from ldcnd.model.samples import MonitorName, TelemetryItem
 from ldcnd.model.verb import PARAMETER_CAPABILITIES, TRACE_CAPABILITIES
 
 

@@ -20,7 +20,7 @@ from typing import ClassVar
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
-from ldcnd.model.monitors import MonitorName
+from ldcnd.model.samples import MonitorName
 
 
 @dataclass(frozen=True, slots=True)

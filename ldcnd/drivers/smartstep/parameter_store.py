@@ -37,8 +37,15 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.log import get_logger
-from ldcnd.model.parameters import AlarmEntry, AssumptionInfo, CounterName, Memory, ParameterInfo, ParameterValue
-from ldcnd.model.requests import WriteParameterRequest
+from ldcnd.model.parameters import (
+    AlarmEntry,
+    AssumptionInfo,
+    CounterName,
+    Memory,
+    ParameterInfo,
+    ParameterValue,
+    WriteParameter,
+)
 
 log = get_logger("smartstep")
 
@@ -106,7 +113,7 @@ class ParameterStore:
                 log.info("parameter not there", axis=self._axis, parameter=parameter.label)
         return tuple(values)
 
-    async def write(self, request: WriteParameterRequest) -> Written:
+    async def write(self, request: WriteParameter) -> Written:
         """Write one parameter; see `ParameterAccess`."""
         parameter = self.find(request.parameter, unlisted=request.unlisted)
         before = await self.read(parameter)
@@ -187,7 +194,7 @@ class ParameterStore:
             )
         self._ledger()
 
-    def _check_unit(self, parameter: Parameter, before: ParameterValue, request: WriteParameterRequest) -> None:
+    def _check_unit(self, parameter: Parameter, before: ParameterValue, request: WriteParameter) -> None:
         """Refuse to change the unit number by the way: after its next power-on the drive has another one."""
         if parameter != PN000:
             return
@@ -285,7 +292,7 @@ class UnitParameters(ParameterAccess):
         """See `ParameterAccess`."""
         return await self._store.read_all()
 
-    async def write(self, request: WriteParameterRequest) -> Written:
+    async def write(self, request: WriteParameter) -> Written:
         """See `ParameterAccess`."""
         return await self._store.write(request)
 

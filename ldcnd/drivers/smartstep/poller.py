@@ -31,8 +31,7 @@ from ldcnd.drivers.smartstep.profiles import SmartStepProfile
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
-from ldcnd.model.monitors import MonitorName
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.samples import MonitorName, TelemetryItem
 
 log = get_logger("smartstep")
 

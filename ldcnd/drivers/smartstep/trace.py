@@ -62,8 +62,7 @@ from ldcnd.drivers.smartstep.words import Words
 from ldcnd.drivers.tracer import ArmedTrace, Granted, Progress, Recorded, Tracer, TraceTimedOut, require_channels
 from ldcnd.errors import BadReply, ByteCountRefused, DriveFault, ReplyTimeout, ValueOutOfRange
 from ldcnd.exchange import Exchange
-from ldcnd.model.requests import TraceRequest
-from ldcnd.model.traces import TracePhase, TraceSource
+from ldcnd.model.traces import TakeTrace, TracePhase, TraceSource
 
 ROUNDS = 4
 """So often a piece is read until two readings agree, and so often the bus's own attempts may fail."""
@@ -171,7 +170,7 @@ class SmartStepTracer(Tracer):
         self._words = words
         self._profile = profile
 
-    async def arm(self, request: TraceRequest) -> ArmedTrace:
+    async def arm(self, request: TakeTrace) -> ArmedTrace:
         """See `Tracer`. Nothing is asked of the drive before everything that it need not say is in order."""
         words, profile = self._words, self._profile
         require_channels(words.axis, request, self.channels)
@@ -212,7 +211,7 @@ class SmartStepTracer(Tracer):
         await enter(self._words, OperatingMode.NORMAL)
         return True
 
-    def _require_possible(self, request: TraceRequest) -> None:
+    def _require_possible(self, request: TakeTrace) -> None:
         """Refuse what no drive of this family can do.
 
         Raises:
@@ -253,7 +252,7 @@ class ArmedSmartStep(ArmedTrace):
         bus: Bus,
         words: Words,
         profile: SmartStepProfile,
-        request: TraceRequest,
+        request: TakeTrace,
         assignment: Assignment,
         settings: Mapping[TraceRegister, int],
         constants: TraceConstants,

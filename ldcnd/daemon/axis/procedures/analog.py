@@ -6,15 +6,14 @@ from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AnalogMotion, AxisReading, StopMode
 from ldcnd.errors import ValueOutOfRange
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import MoveAnalogRequest
+from ldcnd.model.commands import CommandReply, MoveAnalog
+from ldcnd.model.samples import AxisState
 
 
 class AnalogMove(Procedure):
     """One such motion; it ends when the drive says so, and its only step is to stop beyond a software limit."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: MoveAnalogRequest) -> None:
+    def __init__(self, motion: AxisMotion, turn: Turn, request: MoveAnalog) -> None:
         self.turn = turn
         self._motion = motion
         self._request = request

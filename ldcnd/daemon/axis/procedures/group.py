@@ -13,21 +13,20 @@ from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.network import Network
 from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, WrongState
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import MoveAbsoluteRequest
+from ldcnd.model.commands import CommandReply, MoveAbsolute
+from ldcnd.model.samples import AxisState
 
 MEETING_S = 2.0
 """A member that has not got its turn by then keeps the whole group from moving."""
 
 
-class GroupMoveRequest(MoveAbsoluteRequest):
+class GroupMoveRequest(MoveAbsolute):
     """One member's share of a group move; made by the daemon, never read from the network."""
 
     _meeting: "Meeting"
 
     @classmethod
-    def of(cls, move: MoveAbsoluteRequest, meeting: "Meeting") -> "GroupMoveRequest":
+    def of(cls, move: MoveAbsolute, meeting: "Meeting") -> "GroupMoveRequest":
         """Return the share of an axis."""
         request = cls(**move.model_dump())
         request._meeting = meeting

@@ -16,9 +16,8 @@ from ldcnd.drivers.driver import AxisDriver, AxisReading, HomeCapture, StopMode
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.log import get_logger
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import HomeMethod, HomeRequest, HomeStop
+from ldcnd.model.commands import CommandReply, Home, HomeMethod, HomeStop
+from ldcnd.model.samples import AxisState
 
 log = get_logger("axis")
 
@@ -60,7 +59,7 @@ class HomeSearch:
         return self.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
 
 
-def plan_search(config: AxisConfig, driver: AxisDriver, request: HomeRequest) -> HomeSearch:
+def plan_search(config: AxisConfig, driver: AxisDriver, request: Home) -> HomeSearch:
     """Complete a request from the axis's configuration.
 
     Raises:
@@ -120,7 +119,7 @@ class Leg(Enum):
 class HomeSequence(Procedure):
     """One homing, from the request to the reference."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: HomeRequest) -> None:
+    def __init__(self, motion: AxisMotion, turn: Turn, request: Home) -> None:
         self.turn = turn
         self._motion = motion
         self._search = plan_search(motion.config, motion.driver, request)

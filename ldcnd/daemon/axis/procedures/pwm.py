@@ -10,9 +10,8 @@ from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, Motion, PwmOutput, StopMode
 from ldcnd.errors import NotSupported, ValueOutOfRange
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import SetPwmRequest, Verb
+from ldcnd.model.commands import CommandReply, SetPwm, Verb
+from ldcnd.model.samples import AxisState
 
 FULL_DUTY = 255
 """Steps of the duty in one direction on these drives."""
@@ -21,7 +20,7 @@ FULL_DUTY = 255
 class PwmRun(Procedure):
     """One duty, from the request to the stop that ends it."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: SetPwmRequest) -> None:
+    def __init__(self, motion: AxisMotion, turn: Turn, request: SetPwm) -> None:
         self.turn = turn
         self._motion = motion
         self._request = request

@@ -7,9 +7,8 @@ from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.errors import BusError, NotSupported, OutcomeUnknown, TooManyRequests, ValueOutOfRange
-from ldcnd.model.axes import AxisState
-from ldcnd.model.replies import CommandReply
-from ldcnd.model.requests import TrackRequest, Verb
+from ldcnd.model.commands import CommandReply, Track, Verb
+from ldcnd.model.samples import AxisState
 
 IDLE_PERIODS = 5
 SHORTEST_IDLE_S = 0.5
@@ -21,7 +20,7 @@ EARLY = 0.5
 class SetPoint(Procedure):
     """One set-point; it takes the stream over from the one before it."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: TrackRequest, before: Procedure | None) -> None:
+    def __init__(self, motion: AxisMotion, turn: Turn, request: Track, before: Procedure | None) -> None:
         self.turn = turn
         self._motion = motion
         self._request = request
