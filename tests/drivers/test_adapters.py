@@ -165,7 +165,7 @@ async def test_a_homing_that_is_cut_off_leaves_the_axis_at_rest_without_a_refere
 
 async def test_a_halt_and_a_trace_that_are_cut_off_end_and_the_axis_stands():
     async with plugged() as line:
-        await moving(line, "x", 95.0, 40.0)
+        await moving(line, "x", 95.0, 10.0)
         await line.rig.client.command(
             "x", Verb.TRACE, TraceRequest(channels=("position",), interval_s=0.02, samples=200)
         )
