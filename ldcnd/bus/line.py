@@ -9,22 +9,75 @@ follow a request; after any loss the line is fenced and probed (`Fence`) before 
 """
 
 import asyncio
+from enum import Enum
+from typing import Protocol
 
-from ldcnd.bus.exchange_queue import POLL
-from ldcnd.bus.fence import Fence
-from ldcnd.bus.line_phase import Phase
-from ldcnd.bus.pieces import Pieces, Whole
-from ldcnd.bus.resync import Probe, Resync
+from ldcnd.bus.queue import POLL
+from ldcnd.bus.resync import Fence, Probe, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import AT_ONCE, LANES, Turn
-from ldcnd.bus.users import Users
-from ldcnd.bus.watchdog import NEVER_S, Watchdog
-from ldcnd.bus.wire import Wire
-from ldcnd.bus.wire_log import WireEvent, WireLog
+from ldcnd.bus.wire import NEVER_S, Pieces, Watchdog, Whole, Wire
 from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
 from ldcnd.exchange import ReplyVerdict, Timing
 from ldcnd.transport.transport import Transport
+from ldcnd.wirelog.recorder import WireEvent, WireLog
+
+
+class Phase(Enum):
+    """What the line is doing."""
+
+    IDLE = "idle"
+    REPLY = "reply"
+    LINGER = "linger"
+    """A packet that must not be repeated has its reply; a second one would prove that the first was not its own."""
+    QUIET = "quiet"
+    """After a request that draws no reply."""
+    FENCE = "fence"
+    """Waiting for late bytes to stop."""
+    SETTLE = "settle"
+    """The flush is on its way."""
+    CLOSED = "closed"
+
+
+class Users(Protocol):
+    """Whom the line serves: the bus, with its queue and its knowledge of the nodes."""
+
+    def take(self, now_s: float) -> Turn | None:
+        """Remove and return the next turn, or None when nothing is due."""
+
+    def sent(self, turn: Turn) -> None:
+        """Note that a turn that was taken is on the wire."""
+
+    def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
+        """Make ready what can be made ready of the next turn, while there is time.
+
+        Args:
+            turn: on the wire.
+            asked_at_s: when the last bit of its request leaves, in loop time.
+        """
+
+    def next_due_s(self) -> float:
+        """Return when something will be due, in loop time."""
+
+    def stop_waits(self) -> bool:
+        """Tell whether a stop is queued."""
+
+    def failing(self) -> set[int]:
+        """Return the nodes that left their last exchange unanswered."""
+
+    def answered(self, turn: Turn) -> None:
+        """Note that the turn's node replied, or that no reply was due."""
+
+    def missed(self, turn: Turn, now_s: float) -> None:
+        """Note that the turn's node did not reply, before the turn learns of it."""
+
+    def again(self, turn: Turn) -> None:
+        """Give the turn back to the front of its lane."""
+
+    def line_lost(self, reason: str) -> None:
+        """Learn, once, that the line is gone and every turn that was on it has heard of it."""
+
 
 NOT_PLAIN = 0
 """No reply has so few bytes."""

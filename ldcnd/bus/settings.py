@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ldcnd.bus.wire_log import KEPT_BYTES, KEPT_S
+from ldcnd.wirelog.recorder import KEPT_BYTES, KEPT_S
 
 LINGER_S = 0.001
 """The line stays with a packet that must not be repeated for as long as its true reply can come, and so much longer:

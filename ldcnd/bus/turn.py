@@ -4,12 +4,12 @@ import asyncio
 from abc import ABC, abstractmethod
 from typing import Any
 
-from ldcnd.bus.exchange_queue import Lane
-from ldcnd.bus.phase_order import PhaseOrder
+from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.wire_log import AT_ONCE_REMARK
+from ldcnd.bus.queue import Lane
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.wirelog.recorder import AT_ONCE_REMARK
 
 LANES = tuple(lane.name.lower() for lane in Lane)
 """Remarks of the wire log about packets, by lane."""

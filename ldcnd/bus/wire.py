@@ -1,16 +1,161 @@
 """One open transport: its rate, the bytes that pass over it, and the record of them."""
 
 import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from ldcnd.bus.echo import Echo
 from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Turn
-from ldcnd.bus.wire_log import WireEvent, WireLog
 from ldcnd.errors import TransportLost
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.transport.transport import Receiver, Transport
+from ldcnd.wirelog.recorder import WireEvent, WireLog
+
+
+class Echo:
+    """What was sent and has not come back yet."""
+
+    __slots__ = ("_due",)
+
+    def __init__(self) -> None:
+        self._due = bytearray()
+
+    def __bool__(self) -> bool:
+        """Tell whether bytes of ours are still to come back."""
+        return bool(self._due)
+
+    def sent(self, data: bytes) -> None:
+        """Expect these bytes back."""
+        self._due += data
+
+    def strip(self, data: bytes) -> tuple[bytes, bytes] | None:
+        """Take our own bytes off the front, by count: a reply may look exactly like its request.
+
+        Returns:
+            The echo and what follows it; None when what came is not what was sent: nothing is expected back any more.
+        """
+        count = min(len(data), len(self._due))
+        if data[:count] != self._due[:count]:
+            self._due.clear()
+            return None
+        del self._due[:count]
+        return data[:count], data[count:]
+
+    def clear(self) -> None:
+        """Expect nothing back any more."""
+        self._due.clear()
+
+
+CLOCK_TOLERANCE = 0.9
+"""A drive's baud clock may be 3 % fast and a time stamp a little early: bytes count as too early below this share."""
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """As many bytes as make a reply.
+
+    Attributes:
+        reply: these bytes.
+        surplus: what came behind them.
+        early: some came sooner than the wire can carry them.
+    """
+
+    reply: bytes
+    surplus: bytes
+    early: bool
+
+
+class Pieces:
+    """The bytes of a reply so far.
+
+    Attributes:
+        held: these bytes.
+        early: some came sooner than the wire can carry them.
+    """
+
+    __slots__ = ("_byte_s", "_over_s", "early", "held")
+
+    def __init__(self) -> None:
+        self.held = b""
+        self.early = False
+        self._over_s = self._byte_s = 0.0
+
+    def begin(self, sent_at_s: float, request_s: float, byte_s: float) -> None:
+        """Forget what came; wait for the reply to a request.
+
+        Args:
+            sent_at_s: when that was handed over; minus infinity on a line where nothing can come too early.
+            request_s: how long it takes on the wire.
+            byte_s: how long each byte of the reply takes.
+        """
+        self.held, self.early = b"", False
+        self._over_s, self._byte_s = sent_at_s + CLOCK_TOLERANCE * request_s, CLOCK_TOLERANCE * byte_s
+
+    def earliest_s(self, count: int) -> float:
+        """Return the earliest instant at which so many bytes can have come behind the request."""
+        return self._over_s + count * self._byte_s
+
+    def add(self, exchange: Exchange[Any], data: bytes, now_s: float) -> Whole | None:
+        """Add bytes that have just arrived; return the reply once it is whole."""
+        data = self.held + data
+        self.early = self.early or now_s < self.earliest_s(len(data))
+        total = exchange.total_bytes(data) if exchange.total_bytes else exchange.reply_bytes
+        if total is None or len(data) < total:
+            self.held = data
+            return None
+        whole = Whole(data[:total], data[total:], self.early)
+        self.held, self.early = b"", False
+        return whole
+
+
+NEVER_S = float("inf")
+
+
+class Watchdog:
+    """Calls back once the deadline has passed.
+
+    Moving the deadline later costs an assignment: the timer fires at the old time, looks, and sleeps on. So a line
+    that answers in time creates a few timers a second, not one per exchange.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, expired: Callable[[float], None]) -> None:
+        self._loop = loop
+        self._expired = expired
+        self._deadline_s = NEVER_S
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at_s = NEVER_S
+
+    @property
+    def deadline_s(self) -> float:
+        """The deadline, in loop time; infinity when there is none."""
+        return self._deadline_s
+
+    def set(self, at_s: float) -> None:
+        """Move the deadline, in loop time; infinity for none."""
+        self._deadline_s = at_s
+        if at_s < self._timer_at_s:
+            if self._timer:
+                self._timer.cancel()
+            self._timer_at_s = at_s
+            self._timer = self._loop.call_at(at_s, self._look)
+
+    def cancel(self) -> None:
+        """Forget the deadline and the timer."""
+        self._deadline_s = self._timer_at_s = NEVER_S
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
+
+    def _look(self) -> None:
+        self._timer, self._timer_at_s = None, NEVER_S
+        now_s = self._loop.time()
+        if now_s >= self._deadline_s:
+            self._deadline_s = NEVER_S
+            self._expired(now_s)
+        elif self._deadline_s < NEVER_S:
+            self.set(self._deadline_s)
 
 
 class Wire:

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import click
 
-from ldcnd.bus.capture import Capture, CaptureHeader, capture_lines, parse_capture
-from ldcnd.bus.pcapng import encode_pcapng
-from ldcnd.bus.wire_log import WireEvent, WireRecord, parse_records
 from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
 from ldcnd.drivers.transcript import Describe, describer
+from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines, parse_capture
+from ldcnd.wirelog.pcapng import encode_pcapng
+from ldcnd.wirelog.recorder import WireEvent, WireRecord, parse_records
 
 TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
 

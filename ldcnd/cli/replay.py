@@ -5,7 +5,6 @@ from pathlib import Path
 
 import click
 
-from ldcnd.bus.capture import Capture, CaptureHeader, parse_capture
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.process.replay import Played, Take, config_of, play, published_line, virtual_time
 from ldcnd.log import configure_logging
@@ -14,6 +13,7 @@ from ldcnd.messaging.keys import EVENT
 from ldcnd.messaging.session import Sample
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.samples import FaultSample, TelemetryItem
+from ldcnd.wirelog.capture import Capture, CaptureHeader, parse_capture
 
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 

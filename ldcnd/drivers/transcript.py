@@ -7,12 +7,12 @@ an LDCN status packet follows from the requests before it.
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PROFILES, Profile
 from ldcnd.drivers.ldcn.received import DefineStatus, HardReset, PlainCommand, ReadStatus, interpret_bytes
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusFlag, StatusItem, decode_status
 from ldcnd.drivers.smartstep.packet import decode_command, decode_reply
 from ldcnd.errors import BadReply
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 Describe = Callable[[WireRecord], str]
 

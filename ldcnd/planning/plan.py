@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from ldcnd.axis_config import AxisConfig, RatesConfig
-from ldcnd.bus.cost import LineTiming, cost_of
-from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, in_time, largest, plan_line
-from ldcnd.bus.response_times import PeriodicTask
 from ldcnd.bus.settings import ServoCycle
 from ldcnd.bus_config import BAUDS, BusConfig
 from ldcnd.config import RigConfig
@@ -24,6 +21,9 @@ from ldcnd.errors import ConfigError, ValueOutOfRange
 from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigPlan
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning import smartstep as smartstep_plan
+from ldcnd.planning.cost import LineTiming, cost_of
+from ldcnd.planning.line_plan import LinePlan, Poll, Urgent, in_time, largest, plan_line
+from ldcnd.planning.response_times import PeriodicTask
 
 SLOWEST_HZ = 0.01
 

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ldcnd.axis_config import AxisConfig
-from ldcnd.bus.cost import Cost, LineTiming, cost_of
-from ldcnd.bus.poll_plan import Poll, Urgent
 from ldcnd.bus_config import BusConfig
 from ldcnd.drivers.smartstep.costs import BAUD, price_list, words_of
 from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
+from ldcnd.planning.cost import Cost, LineTiming, cost_of
+from ldcnd.planning.line_plan import Poll, Urgent
 
 
 def rates_hz(axis: AxisConfig) -> Mapping[Item, float]:

@@ -9,12 +9,12 @@ from itertools import pairwise, product
 from typing import Literal
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.bus.turn import AT_ONCE, LANES
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating
 from tests.support.rig import RunningRig

@@ -15,12 +15,12 @@ from asyncio.subprocess import PIPE
 
 import structlog
 
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.config import RigConfig
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.messaging.session import Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.bench.report import Row, table
 from tests.support.process import free_port
 

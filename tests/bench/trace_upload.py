@@ -4,7 +4,6 @@ import math
 from itertools import pairwise
 
 from ldcnd.axis_config import AxisConfig, RatesConfig
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.client.traces import take_trace
 from ldcnd.config import RigConfig
 from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
@@ -13,6 +12,7 @@ from ldcnd.drivers.smartstep.trace_data import chunk_plan
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.smartstep.unit import CHARACTER_S
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock
 from tests.support.rig import RunningRig

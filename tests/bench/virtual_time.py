@@ -10,11 +10,11 @@ from itertools import pairwise
 from typing import TypeVar
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.daemon.process.service import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.bench import commands_and_polls, trace_upload
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating, saturating_smartsteps

@@ -6,9 +6,9 @@ import signal
 
 import pytest
 
-from ldcnd.bus.capture import parse_capture
 from ldcnd.config import CapturesConfig, load_config
 from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.wirelog.capture import parse_capture
 from tests.support.captures import FOLDER, replayed
 from tests.support.process import LDCND, answering, free_port
 from tests.support.rig import running_rig

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 
 import ldcnd
-from ldcnd.bus.poll_rank import CHOICE
+from ldcnd.bus.queue import CHOICE
 from ldcnd.config import RigConfig
 from tests.support.rig import running_rig
 

@@ -4,9 +4,9 @@ import asyncio
 from collections import deque
 from itertools import pairwise
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.model.samples import LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.saturated_rig import saturating
 from tests.support.chain_rig import rig_on
 

@@ -6,7 +6,7 @@ from itertools import accumulate, pairwise
 
 import pytest
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.bus.statistics import bucket_limit_s
 from ldcnd.config import load_config
 from ldcnd.daemon.line.smartstep_line import LEDGER_FILE

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.config import load_config
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange

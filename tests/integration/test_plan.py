@@ -8,7 +8,7 @@ import time
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.cli.main import cli
 from ldcnd.config import RigConfig, load_config
 from ldcnd.drivers.ldcn import commands

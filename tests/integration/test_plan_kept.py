@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.config import RigConfig
 from ldcnd.model.plan import BusPlan
 from ldcnd.planning.plan import require_plan

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.errors import MalformedRequest
 from ldcnd.model.commands import MoveAbsolute, Power, Preview, Verb
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
 

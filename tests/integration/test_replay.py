@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.bus.capture import Capture, parse_capture
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.config import load_config
 from ldcnd.daemon.process.replay import config_of
 from ldcnd.errors import ConfigError, MalformedRequest, ReplayDeviation
+from ldcnd.wirelog.capture import Capture, parse_capture
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.support.captures import FOLDER, NAMES, record, replayed
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec, Gains, Motion
 from ldcnd.drivers.ldcn import commands

@@ -7,15 +7,15 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.bus.cost import Cost
-from ldcnd.bus.poll_plan import LinePlan, Poll, Urgent, plan_line
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.smartstep.costs import words_of
 from ldcnd.drivers.smartstep.monitors import OUTPUT_SIGNALS, SPEED_FEEDBACK, WORDS
 from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP
 from ldcnd.model.samples import MonitorName
+from ldcnd.planning.cost import Cost
+from ldcnd.planning.line_plan import LinePlan, Poll, Urgent, plan_line
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import simulated, smartstep_line
 
 VARIANT = SimulatedVariant()

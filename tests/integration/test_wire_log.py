@@ -4,13 +4,13 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent, parse_records
 from ldcnd.bus_config import RecorderConfig
 from ldcnd.client.wire_log import fetch_wire_log
 from ldcnd.config import load_config
 from ldcnd.daemon.capture.flight_recorder import LONGEST_DATA_BYTES
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
+from ldcnd.wirelog.recorder import WireEvent, parse_records
 from tests.support.rig import SIMULATED, running_rig
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.bus.settings import BusSettings
 from ldcnd.errors import BadReply, BusBusy, BusDown, BusError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Exchange

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.driver import AxisSpec, Gains
 from ldcnd.drivers.ldcn.network import RESET_BAUD, LdcnNetwork
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
@@ -15,6 +14,7 @@ from ldcnd.drivers.line import LineSpec
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.transport.transport import Transport
+from ldcnd.wirelog.recorder import WireEvent
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ldcnd.bus.capture import Capture
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.capture.captures import lines_of
@@ -18,6 +17,7 @@ from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
 from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.wirelog.capture import Capture
 
 FOLDER = Path(__file__).parents[1] / "captures"
 NAMES = ("clean_start", "power_loss", "corrupted_line")

@@ -7,7 +7,6 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig
 from ldcnd.daemon.line.line import BusService
@@ -18,6 +17,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.transport.transport import Opener
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig
 
 UP_WITHIN_S = 60.0

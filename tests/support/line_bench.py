@@ -3,15 +3,15 @@
 import asyncio
 from collections import deque
 
-from ldcnd.bus.exchange_queue import Lane
 from ldcnd.bus.line import Line
+from ldcnd.bus.queue import Lane
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Turn
-from ldcnd.bus.wire_log import WireLog
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.wirelog.recorder import WireLog
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, ScriptedLine
 

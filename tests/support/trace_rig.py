@@ -9,7 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 from ldcnd.axis_config import AxisConfig, RatesConfig
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
@@ -22,6 +21,7 @@ from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from ldcnd.smartstep_config import SmartStepUnitConfig
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.process import free_port
 from tests.support.rig import RunningRig, running_rig
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from ldcnd.bus.exchange_queue import LANE_LIMITS, Lane
+from ldcnd.bus.queue import LANE_LIMITS, Lane
 from ldcnd.errors import (
     BusBusy,
     NotSupported,

@@ -4,7 +4,7 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.bus.bus import LONGEST_REOPEN_S
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.errors import (
     BadReply,
     BusDown,

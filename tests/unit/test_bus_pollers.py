@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.bus.mute_nodes import LONGEST_BACKOFF_S
+from ldcnd.bus.bus import LONGEST_BACKOFF_S
 from ldcnd.errors import (
     BadReply,
     PacketRejected,

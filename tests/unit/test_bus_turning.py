@@ -3,9 +3,8 @@
 import asyncio
 
 from ldcnd.bus.bus import LONGEST_OPENING_S, LONGEST_REOPEN_S, Bus
-from ldcnd.bus.exchange_queue import Lane
-from ldcnd.bus.line import LATE_S
-from ldcnd.bus.line_phase import Phase
+from ldcnd.bus.line import LATE_S, Phase
+from ldcnd.bus.queue import Lane
 from ldcnd.errors import TransportLost
 from ldcnd.transport.transport import Transport
 from tests.support import toy_family as toy

@@ -1,8 +1,8 @@
 import pytest
 
-from ldcnd.bus.capture import CaptureHeader, capture_lines, parse_capture
-from ldcnd.bus.wire_log import WireEvent, WireRecord, parse_records
 from ldcnd.errors import MalformedRequest
+from ldcnd.wirelog.capture import CaptureHeader, capture_lines, parse_capture
+from ldcnd.wirelog.recorder import WireEvent, WireRecord, parse_records
 
 HEADER = CaptureHeader(
     version="0.1.0",

@@ -1,8 +1,8 @@
 from structlog.testing import capture_logs
 
-from ldcnd.bus.capture import Capture, parse_capture
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.daemon.capture.captures import CaptureStore
+from ldcnd.wirelog.capture import Capture, parse_capture
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.unit.test_capture import HEADER, RECORDS
 
 

@@ -5,7 +5,6 @@ import math
 
 import pytest
 
-from ldcnd.bus.cost import LineTiming, cost_of
 from ldcnd.bus.settings import LINGER_S
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
@@ -16,6 +15,7 @@ from ldcnd.drivers.smartstep.costs import price_list as smartstep_price_list
 from ldcnd.drivers.smartstep.parameters import PN000
 from ldcnd.exchange import Exchange
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.planning.cost import LineTiming, cost_of
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.module import ModuleSettings
 from ldcnd.sim.line import SimulatedLine, open_simulated_line

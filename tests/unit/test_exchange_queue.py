@@ -3,8 +3,8 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.bus.exchange_queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
 from ldcnd.bus.poller import Poller
+from ldcnd.bus.queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
 from ldcnd.errors import BusBusy
 from tests.support.queue_turns import take
 from tests.support.toy_family import ToyPoller

@@ -2,9 +2,9 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.line_phase import Phase
-from ldcnd.bus.wire_log import WireEvent
+from ldcnd.bus.line import Phase
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support import toy_family as toy
 from tests.support.line_bench import MARGIN_S, REPLY_S, REQUEST_S, Bench, RecordingTurn, settle
 from tests.support.scripted_line import Say

@@ -1,9 +1,8 @@
 import pytest
 
-from ldcnd.bus.exchange_queue import Lane
-from ldcnd.bus.fence import LONGEST_FENCE
-from ldcnd.bus.line_phase import Phase
-from ldcnd.bus.resync import Resync
+from ldcnd.bus.line import Phase
+from ldcnd.bus.queue import Lane
+from ldcnd.bus.resync import LONGEST_FENCE, Resync
 from tests.support import toy_family as toy
 from tests.support.line_bench import BYTE_S, FENCE_S, MARGIN_S, REPLY_S, REQUEST_S, Bench, settle
 from tests.support.scripted_line import Say

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.bus.line_phase import Phase
+from ldcnd.bus.line import Phase
 from ldcnd.bus.settings import LINGER_S
 from tests.support import toy_family as toy
 from tests.support.line_bench import REPLY_S, REQUEST_S, Bench, settle

@@ -2,8 +2,8 @@
 
 import struct
 
-from ldcnd.bus.pcapng import encode_pcapng
-from ldcnd.bus.wire_log import WireEvent, WireRecord
+from ldcnd.wirelog.pcapng import encode_pcapng
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 ZERO_NS = 1_700_000_000_000_000_000
 RECORDS = (

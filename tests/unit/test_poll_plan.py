@@ -5,12 +5,11 @@ import random
 
 import pytest
 
-from ldcnd.bus.cost import Cost
-from ldcnd.bus.exchange_queue import ExchangeQueue
-from ldcnd.bus.poll_plan import Poll, Urgent, largest, plan_line
-from ldcnd.bus.poll_rank import Choose
 from ldcnd.bus.poller import Poller, Priority
-from ldcnd.bus.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
+from ldcnd.bus.queue import Choose, ExchangeQueue
+from ldcnd.planning.cost import Cost
+from ldcnd.planning.line_plan import Poll, Urgent, largest, plan_line
+from ldcnd.planning.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 from tests.support.queue_turns import take
 
 MS = 0.001

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.bus.poll_queue import POLLS_PER_LOWER, PollQueue
-from ldcnd.bus.poll_rank import Choose
 from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority
+from ldcnd.bus.queue import POLLS_PER_LOWER, Choose, PollQueue
 from tests.support.toy_family import ToyPoller
 
 HIGH, NORMAL, LOW = Priority

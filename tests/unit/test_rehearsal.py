@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.bus.cost import Cost
-from ldcnd.bus.rehearsal import Drive, mean_lengths_s
+from ldcnd.planning.cost import Cost
+from ldcnd.planning.simulated_polling import Drive, mean_lengths_s
 from tests.support.polled_chain import BAUD, CYCLE, saturated
 
 BYTE_S = 10 / BAUD

@@ -2,7 +2,6 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import set_operating_mode
 from ldcnd.errors import BusyTracing, OutcomeUnknown, ReplyTimeout, WrongState
@@ -10,6 +9,7 @@ from ldcnd.model.parameters import CounterName
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import simulated, smartstep_line
 
 

@@ -5,7 +5,6 @@ import itertools
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.driver import AxisReading, ReadingListeners
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode
@@ -18,6 +17,7 @@ from ldcnd.errors import NetworkMismatch, NotSupported, WrongState
 from ldcnd.exchange import Timing
 from ldcnd.model.samples import MonitorName, TelemetryItem
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line
 
 

@@ -5,7 +5,6 @@ from contextlib import suppress
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import set_operating_mode
 from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN102, PN202, PN304, PN402
@@ -24,6 +23,7 @@ from ldcnd.errors import (
 from ldcnd.model.parameters import Memory, WriteParameter
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.support.smartstep_line import simulated, smartstep_line
 
 

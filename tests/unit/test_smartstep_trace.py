@@ -4,13 +4,13 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum, TriggerWordSource
 from ldcnd.drivers.smartstep.trace import TraceUpload
 from ldcnd.errors import BadReply, BusError, ByteCountRefused, DriveFault, ValueOutOfRange, WrongState
 from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
+from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import simulated, smartstep_line
 
 RAMP = [(7 * point) & 0xFFFF for point in range(500)]

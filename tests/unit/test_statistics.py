@@ -2,7 +2,7 @@ import random
 
 import pytest
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.bus.statistics import BUCKETS, BusStatistics, LatencyHistogram, bucket_limit_s
 
 

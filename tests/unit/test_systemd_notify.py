@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.axis_config import AxisConfig
-from ldcnd.bus.line_phase import Phase
+from ldcnd.bus.line import Phase
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon

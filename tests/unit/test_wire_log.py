@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.bus.wire_log import RECORD_BYTES, WireEvent, WireLog, WireRecord, parse_record, parse_records
 from ldcnd.errors import MalformedRequest
+from ldcnd.wirelog.recorder import RECORD_BYTES, WireEvent, WireLog, WireRecord, parse_record, parse_records
 
 
 def test_records_come_oldest_first():

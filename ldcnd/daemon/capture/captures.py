@@ -11,8 +11,6 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
-from ldcnd.bus.capture import Capture, CaptureHeader, capture_lines
-from ldcnd.bus.wire_log import WireEntry, WireRecord
 from ldcnd.config import CapturesConfig, RigConfig, ZenohConfig
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
@@ -20,6 +18,8 @@ from ldcnd.drivers.transcript import describer
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.version import version
+from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
+from ldcnd.wirelog.recorder import WireEntry, WireRecord
 
 log = get_logger("captures")
 

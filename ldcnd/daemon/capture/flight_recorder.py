@@ -10,13 +10,13 @@ import json
 from collections.abc import Iterable
 from dataclasses import replace
 
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.messaging.codec import to_json
 from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 PAGE_BYTES = 12_000
 """Text in one reply: with its other fields it stays below what a payload may have."""

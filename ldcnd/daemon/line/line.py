@@ -7,7 +7,6 @@ from typing import Any
 from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, Priority
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.polling import AxisPoller
 from ldcnd.drivers.driver import ReadingListeners, StopMode
@@ -16,6 +15,7 @@ from ldcnd.errors import BusError, LdcndError
 from ldcnd.log import get_logger
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning.plan import wanted_rates_hz
+from ldcnd.wirelog.recorder import WireEvent
 
 log = get_logger("bus")
 

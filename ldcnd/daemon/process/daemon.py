@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 
-from ldcnd.bus.capture import Capture
 from ldcnd.config import RigConfig
 from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
 from ldcnd.daemon.capture.watch import CaptureWatch
@@ -23,6 +22,7 @@ from ldcnd.model.plan import RigPlan
 from ldcnd.model.samples import LinkState
 from ldcnd.planning.plan import plan_rig
 from ldcnd.version import version
+from ldcnd.wirelog.capture import Capture
 
 log = get_logger("daemon")
 

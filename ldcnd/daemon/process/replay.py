@@ -13,9 +13,6 @@ from itertools import pairwise
 
 from pydantic import ValidationError
 
-from ldcnd.bus.capture import Capture, CaptureHeader
-from ldcnd.bus.replay import Replay
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.config import RigConfig
 from ldcnd.daemon.capture.captures import of_one_line
 from ldcnd.daemon.capture.flight_recorder import STOP
@@ -29,6 +26,9 @@ from ldcnd.messaging.session import Qos, Sample, SampleKind
 from ldcnd.model.verbs import ACQUIRE
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.transport.port_url import SOCKET
+from ldcnd.wirelog.capture import Capture, CaptureHeader
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.wirelog.replay import Replay
 
 Take = Callable[[Sample], None]
 """Gets every sample, event and report as it is published."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig

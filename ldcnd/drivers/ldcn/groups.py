@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan

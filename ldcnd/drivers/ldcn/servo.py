@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.drivers import driver
 from ldcnd.drivers.driver import (
     AnalogMotion,

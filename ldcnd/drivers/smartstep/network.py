@@ -14,7 +14,6 @@ from typing import Any
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.drivers.driver import AxisDriver
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.drivers.smartstep import commands
@@ -28,6 +27,7 @@ from ldcnd.errors import DriveFault, NetworkMismatch, ReplyTimeout, TransportLos
 from ldcnd.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.transport.transport import Opener, Receiver, Transport
+from ldcnd.wirelog.recorder import WireEvent
 
 BAUD = 9600
 """The only rate (manual 2.1)."""

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.drivers.smartstep.addresses import OperatingMode, Register, TraceRegister
 from ldcnd.drivers.smartstep.commands import (
     ChecksumPin,

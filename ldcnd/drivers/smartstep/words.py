@@ -6,7 +6,7 @@ Source: manual 2.2 (5) "Status"; 4 "Data setting limit".
 from typing import TypeVar
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.exchange_queue import Lane
+from ldcnd.bus.queue import Lane
 from ldcnd.drivers.smartstep import commands
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import Refusal, RefusalReason

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-from ldcnd.bus.cost import Cost
-from ldcnd.bus.phase_order import PhaseOrder
-from ldcnd.bus.poll_queue import PollQueue
+from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller, next_on_grid
+from ldcnd.bus.queue import PollQueue
 from ldcnd.bus.settings import ServoCycle
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, ReplyVerdict, Timing
+from ldcnd.planning.cost import Cost
 
 LEARNING = 10
 """Polls of each drive on average until its cycle is known."""

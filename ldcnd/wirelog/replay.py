@@ -16,9 +16,9 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Protocol
 
-from ldcnd.bus.wire_log import ARRIVALS, AT_ONCE_REMARK, WireEvent, WireRecord
 from ldcnd.errors import ReplayDeviation, TransportLost
 from ldcnd.transport.transport import Receiver, Transport
+from ldcnd.wirelog.recorder import ARRIVALS, AT_ONCE_REMARK, WireEvent, WireRecord
 
 PATIENCE_S = 1.0
 """The host is given so long for a packet after the instant at which it sent it then; opening may take longer."""

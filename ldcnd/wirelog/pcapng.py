@@ -8,7 +8,7 @@ enhanced packet blocks; link types of tcpdump.org, LINKTYPE_USER0.
 import struct
 from collections.abc import Iterable
 
-from ldcnd.bus.wire_log import WireEvent, WireRecord
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 LINKTYPE_USER0 = 147
 

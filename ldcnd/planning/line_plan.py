@@ -8,10 +8,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from ldcnd.bus.cost import Cost
-from ldcnd.bus.rehearsal import Drive, mean_lengths_s
-from ldcnd.bus.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 from ldcnd.bus.settings import ServoCycle
+from ldcnd.planning.cost import Cost
+from ldcnd.planning.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
+from ldcnd.planning.simulated_polling import Drive, mean_lengths_s
 
 STEPS = 16
 """Halvings of an interval when a largest value is sought: far finer than anything that is measured."""

@@ -13,9 +13,9 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from ldcnd.bus.wire_log import WireRecord, parse_records
 from ldcnd.errors import MalformedRequest
 from ldcnd.model.frozen import Frozen
+from ldcnd.wirelog.recorder import WireRecord, parse_records
 
 TITLE = "# ldcnd wire capture"
 _FACT = re.compile(r"# (\w+): (.+)")

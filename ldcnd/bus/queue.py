@@ -1,0 +1,370 @@
+"""Which exchange goes on the wire next: four lanes and a fairness bound. Pure: knows no clock and no wire."""
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from itertools import count
+from typing import Any, Generic, Protocol, TypeVar
+
+from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority
+from ldcnd.errors import BusBusy
+
+CHOICE = 16
+"""The choice among equals is among so many at most, because looking at each takes time."""
+SHORTEST_ROUND, LONGEST_ROUND = 0.5, 1.5
+"""Turns for which a late poll waits, as shares of how many are late. The longest one keeps the longest gap below two
+mean ones, also when several are passed over.
+"""
+FEW = 4
+"""So many wait for a turn less than that: turns are counted, not seconds, and with few of them chance weighs more."""
+
+Choose = Callable[[Sequence[Poller[Any]], float], Poller[Any]]
+"""Which of several polls to run now, at an instant in loop time; there is always one."""
+
+
+class PollRank:
+    """Polls of one priority that are due; false while there is none. The earliest deadline goes first.
+
+    Where deadlines leave a choice it is somebody else's: among polls with the same deadline, and among those that are
+    late already. These have no deadline to lose, so they take turns: half of them go before one goes again, and who was
+    passed over for `LONGEST_ROUND` rounds goes now.
+    """
+
+    def __init__(self, choose: Choose | None) -> None:
+        self._choose = choose
+        self._turn = 0
+        self._late: list[tuple[int, float, Poller[Any]]] = []  # since which turn, and since when it is due
+        self._due: list[tuple[float, float, int, Poller[Any]]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._due or self._late)
+
+    @property
+    def since_s(self) -> float:
+        """Since when the first one is due."""
+        return self._late[0][1] if self._late else self._due[0][1]
+
+    @property
+    def deadline_s(self) -> float:
+        """The earliest deadline of those that were not late yet when one was last taken."""
+        return self._due[0][0] if self._due else NO_DEADLINE_S
+
+    def is_late(self, now_s: float) -> bool:
+        """Tell whether the deadline of one has passed."""
+        return bool(self._late) or self.deadline_s <= now_s
+
+    def add(self, poller: Poller[Any], at_s: float, serial: int) -> None:
+        """Take a poll that has become due at `at_s`; equal ones go in the order of their serial numbers."""
+        heapq.heappush(self._due, (poller.deadline_at_s, at_s, serial, poller))
+
+    def remove(self, poller: Poller[Any]) -> None:
+        """Forget a poll; unknown ones are ignored."""
+        self._late = [late for late in self._late if late[2] is not poller]
+        self._due = [due for due in self._due if due[3] is not poller]
+        heapq.heapify(self._due)
+
+    def take(self, now_s: float) -> Poller[Any]:
+        """Remove and return the one that goes now."""
+        if self._choose is None:
+            return heapq.heappop(self._due)[3]
+        self._turn += 1
+        while self._due and self._due[0][0] <= now_s:
+            _, at_s, _, poller = heapq.heappop(self._due)
+            self._late.append((self._turn, at_s, poller))
+        return self._take_late(self._choose, now_s) if self._late else self._take_equal(self._choose, now_s)
+
+    def _take_late(self, choose: Choose, now_s: float) -> Poller[Any]:
+        since, _, first = self._late[0]
+        late = len(self._late)
+        if self._turn - since >= LONGEST_ROUND * late - FEW / late:
+            del self._late[0]
+            return first
+        before = self._turn - SHORTEST_ROUND * late
+        among = [poller for turn, _, poller in self._late if turn <= before] or [first]
+        chosen = choose(among, now_s)
+        del self._late[among.index(chosen)]  # both begin with who is late longest
+        return chosen
+
+    def _take_equal(self, choose: Choose, now_s: float) -> Poller[Any]:
+        equal = [heapq.heappop(self._due)]
+        while len(equal) < CHOICE and self._due and self._due[0][0] == equal[0][0]:
+            equal.append(heapq.heappop(self._due))
+        chosen = choose([poller for *_, poller in equal], now_s)
+        for entry in equal:
+            if entry[3] is not chosen:
+                heapq.heappush(self._due, entry)
+        return chosen
+
+
+NORMAL = Priority.NORMAL
+POLLS_PER_LOWER = 16
+"""So many polls may pass a late one of a lower priority before such a one goes. On a line of 31 axes at 19200 baud that
+one priority could fill alone, each of the others is asked every five seconds then, as seldom as a drive that is mute.
+"""
+
+
+class PollQueue:
+    """Pollers, each with its next turn.
+
+    As long as no poll that is due is late, the earliest deadline goes first, whatever the priority. Once one is, the
+    line has fallen behind; until it has caught up, which is when nothing with a deadline is due, the highest priority
+    goes first, and deadlines count within one priority only. That concerns all that are due and not just the late ones:
+    who is only asked once it is late has lost a turn by then.
+
+    A late poll of a lower priority waits for at most `POLLS_PER_LOWER` others for each late one before it.
+
+    Who goes next can be chosen ahead, while the line is busy. As long as the line keeps up, a poll that becomes due
+    meanwhile goes before if its deadline is earlier, so whoever has the earliest one never waits for a choice made too
+    soon.
+
+    Args:
+        choose: who chooses where deadlines leave a choice, see `PollRank`; None for who is due longest.
+    """
+
+    def __init__(self, choose: Choose | None) -> None:
+        self._ranks = tuple(PollRank(choose) for _ in Priority)  # highest first
+        self._only: PollRank | None = self._ranks[NORMAL]  # None once other priorities take part
+        self._later: list[tuple[float, int, Poller[Any]]] = []
+        self._turns: dict[Poller[Any], int] = {}  # those that are valid of `_later`
+        self._due: set[Poller[Any]] = set()
+        self._serial = count()
+        self._behind = False
+        self._passed = 0
+        self._ahead: Poller[Any] | None = None  # who was chosen ahead
+
+    def schedule(self, poller: Poller[Any], at_s: float) -> None:
+        """Let a poller have its next turn at `at_s`; replaces any turn it had."""
+        if poller in self._due or poller is self._ahead:
+            self.unschedule(poller)
+        if poller.priority is not NORMAL:
+            self._only = None
+        serial = self._turns[poller] = next(self._serial)
+        heapq.heappush(self._later, (at_s, serial, poller))
+
+    def unschedule(self, poller: Poller[Any]) -> None:
+        """Forget a poller; unknown ones are ignored."""
+        self._turns.pop(poller, None)
+        if poller is self._ahead:
+            self._ahead = None
+        if poller in self._due:
+            self._due.discard(poller)
+            self._ranks[poller.priority].remove(poller)
+
+    def next_due_s(self) -> float:
+        """Return when the next poller is due; infinity when there is none."""
+        if self._ahead:
+            return self._ahead.due_at_s
+        for rank in self._ranks:
+            if rank:
+                return rank.since_s
+        while self._later and self._turns.get(self._later[0][2]) != self._later[0][1]:
+            heapq.heappop(self._later)
+        return self._later[0][0] if self._later else float("inf")
+
+    def is_due(self, now_s: float) -> bool:
+        """Tell whether there is a poll to run."""
+        if self._ahead:
+            return True
+        self._rank_due(now_s)
+        if self._due:
+            return True
+        self._behind = False
+        return False
+
+    def look_ahead(self, at_s: float) -> Poller[Any] | None:
+        """Choose who of those that are due at about `at_s` goes then; None when nobody is, or one is chosen already."""
+        if self._ahead or not self.is_due(at_s):
+            return None
+        self._ahead = self._take(at_s)
+        return self._ahead
+
+    def take(self, now_s: float) -> Poller[Any]:
+        """Remove and return the poller whose turn it is; one is due."""
+        ahead = self._ahead
+        if ahead and not self._is_overtaken(ahead, now_s):
+            self._ahead = None
+            return ahead
+        return self._take(now_s)
+
+    def _is_overtaken(self, ahead: Poller[Any], now_s: float) -> bool:
+        if self._later and self._later[0][0] <= now_s:
+            self._rank_due(now_s)
+        if (only := self._only) is not None:
+            return only.deadline_s < ahead.deadline_at_s
+        if self._behind:
+            return False
+        return any(rank.deadline_s < ahead.deadline_at_s for rank in self._ranks)
+
+    def _rank_due(self, now_s: float) -> None:
+        while self._later and self._later[0][0] <= now_s:
+            at_s, serial, poller = heapq.heappop(self._later)
+            if self._turns.get(poller) == serial:
+                del self._turns[poller]
+                self._due.add(poller)
+                self._ranks[poller.priority].add(poller, at_s, serial)
+
+    def _take(self, now_s: float) -> Poller[Any]:
+        rank = self._next_rank(now_s) if self._only is None else self._only
+        poller = rank.take(now_s)
+        self._due.discard(poller)
+        return poller
+
+    def _next_rank(self, now_s: float) -> PollRank:
+        """Return the priority whose turn it is."""
+        ranks = [rank for rank in self._ranks if rank]
+        late = [rank for rank in ranks if rank.is_late(now_s)]
+        earliest = min(ranks, key=lambda rank: rank.deadline_s)
+        if late:
+            self._behind = True
+        elif earliest.deadline_s == NO_DEADLINE_S:
+            self._behind = False
+        if not self._behind:
+            return earliest
+        lower = [rank for rank in late if rank is not ranks[0]]
+        self._passed = self._passed + 1 if lower else 0
+        if self._passed <= POLLS_PER_LOWER:
+            return ranks[0]
+        self._passed = 0
+        return min(lower, key=lambda rank: rank.since_s)
+
+
+class Lane(IntEnum):
+    """Priorities, highest first."""
+
+    STOP = 0
+    COMMAND = 1
+    POLL = 2
+    BACKGROUND = 3
+
+
+STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
+
+
+class Queueable(Protocol):
+    """What the queue must know of a job."""
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody waits for this job any more."""
+
+
+JobT = TypeVar("JobT", bound=Queueable)
+
+COMMANDS_PER_POLL = 4
+"""So many commands may pass a due poll before the poll goes."""
+POLLS_PER_BACKGROUND = 8
+"""So many due polls may pass a background job before the job goes."""
+LANE_LIMITS = {Lane.STOP: 256, Lane.COMMAND: 64, Lane.BACKGROUND: 64}
+
+
+class ExchangeQueue(Generic[JobT]):
+    """Jobs of three lanes, first in first out, and the pollers of the fourth, see `PollQueue`.
+
+    A stop goes before everything. Commands go before polls, but a due poll waits for at most `COMMANDS_PER_POLL`
+    commands; background jobs wait for at most `POLLS_PER_BACKGROUND` polls.
+    """
+
+    def __init__(self, choose: Choose | None = None) -> None:
+        self._choose = choose
+        self._polls = PollQueue(choose)
+        self._probe: JobT | None = None
+        self._jobs: dict[Lane, deque[JobT]] = {lane: deque() for lane in LANE_LIMITS}
+        self._commands_in_a_row = 0
+        self._polls_in_a_row = 0
+
+    def push(self, job: JobT, lane: Lane) -> None:
+        """Queue a job behind its lane's others.
+
+        Raises:
+            BusBusy: the lane is full.
+        """
+        waiting = self._jobs[lane]
+        if len(waiting) >= LANE_LIMITS[lane]:
+            waiting = self._jobs[lane] = deque(other for other in waiting if not other.abandoned)
+        if len(waiting) >= LANE_LIMITS[lane]:
+            raise BusBusy(
+                f"{len(waiting)} exchanges wait in the {lane.name.lower()} lane already; nothing was sent",
+                limit=LANE_LIMITS[lane],
+                remedy="send commands more slowly",
+            )
+        waiting.append(job)
+
+    def push_front(self, job: JobT, lane: Lane) -> None:
+        """Give a job that has to be sent again the next turn of its lane."""
+        self._jobs[lane].appendleft(job)
+
+    def takes_probe(self) -> bool:
+        """Tell whether a probe would be alone: no stop waits, and no other probe."""
+        return self._probe is None and not self.stop_waits()
+
+    def push_probe(self, job: JobT) -> None:
+        """Let a job wait as the only stop would: behind every stop and in front of everything else."""
+        self._probe = job
+
+    def waiting(self, lane: Lane) -> list[JobT]:
+        """Return the jobs of a lane, first to go first."""
+        return list(self._jobs[lane])
+
+    def schedule(self, poller: Poller[Any], at_s: float) -> None:
+        """Let a poller have its next turn at `at_s`; replaces any turn it had."""
+        self._polls.schedule(poller, at_s)
+
+    def unschedule(self, poller: Poller[Any]) -> None:
+        """Forget a poller; unknown ones are ignored."""
+        self._polls.unschedule(poller)
+
+    def stop_waits(self) -> bool:
+        """Tell whether a stop is queued that somebody waits for."""
+        return any(not stop.abandoned for stop in self._jobs[Lane.STOP])
+
+    def next_due_s(self) -> float:
+        """Return when the next poller is due; infinity when there is none."""
+        return self._polls.next_due_s()
+
+    def take_job(self, now_s: float) -> JobT | None:
+        """Remove and return the job that goes on the wire now, or None when it is a poll's turn or nothing is due."""
+        if self._probe is None and not any(self._jobs.values()):  # as nearly always, and this is between two packets
+            self._commands_in_a_row = 0
+            return None
+        if stop := self._take_job(STOP):
+            return stop
+        probe, self._probe = self._probe, None
+        if probe and not probe.abandoned:
+            return probe
+        poll_due = self._polls.is_due(now_s)
+        if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (command := self._take_job(COMMAND)):
+            self._commands_in_a_row += 1
+            return command
+        self._commands_in_a_row = 0
+        if not poll_due or self._polls_in_a_row >= POLLS_PER_BACKGROUND:
+            self._polls_in_a_row = 0
+            return self._take_job(BACKGROUND)
+        self._polls_in_a_row += 1
+        return None
+
+    def take_poll(self, now_s: float) -> Poller[Any] | None:
+        """Remove and return the poller whose turn it is when no job goes, or None when none is due."""
+        return self._polls.take(now_s) if self._polls.is_due(now_s) else None
+
+    def look_ahead(self, at_s: float) -> Poller[Any] | None:
+        """Choose the next poll ahead, see `PollQueue`; jobs may still go before it."""
+        return self._polls.look_ahead(at_s)
+
+    def drain(self) -> list[JobT]:
+        """Forget all pollers; remove and return all jobs, stops first."""
+        self._polls = PollQueue(self._choose)
+        drained = [self._probe] if self._probe else []
+        self._probe = None
+        drained += [job for lane in sorted(self._jobs) for job in self._jobs[lane]]
+        for waiting in self._jobs.values():
+            waiting.clear()
+        return drained
+
+    def _take_job(self, lane: Lane) -> JobT | None:
+        waiting = self._jobs[lane]
+        while waiting:
+            job = waiting.popleft()
+            if not job.abandoned:
+                return job
+        return None
