@@ -48,7 +48,7 @@ class SmartStepUnitConfig(Frozen):
     eeprom_write: EepromWrite = EepromWrite.CONFIRM
     """deny forbids it; otherwise EEPROM is written when a request names it."""
     eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
-    """Writes of one parameter until further ones are refused."""
+    """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
     planned_response_s: float = Field(default=0.02, ge=0, le=5)
     """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
     first_character_s: float = Field(default=0.3, gt=0, le=5)

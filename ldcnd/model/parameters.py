@@ -72,6 +72,8 @@ class ParameterValue(Frozen):
     """The value in EEPROM."""
     eeprom_writes: int | None
     """So many times this daemon has written it to EEPROM; null when no ledger is kept."""
+    eeprom_total: int | None = None
+    """EEPROM writes of the drive, all parameters together: this is what its life of 10,000 counts."""
 
     @property
     def differs(self) -> bool:

@@ -22,7 +22,7 @@ from ldcnd.drivers.smartstep.commands import (
 )
 from ldcnd.drivers.smartstep.monitors import SPEED_FEEDBACK
 from ldcnd.drivers.smartstep.packet import Command, Function, Reply, ResponseStatus, checksum
-from ldcnd.drivers.smartstep.parameters import PN100, PN304, unlisted_parameter
+from ldcnd.drivers.smartstep.parameters import PN100, PN304, parameter_at
 from ldcnd.drivers.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
 from ldcnd.errors import BadReply, ValueOutOfRange
 from ldcnd.exchange import ReplyVerdict
@@ -146,8 +146,8 @@ def test_eeprom_write_goes_to_the_parameters_own_address():
     assert write_eeprom(0, PN304, 1000).request == b"W01030403E80D\r"
 
 
-def test_unlisted_parameter_can_be_written_on_purpose():
-    assert write_ram(0, unlisted_parameter(0x003), 1).request[3:7] == b"1003"
+def test_parameter_at_can_be_written_on_purpose():
+    assert write_ram(0, parameter_at(0x003), 1).request[3:7] == b"1003"
 
 
 def test_operating_mode_is_a_closed_list():

@@ -149,6 +149,38 @@ async def test_a_new_unit_number_must_be_confirmed(tmp_path):
     assert drive.drive.memory.writes[PN000.number] == 1
 
 
+@pytest.mark.parametrize("spelling", ["000", "Pn0", "pn000", "0", "Basic switch 1"])
+async def test_no_spelling_of_pn000_goes_round_the_confirmation_of_a_new_unit_number(tmp_path, spelling):
+    drive = simulated(1)
+    async with smartstep_line([drive], ledger=tmp_path / "ledger.json") as line:
+        request = WriteParameter(parameter=spelling, value=0x0300, memory=Memory.EEPROM, unlisted=True)
+
+        with pytest.raises(WrongState, match="unit 3"):
+            await line.axis("u1").parameters.write(request)
+
+    assert drive.drive.memory.stored(PN000) == 0x0100
+
+
+@pytest.mark.parametrize(("unit", "word"), [(2, "u2"), (0, "alone"), (5, "answers")])
+async def test_a_unit_number_that_collides_is_refused_although_confirmed(tmp_path, unit, word):
+    drives = [simulated(1), simulated(2), simulated(5)]
+    async with smartstep_line(drives, numbers=[1, 2], ledger=tmp_path / "ledger.json") as line:
+        with pytest.raises(WrongState, match=word):
+            await line.axis("u1").parameters.write(to_eeprom("Pn000", unit << 8, confirm_unit=unit))
+
+    assert drives[0].drive.memory.stored(PN000) == 0x0100
+
+
+async def test_the_budget_is_that_of_the_eeprom_as_a_whole(tmp_path):
+    async with smartstep_line([simulated(1)], ledger=tmp_path / "ledger.json", budget=2) as line:
+        access = line.axis("u1").parameters
+        await access.write(to_eeprom("Pn100", 90))
+        await access.write(to_eeprom("Pn102", 50))
+
+        with pytest.raises(EepromBudgetSpent, match="2 times"):
+            await access.write(to_eeprom("Pn304", 600))
+
+
 async def test_a_ram_write_of_a_power_cycle_parameter_is_remarked_upon():
     async with smartstep_line([simulated(1)]) as line:
         done = await line.axis("u1").parameters.write(to_ram("Pn202", 8))

@@ -8,8 +8,8 @@ from ldcnd.drivers.smartstep.parameters import (
     Limits,
     digit_of,
     find_parameter,
+    parameter_at,
     unit_number,
-    unlisted_parameter,
     with_digit,
 )
 from ldcnd.drivers.smartstep.profiles import Confidence
@@ -38,10 +38,10 @@ def test_parameters_are_found_by_label_in_any_case():
     assert find_parameter("Pn003") is None
 
 
-def test_unlisted_parameter_stays_in_the_parameter_area():
-    assert unlisted_parameter(0x003).ram_address == 0x1003
+def test_parameter_at_stays_in_the_parameter_area():
+    assert parameter_at(0x003).ram_address == 0x1003
     with pytest.raises(ValueOutOfRange):
-        unlisted_parameter(0x1000)
+        parameter_at(0x1000)
 
 
 def test_digits_count_from_the_right():

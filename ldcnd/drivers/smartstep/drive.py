@@ -6,6 +6,7 @@ Source: manual, introduction ("Omission": no command enables, moves, or resets);
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 from ldcnd.bus.bus import Bus
@@ -63,7 +64,14 @@ class UnitSpec:
 class SmartStepAxis(ReadOnlyAxis):
     """A drive at one unit number."""
 
-    def __init__(self, spec: UnitSpec, bus: Bus) -> None:
+    def __init__(self, spec: UnitSpec, bus: Bus, others: Mapping[int, str] = MappingProxyType({})) -> None:
+        """Prepare the axis; asks nothing.
+
+        Args:
+            spec: what the configuration says.
+            bus: the owner of its line.
+            others: the other axes of the line, by unit number.
+        """
         self.spec = spec.axis
         self.profile = spec.profile
         self.identity: str | None = None
@@ -72,7 +80,7 @@ class SmartStepAxis(ReadOnlyAxis):
         self.home_methods: frozenset[HomeMethod] = frozenset()
         self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
         self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
-        self._parameters = UnitParameters(self.words, spec.profile, spec.eeprom, self._cleared)
+        self._parameters = UnitParameters(self.words, spec.profile, spec.eeprom, others, self._cleared)
         self.tracer = SmartStepTracer(bus, self.words, spec.profile)
         self._rates_hz = spec.rates_hz
         self._bus = bus

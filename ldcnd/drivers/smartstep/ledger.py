@@ -1,4 +1,4 @@
-"""How often each parameter was written to EEPROM, kept on disk: the memory endures 10,000 writes.
+"""How often the EEPROM of each drive was written, kept on disk: as a whole it endures 10,000 writes.
 
 A write is entered before it is sent and taken back only when the drive has proven that it did not carry it out, so a
 crash in between makes the count too high, never too low.
@@ -20,7 +20,10 @@ WARNING_WRITES = 1000
 
 
 class EepromLedger:
-    """The counts of one rig, by axis and parameter; an axis stands for its drive."""
+    """The counts of one rig, by axis and parameter; an axis stands for its drive.
+
+    Counts of single parameters say where the writes went; the budget is that of the whole memory (manual 2.2, note).
+    """
 
     def __init__(self, path: Path) -> None:
         """Take up the ledger that is there, or begin an empty one.
@@ -44,18 +47,18 @@ class EepromLedger:
         """Count a write that is about to be sent; it is on disk when this returns.
 
         Raises:
-            EepromBudgetSpent: the parameter has had its share.
+            EepromBudgetSpent: the drive's EEPROM has taken as many writes as it may.
         """
-        writes = self.writes(axis, parameter)
-        if writes >= budget:
+        total = self.total(axis)
+        if total >= budget:
             raise EepromBudgetSpent(
-                f"axis {axis}: {parameter} was written to EEPROM {writes} times; the budget is {budget}",
+                f"axis {axis}: its EEPROM was written {total} times, all parameters together; the budget is {budget}",
                 axis=axis,
-                value=writes,
+                value=total,
                 limit=budget,
                 remedy=f"write RAM, or raise eeprom_budget (the memory endures {EEPROM_LIFE} writes)",
             )
-        await self._set(axis, parameter, writes + 1)
+        await self._set(axis, parameter, self.writes(axis, parameter) + 1)
 
     async def take_back(self, axis: str, parameter: str) -> None:
         """Forget a write that the drive has not carried out."""

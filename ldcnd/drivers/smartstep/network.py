@@ -139,7 +139,11 @@ class SmartStepNetwork(Network):
 
     def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...]) -> None:
         self._bus = bus
-        self._units = {spec.axis.address: SmartStepAxis(spec, bus) for spec in specs}
+        names = {spec.axis.address: spec.axis.name for spec in specs}
+        self._units = {
+            number: SmartStepAxis(spec, bus, {other: name for other, name in names.items() if other != number})
+            for number, spec in ((spec.axis.address, spec) for spec in specs)
+        }
         self._answering: list[int] = []
         self.axes: Mapping[str, AxisDriver] = {unit.spec.name: unit for unit in self._units.values()}
         self.resync = Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=self._probe)

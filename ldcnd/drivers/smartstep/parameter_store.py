@@ -6,8 +6,9 @@ be sent again.
 Source: manual 2.2, note on EEPROM; 3.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from ldcnd.drivers.parameter_access import ParameterAccess, Written
 from ldcnd.drivers.smartstep.addresses import Register
@@ -21,7 +22,6 @@ from ldcnd.drivers.smartstep.parameters import (
     Parameter,
     find_parameter,
     unit_number,
-    unlisted_parameter,
 )
 from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile, assumption_info
 from ldcnd.drivers.smartstep.words import Words
@@ -60,7 +60,7 @@ class EepromRules:
 
     Attributes:
         ledger: where writes are counted; without one there are none.
-        budget: writes of one parameter, up to 10,000.
+        budget: writes of the drive's EEPROM, all parameters together, up to 10,000.
     """
 
     ledger: EepromLedger | None = None
@@ -70,10 +70,25 @@ class EepromRules:
 class ParameterStore:
     """The parameters of one drive; one call at a time."""
 
-    def __init__(self, words: Words, profile: SmartStepProfile, rules: EepromRules) -> None:
+    def __init__(
+        self,
+        words: Words,
+        profile: SmartStepProfile,
+        rules: EepromRules,
+        others: Mapping[int, str] = MappingProxyType({}),
+    ) -> None:
+        """Prepare the access; asks nothing.
+
+        Args:
+            words: the drive.
+            profile: how it is taken to behave.
+            rules: when EEPROM may be written.
+            others: the other axes of its line, by unit number.
+        """
         self._words = words
         self._profile = profile
         self._rules = rules
+        self._others = others
 
     @property
     def _axis(self) -> str:
@@ -85,12 +100,9 @@ class ParameterStore:
         Raises:
             ValueOutOfRange: there is none, or the manual does not list it and that was not asked for.
         """
-        listed = find_parameter(text) or next((each for each in PARAMETERS if each.name.lower() == text.lower()), None)
-        if listed:
-            return listed
-        digits = text.lower().removeprefix("pn")
-        if unlisted and digits and not digits.strip("0123456789abcdef"):
-            return unlisted_parameter(int(digits, 16))
+        found = find_parameter(text)
+        if found and (unlisted or found in PARAMETERS):
+            return found
         raise ValueOutOfRange(
             f"axis {self._axis}: the manual lists no parameter {text!r}",
             axis=self._axis,
@@ -117,7 +129,7 @@ class ParameterStore:
         """Write one parameter; see `ParameterAccess`."""
         parameter = self.find(request.parameter, unlisted=request.unlisted)
         before = await self.read(parameter)
-        self._check_unit(parameter, before, request)
+        await self._check_unit(parameter, before, request)
         if request.memory is Memory.RAM:
             if before.active == request.value:
                 return Written(before, written=False)
@@ -194,9 +206,9 @@ class ParameterStore:
             )
         self._ledger()
 
-    def _check_unit(self, parameter: Parameter, before: ParameterValue, request: WriteParameter) -> None:
-        """Refuse to change the unit number by the way: after its next power-on the drive has another one."""
-        if parameter != PN000:
+    async def _check_unit(self, parameter: Parameter, before: ParameterValue, request: WriteParameter) -> None:
+        """Refuse to change the unit number by the way, or to one that is taken (manual 2.2 (6))."""
+        if parameter.number != PN000.number:
             return
         unit = unit_number(request.value)
         if unit == unit_number(before.stored if request.memory is Memory.EEPROM else before.active):
@@ -215,6 +227,25 @@ class ParameterStore:
                 value=request.value,
                 remedy=f"send confirm_unit {unit}, and change the configuration before the power cycle",
             )
+        await self._require_free(unit)
+
+    async def _require_free(self, unit: int) -> None:
+        """Refuse a unit number that another drive of the line has, or that would make this one jam the others.
+
+        Raises:
+            WrongState: the number is taken, configured or not; or it is 0 and the drive is not alone on its line.
+        """
+        if unit == 0 and self._others:
+            reason = "a drive with unit number 0 never releases its transmitter, so it must be alone on its line"
+        elif unit in self._others:
+            reason = f"unit number {unit} is that of axis {self._others[unit]}"
+        elif unit != self._words.unit and await self._words.answers(unit):
+            reason = f"a drive answers to unit number {unit} on this line, although no axis is configured for it"
+        else:
+            return
+        raise WrongState(
+            f"axis {self._axis}: {reason}", axis=self._axis, value=unit, remedy="choose a free unit number"
+        )
 
     # -- results -----------------------------------------------------------------------------------------------------
 
@@ -226,15 +257,16 @@ class ParameterStore:
             active=active,
             stored=stored,
             eeprom_writes=ledger.writes(self._axis, parameter.label) if ledger else None,
+            eeprom_total=ledger.total(self._axis) if ledger else None,
         )
 
     def _remarks(self, parameter: Parameter, value: ParameterValue, memory: Memory) -> tuple[str, ...]:
         remarks = list(_pending(parameter, value))
         if memory is Memory.RAM and parameter.power_cycle and parameter.power_cycle.value:
             remarks = [f"{parameter.label} is said to be taken over at power-on, when RAM is lost: write EEPROM"]
-        if memory is Memory.EEPROM and (value.eeprom_writes or 0) >= WARNING_WRITES:
-            remarks.append(f"{value.eeprom_writes} of {EEPROM_LIFE} EEPROM writes are spent")
-            log.warning("EEPROM wears", axis=self._axis, parameter=parameter.label, writes=value.eeprom_writes)
+        if memory is Memory.EEPROM and (value.eeprom_total or 0) >= WARNING_WRITES:
+            remarks.append(f"{value.eeprom_total} of {EEPROM_LIFE} EEPROM writes are spent")
+            log.warning("EEPROM wears", axis=self._axis, parameter=parameter.label, writes=value.eeprom_total)
         return tuple(remarks)
 
 
@@ -268,11 +300,16 @@ class UnitParameters(ParameterAccess):
     """See `ParameterAccess`."""
 
     def __init__(
-        self, words: Words, profile: SmartStepProfile, eeprom: EepromRules, cleared: Callable[[], None]
+        self,
+        words: Words,
+        profile: SmartStepProfile,
+        eeprom: EepromRules,
+        others: Mapping[int, str],
+        cleared: Callable[[], None],
     ) -> None:
         self._words = words
         self._profile = profile
-        self._store = ParameterStore(words, profile, eeprom)
+        self._store = ParameterStore(words, profile, eeprom, others)
         self._cleared = cleared
 
     @property

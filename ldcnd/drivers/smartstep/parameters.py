@@ -13,6 +13,8 @@ from ldcnd.drivers.smartstep.profiles import Confidence
 from ldcnd.errors import ValueOutOfRange
 
 ValueT = TypeVar("ValueT")
+LONGEST_NUMBER = 3
+"""Hexadecimal digits of a parameter number."""
 UNIT_DIGIT = 2
 """The unit number is Pn000.2: digits count from the right (INFERRED_HIGH)."""
 
@@ -70,23 +72,28 @@ class Parameter:
         return self.number + RAM_OFFSET
 
 
-def unlisted_parameter(number: int) -> Parameter:
-    """Return a parameter that the manual does not list: an explicit step for who really means it.
+def parameter_at(number: int) -> Parameter:
+    """Return the parameter with this number, 0 to FFFH: the listed one, or one without a name.
 
-    Args:
-        number: 0 to FFFH.
+    The only way to a `Parameter` that is not in the table, so a listed number never comes without what is known of it.
 
     Raises:
         ValueOutOfRange: the number is outside the parameter area.
     """
     if number not in EEPROM_AREA:
         raise ValueOutOfRange(f"parameter number {number:X}H is not 0 to FFFH", value=number, limit=EEPROM_AREA[-1])
-    return Parameter(number, "")
+    return _BY_NUMBER.get(number) or Parameter(number, "")
 
 
-def find_parameter(label: str) -> Parameter | None:
-    """Return the listed parameter with this label, such as Pn100, in any case; None when there is none."""
-    return next((parameter for parameter in PARAMETERS if parameter.label.lower() == label.lower()), None)
+def find_parameter(text: str) -> Parameter | None:
+    """Return what a number (Pn100, pn10a, 100, Pn0) or the manual's name stands for, in any case; None for neither."""
+    named = next((parameter for parameter in PARAMETERS if parameter.name.lower() == text.lower()), None)
+    if named:
+        return named
+    digits = text.lower().removeprefix("pn")
+    if not digits or digits.strip("0123456789abcdef") or len(digits.lstrip("0")) > LONGEST_NUMBER:
+        return None
+    return parameter_at(int(digits, 16))
 
 
 def digit_of(word: int, digit: int) -> int:
@@ -203,3 +210,4 @@ PARAMETERS: tuple[Parameter, ...] = (
     PN600,
 )
 """In the manual's order."""
+_BY_NUMBER = {parameter.number: parameter for parameter in PARAMETERS}

@@ -92,6 +92,14 @@ class Words:
             raise drive_error(self.axis, answer, mode)
         return answer
 
+    async def answers(self, unit: int) -> bool:
+        """Tell whether any drive of the line has this unit number; what it asks changes nothing."""
+        try:
+            await self._bus.execute(commands.with_response_time(commands.probe(unit), self._profile), Lane.COMMAND)
+        except ReplyTimeout:
+            return False
+        return True
+
     async def read(self, address: int) -> int:
         """Read one word.
 
