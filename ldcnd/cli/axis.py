@@ -23,7 +23,15 @@ from ldcnd.model.commands import (
     Verb,
 )
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.parameters import AlarmReport, ClearCounter, CounterName, DriveProfile, ReadAlarms, ReadProfile
+from ldcnd.model.parameters import (
+    AlarmReport,
+    ClearCounter,
+    CounterName,
+    CounterReply,
+    DriveProfile,
+    ReadAlarms,
+    ReadProfile,
+)
 from ldcnd.model.samples import (
     AdcSample,
     FaultSample,
@@ -209,7 +217,7 @@ def alarms(target: Target, axis: str) -> None:
     reply = target.run(lambda client: client.command(axis, Verb.READ_ALARMS, ReadAlarms(), timeout_s=30.0))
     if not isinstance(reply, AlarmReport):
         raise NotSupported(f"axis {axis} keeps no alarms", axis=axis)
-    past = "".join(f"\n  {entry.code:04X}H {entry.text}" for entry in reply.history)
+    past = "".join(f"\n  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
     target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}{past}")
 
 
@@ -218,8 +226,13 @@ def alarms(target: Target, axis: str) -> None:
 @click.argument("counter", type=click.Choice([name.value for name in CounterName]))
 @with_target
 def clear_counter(target: Target, axis: str, counter: str) -> None:
-    """Set a pulse counter of AXIS to 0; its motor must stand."""
-    _send(target, axis, Verb.CLEAR_COUNTER, ClearCounter(counter=CounterName(counter)))
+    """Set a pulse counter of AXIS to 0; command pulses must be stopped, and the motor must stand."""
+    request = ClearCounter(counter=CounterName(counter))
+    reply = target.run(lambda client: client.command(axis, Verb.CLEAR_COUNTER, request, timeout_s=30.0))
+    if not isinstance(reply, CounterReply):
+        raise NotSupported(f"axis {axis} has no pulse counters", axis=axis)
+    remarks = "".join(f"; {remark}" for remark in reply.remarks)
+    target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
 
 
 def _send(target: Target, axis: str, verb: Verb, request: AxisCommand[CommandReply], *, wait: bool = False) -> None:

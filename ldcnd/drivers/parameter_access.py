@@ -28,6 +28,19 @@ class Written:
     remarks: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class ClearedCounter:
+    """What became of a counter clear.
+
+    Attributes:
+        value: what it counts now, signed.
+        remarks: what deserves a look.
+    """
+
+    value: int
+    remarks: tuple[str, ...] = ()
+
+
 class ParameterAccess(ABC):
     """The parameters of one drive; one call at a time.
 
@@ -63,11 +76,11 @@ class ParameterAccess(ABC):
         """
 
     @abstractmethod
-    async def clear_counter(self, counter: CounterName) -> int:
-        """Set a pulse counter to 0 and return what it counts then.
+    async def clear_counter(self, counter: CounterName) -> ClearedCounter:
+        """Set a pulse counter to 0 and read it.
 
         Raises:
-            WrongState: the motor turns, or the drive is busy.
+            WrongState: command pulses come in, the motor turns, or the drive is busy.
         """
 
     @abstractmethod

@@ -105,7 +105,9 @@ class CounterReply(CommandReply):
     counter: CounterName
     """Which."""
     value: int
-    """What it counts now, signed; near 0 unless pulses come in."""
+    """What it counts now, signed; 0 unless pulses have come in since."""
+    remarks: tuple[str, ...] = ()
+    """What deserves attention."""
 
 
 class AlarmEntry(Frozen):
@@ -210,7 +212,7 @@ class WriteParameter(AxisCommand[ParameterReply]):
 
 
 class ClearCounter(AxisCommand[CounterReply]):
-    """Set a pulse counter to 0; the motor must stand."""
+    """Set a pulse counter to 0; command pulses must be stopped, and for the feedback counter the motor must stand."""
 
     verb = Verb.CLEAR_COUNTER
     capability = Capability.PARAMETERS

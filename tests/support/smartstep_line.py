@@ -1,7 +1,7 @@
 """A simulated SmartStep line under the real bus, without a daemon."""
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +9,11 @@ from pathlib import Path
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec
+from ldcnd.drivers.smartstep.addresses import NEVER_VALID
 from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger
 from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
+from ldcnd.drivers.smartstep.packet import decode_command
 from ldcnd.drivers.smartstep.parameter_store import EepromRules
 from ldcnd.drivers.smartstep.parameters import PN000, Parameter
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile, Wiring
@@ -27,6 +29,48 @@ def simulated(
 ) -> SimulatedUnit:
     """Return a drive with this unit number."""
     return SimulatedUnit(variant, {PN000: number << 8, **(stored or {})})
+
+
+class LosingUnit(SimulatedUnit):
+    """A drive whose line loses what a test names.
+
+    Attributes:
+        commands: the intact commands that were sent to it, lost ones among them.
+    """
+
+    def __init__(
+        self, number: int, losses: Callable[[int, bytes], str | None], variant: SimulatedVariant | None = None
+    ) -> None:
+        """Return a drive with this unit number.
+
+        Args:
+            number: its unit number.
+            losses: says for the place of a command, from 0, and the command itself what gets lost: "request", "reply",
+                or None.
+            variant: how the drive behaves.
+        """
+        super().__init__(variant, {PN000: number << 8})
+        self.commands: list[bytes] = []
+        self._losses = losses
+
+    def _obey(self, packet: bytes, at_s: float) -> None:
+        command = decode_command(packet)
+        if command is None or command.address == NEVER_VALID:
+            super()._obey(packet, at_s)
+            return
+        lost = self._losses(len(self.commands), packet)
+        self.commands.append(packet)
+        if lost == "request":
+            return
+        super()._obey(packet, at_s)
+        if lost == "reply":
+            self._pending = None
+
+
+def losing_once(number: int, start: bytes, *lost: str, variant: SimulatedVariant | None = None) -> LosingUnit:
+    """Return a drive for which the first commands that begin like this lose their requests or replies, one by one."""
+    left = list(lost)
+    return LosingUnit(number, lambda _, packet: left.pop(0) if packet.startswith(start) and left else None, variant)
 
 
 @dataclass(frozen=True, slots=True)

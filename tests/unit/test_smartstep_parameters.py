@@ -2,10 +2,12 @@ import pytest
 
 from ldcnd.drivers.smartstep.parameters import (
     PARAMETERS,
+    PN000,
     PN10A,
     PN100,
     Fact,
     Limits,
+    Parameter,
     digit_of,
     find_parameter,
     parameter_at,
@@ -35,7 +37,9 @@ def test_range_of_the_manuals_example_ends_at_2000():
 
 def test_parameters_are_found_by_label_in_any_case():
     assert find_parameter("pn10a") is PN10A
-    assert find_parameter("Pn003") is None
+    assert find_parameter("Pn0") is find_parameter("basic SWITCH 1") is PN000
+    assert find_parameter("Pn003") == Parameter(0x003, "")
+    assert find_parameter("speed") is None
 
 
 def test_parameter_at_stays_in_the_parameter_area():

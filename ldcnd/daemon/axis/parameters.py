@@ -54,8 +54,15 @@ class Parameters:
                     remarks=done.remarks,
                 )
             case ClearCounter(counter=counter):
-                count = await access.clear_counter(counter)
-                return CounterReply(command_id=command_id, axis=axis, verb=verb, counter=counter, value=count)
+                cleared = await access.clear_counter(counter)
+                return CounterReply(
+                    command_id=command_id,
+                    axis=axis,
+                    verb=verb,
+                    counter=counter,
+                    value=cleared.value,
+                    remarks=cleared.remarks,
+                )
             case _:
                 return await self._told(command_id, verb)
 

@@ -17,13 +17,14 @@ from ldcnd.bus.resync import Resync
 from ldcnd.drivers.driver import AxisDriver
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.drivers.smartstep import commands
-from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
+from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
+from ldcnd.drivers.smartstep.modes import end_mode
 from ldcnd.drivers.smartstep.monitors import DriverType, FunctionSwitch, function_switches
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, ReplyReader, add_parity, strip_parity
 from ldcnd.drivers.smartstep.parameters import PN000, PN100, unit_number
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile
-from ldcnd.errors import DriveFault, NetworkMismatch, ReplyTimeout, TransportLost
+from ldcnd.errors import DriveFault, NetworkMismatch, ReplyTimeout, TransportLost, WrongState
 from ldcnd.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.transport.transport import Opener, Receiver, Transport
@@ -205,9 +206,15 @@ class SmartStepNetwork(Network):
         unit.identified(type_word, await words.read(Register.SOFTWARE_VERSION))
         if type_word != DriverType.R7D_AP:
             remarks.append(f"{who}: driver type {type_word:04X}H is not one that the manual lists")
-        mode = await words.mode()
-        if mode != OperatingMode.NORMAL:
-            remarks.append(f"{who}: was left in operating mode {mode:04X}H")
+        try:
+            ended = await end_mode(words)
+        except WrongState as error:
+            remarks.append(f"{who}: {error.message}")
+        else:
+            if ended:
+                remarks.append(
+                    f"{who}: was left in operating mode {ended:04X}H by another host; it is in its normal mode now"
+                )
         stored = unit_number(await words.read(PN000.eeprom_address))
         if stored != unit.spec.address:
             remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from ldcnd.drivers.parameter_access import ParameterAccess, Written
+from ldcnd.drivers.parameter_access import ClearedCounter, ParameterAccess, Written
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import write_eeprom, write_ram
 from ldcnd.drivers.smartstep.ledger import EEPROM_LIFE, WARNING_WRITES, EepromLedger
@@ -333,11 +333,11 @@ class UnitParameters(ParameterAccess):
         """See `ParameterAccess`."""
         return await self._store.write(request)
 
-    async def clear_counter(self, counter: CounterName) -> int:
+    async def clear_counter(self, counter: CounterName) -> ClearedCounter:
         """See `ParameterAccess`."""
-        value = await clear_counter(self._words, COUNTERS[counter])
+        cleared = await clear_counter(self._words, COUNTERS[counter])
         self._cleared()
-        return value
+        return ClearedCounter(cleared.value, cleared.remarks)
 
     async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
         """See `ParameterAccess`."""

@@ -29,7 +29,7 @@ from ldcnd.drivers.smartstep.commands import (
     string_reference,
     write_trace_register,
 )
-from ldcnd.drivers.smartstep.modes import enter, execute_once, leave, require_idle
+from ldcnd.drivers.smartstep.modes import end_mode, enter, execute_mode, leave, require_idle
 from ldcnd.drivers.smartstep.parameters import PN202, PN203
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile, StringChecksum, TriggerWordSource
 from ldcnd.drivers.smartstep.trace_data import (
@@ -198,7 +198,7 @@ class SmartStepTracer(Tracer):
         armed = ArmedSmartStep(self._bus, words, profile, request, assignment, settings, constants, condition.source)
         try:
             await enter(words, OperatingMode.DATA_TRACE)
-            await execute_once(words)
+            await execute_mode(words, OperatingMode.DATA_TRACE)
         except BaseException:
             await leave(words)
             raise
@@ -206,10 +206,7 @@ class SmartStepTracer(Tracer):
 
     async def disarm(self) -> bool:
         """See `Tracer`."""
-        if await self._words.mode() != OperatingMode.DATA_TRACE:
-            return False
-        await enter(self._words, OperatingMode.NORMAL)
-        return True
+        return await end_mode(self._words) is not None
 
     def _require_possible(self, request: TakeTrace) -> None:
         """Refuse what no drive of this family can do.
