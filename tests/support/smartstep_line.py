@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from ldcnd.bus.bus import Bus
@@ -71,6 +72,16 @@ def losing_once(number: int, start: bytes, *lost: str, variant: SimulatedVariant
     """Return a drive for which the first commands that begin like this lose their requests or replies, one by one."""
     left = list(lost)
     return LosingUnit(number, lambda _, packet: left.pop(0) if packet.startswith(start) and left else None, variant)
+
+
+def executes_in_a_fresh_mode_only(sent: Sequence[bytes]) -> bool:
+    """Tell whether the mode of unit 1 was left and entered again between any two executes among these packets."""
+    executes = [place for place, data in enumerate(sent) if data.startswith(b"W112001")]
+    for earlier, later in pairwise(executes):
+        modes = [data[7:11] for data in sent[earlier:later] if data.startswith(b"W112000")]
+        if not modes or modes[0] != b"0000" or modes[-1] == b"0000":
+            return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,4 @@
 import asyncio
-from itertools import pairwise
 
 import pytest
 
@@ -12,7 +11,7 @@ from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from ldcnd.wirelog.recorder import WireEvent
-from tests.support.smartstep_line import losing_once, simulated, smartstep_line
+from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
 
 
 def turned(variant: SimulatedVariant | None = None) -> SimulatedUnit:
@@ -150,9 +149,5 @@ async def test_a_bad_line_leaves_no_mode_armed_and_executes_in_a_fresh_mode_only
         sent = [record.data for record in line.bus.wire_log.records() if record.event is WireEvent.SENT]
 
     assert value is None or value.value == 0
-    executes = [place for place, data in enumerate(sent) if data.startswith(b"W112001")]
-    for earlier, later in pairwise(executes):
-        modes = [data[7:11] for data in sent[earlier:later] if data.startswith(b"W112000")]
-        assert modes[0] == b"0000"
-        assert modes[-1] == b"2004"
+    assert executes_in_a_fresh_mode_only(sent)
     assert unit.drive.mode is OperatingMode.NORMAL
