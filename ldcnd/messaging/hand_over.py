@@ -4,7 +4,7 @@ import asyncio
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from ldcnd.errors import ShuttingDown, TooManyRequests
 from ldcnd.messaging.session import (
@@ -19,14 +19,31 @@ from ldcnd.messaging.session import (
 
 ItemT = TypeVar("ItemT")
 
+COMMANDS_PER_TURN = 4
+"""So many commands begin in one turn of the loop; all stops that have arrived do."""
+
 COLLECTED_ITEMS = 4096
 """One question collects so many answers at most."""
 
 
 class HandOver(Generic[ItemT]):
-    """Keeps the newest items until the loop has called back with them, in order."""
+    """Keeps the newest items until the loop has called back with them, in order.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, deliver: Callable[[ItemT], None], capacity: int) -> None:
+    Args:
+        loop: the loop.
+        deliver: takes an item.
+        capacity: so many items wait at most.
+        per_turn: so many are delivered in one turn of the loop; all that wait, if missing.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        deliver: Callable[[ItemT], None],
+        capacity: int,
+        per_turn: int | None = None,
+    ) -> None:
+        self._per_turn = per_turn or capacity
         self._lost = 0
         self._loop = loop
         self._deliver = deliver
@@ -66,7 +83,7 @@ class HandOver(Generic[ItemT]):
     def _drain(self) -> None:
         """Deliver what was there on waking; later items wait for the next turn, so that others get theirs."""
         with self._lock:
-            batch = len(self._items)
+            batch = min(len(self._items), self._per_turn)
         try:
             for _ in range(batch):
                 with self._lock:
@@ -81,11 +98,36 @@ class HandOver(Generic[ItemT]):
                 self._loop.call_soon(self._drain)
 
 
+class Admission(Protocol):
+    """A query that was counted in; neither method blocks, and any thread may call them."""
+
+    def offer(self, query: Query) -> None:
+        """Hand the query to its queryable."""
+
+    def leave(self) -> None:
+        """Count the query out: its answer has left."""
+
+
+class QueryIntake(Protocol):
+    """The way in to one queryable; no method blocks, and any thread may call all but `close`."""
+
+    def admit(self, source: str) -> Admission | None:
+        """Count a query in, None if there is no room; `source` is the session that it names, empty if it names none."""
+
+    def refusal(self, key: str, source: str) -> TooManyRequests:
+        """Return the error for a query that was not admitted."""
+
+    def load(self) -> Load:
+        """Return how many queries are unanswered, and how many were not admitted."""
+
+    def close(self) -> None:
+        """Call back no more; refuse the queries that the callback has not had."""
+
+
 class Intake:
     """Hands the queries of one queryable to its callback, so many at a time at most.
 
-    A query counts from its arrival until its answer has left, so a client that does not take answers holds up its own
-    queryable at worst.
+    A query counts from its arrival until its answer has left.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, on_query: OnQuery, *, urgent: bool = False) -> None:
@@ -96,19 +138,21 @@ class Intake:
         # re-entrant: a forgotten query may be collected, and so leave, while this very thread counts
         self._lock = threading.RLock()
         # admission bounds it, so nothing ever gives way
-        self._queries = HandOver(loop, self._deliver, self._capacity)
+        self._queries = HandOver(loop, self._deliver, self._capacity, None if urgent else COMMANDS_PER_TURN)
 
-    def admit(self) -> bool:
-        """Count a query in, if there is room; `leave` counts it out. Any thread, never blocks."""
+    def admit(self, source: str) -> Admission | None:
+        """Count a query in."""
+        del source
         with self._lock:
             if self._pending >= self._capacity:
                 self._refused += 1
-                return False
+                return None
             self._pending += 1
-            return True
+            return self
 
-    def refusal(self, key: str) -> TooManyRequests:
+    def refusal(self, key: str, source: str) -> TooManyRequests:
         """Return the error for a query that was not admitted."""
+        del source
         return TooManyRequests(
             f"{key}: {self._capacity} queries are unanswered already; nothing was done",
             limit=self._capacity,
@@ -120,12 +164,12 @@ class Intake:
         return Load(self._pending, self._refused)
 
     def leave(self) -> None:
-        """Count a query out: its answer has left. Any thread."""
+        """Count a query out."""
         with self._lock:
             self._pending -= 1
 
     def offer(self, query: Query) -> None:
-        """Take an admitted query. Any thread, never blocks."""
+        """Take an admitted query."""
         self._queries.offer(query)
 
     def close(self) -> None:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from ldcnd.errors import OutcomeUnknown, SessionError
-from ldcnd.messaging.hand_over import HandOver, Intake, TokenChanges
+from ldcnd.messaging.hand_over import Admission, HandOver, Intake, QueryIntake, TokenChanges
 from ldcnd.messaging.keys import matches
+from ldcnd.messaging.reads import ReadIntake, Reads
 from ldcnd.messaging.session import (
     NO_PARAMETERS,
     QUERY_TIMEOUT_S,
@@ -21,6 +22,7 @@ from ldcnd.messaging.session import (
     Declaration,
     Load,
     OnQuery,
+    OnRead,
     OnSample,
     OnSubscribed,
     OnToken,
@@ -35,7 +37,7 @@ from ldcnd.messaging.session import (
 @dataclass(eq=False, slots=True)
 class _Queryable:
     key: str
-    intake: Intake
+    intake: QueryIntake
     complete: bool
 
 
@@ -145,6 +147,8 @@ class MemorySession(Session):
         self._login = login
         self._loop = asyncio.get_running_loop()
         self._declarations: list[Declaration] = []
+        self._reads = Reads(self._loop)
+        self._name = f"session {id(self)}"
         self._closed = False
 
     def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
@@ -158,8 +162,15 @@ class MemorySession(Session):
 
     async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
         """Answer queries; nothing is in the way of an answer here, so urgent only means not to be refused."""
+        return self._serve(key, Intake(self._loop, on_query, urgent=urgent), complete=complete)
+
+    async def serve_reads(self, key: str, on_read: OnRead, *, complete: bool) -> Declaration:
+        """Answer queries in steps."""
+        return self._serve(key, ReadIntake(self._reads, on_read), complete=complete)
+
+    def _serve(self, key: str, intake: QueryIntake, *, complete: bool) -> Declaration:
         self._must_be_open()
-        queryable = _Queryable(key, Intake(self._loop, on_query, urgent=urgent), complete)
+        queryable = _Queryable(key, intake, complete)
 
         def undeclare() -> None:
             self._broker.queryables.remove(queryable)
@@ -215,11 +226,12 @@ class MemorySession(Session):
             return []
         pending = _Pending(len(asked), self._loop.create_future())
         for queryable in asked:
-            if queryable.intake.admit():
-                send = partial(_answer, pending, queryable.intake)
-                queryable.intake.offer(Query(key, parameters, payload, encoding, send, lambda: self._login))
+            if admission := queryable.intake.admit(self._name):
+                send = partial(_answer, pending, admission)
+                admission.offer(Query(key, parameters, payload, encoding, send, lambda: self._login))
             else:
-                Query(key, parameters, payload, encoding, pending.take).refuse(queryable.intake.refusal(key))
+                refusal = queryable.intake.refusal(key, self._name)
+                Query(key, parameters, payload, encoding, pending.take).refuse(refusal)
         try:
             async with asyncio.timeout(timeout_s):
                 await pending.done
@@ -277,6 +289,6 @@ class MemorySession(Session):
             raise SessionError("the session is closed")
 
 
-def _answer(pending: _Pending, intake: Intake, answers: tuple[Answer, ...]) -> None:
-    intake.leave()
+def _answer(pending: _Pending, admission: Admission, answers: tuple[Answer, ...]) -> None:
+    admission.leave()
     pending.take(answers)

@@ -5,7 +5,7 @@ bounded: a subscription keeps its newest samples, a queryable refuses what is to
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
@@ -24,6 +24,15 @@ UNDELIVERED_TOKENS = 1024
 
 PENDING_URGENT_QUERIES = 4096
 """The same for an urgent queryable: a bound on memory, not on clients; a stop is not refused for being one of many."""
+
+READS_OF_A_CLIENT = 64
+"""A client that names its session has so many unanswered reads at most; the next is refused with too_many_requests."""
+
+READS_OF_UNNAMED = 256
+"""The same for all clients together that do not name their sessions: Zenoh does not tell whose query it is."""
+
+READS_UNANSWERED = 1024
+"""The same for all clients together."""
 
 QUERY_TIMEOUT_S = 2.0
 """A client waits so long for the answers to a query unless it says otherwise."""
@@ -184,6 +193,8 @@ class Query:
 
 
 OnQuery = Callable[[Query], None]
+OnRead = Callable[[Query], Iterator[None]]
+"""Answers a query in steps: each makes at most one payload, and between two of them the loop does other work."""
 OnSample = Callable[[Sample], None]
 OnToken = Callable[[str, bool], None]
 """Learns that the token of a key has appeared (True) or vanished (False)."""
@@ -256,6 +267,20 @@ class Session(ABC):
             complete: this session alone can answer everything below the key, so one such session is asked, not all.
             urgent: answers do not queue behind the answers of other declarations, and so many queries may be
                 unanswered that none is refused in practice.
+        """
+
+    @abstractmethod
+    async def serve_reads(self, key: str, on_read: OnRead, *, complete: bool) -> Declaration:
+        """Answer queries that only read, in steps, whenever the loop has nothing else to do.
+
+        One step is made for each turn of the loop, for one client after the other: reading delays a command or a stop
+        by one step at most, however much is read. Answers leave on threads of their own: a client that does not take
+        them holds up no command.
+
+        Args:
+            key: the expression.
+            on_read: answers a query; if it raises, the query is answered with an internal error.
+            complete: as for `serve`.
         """
 
     @abstractmethod

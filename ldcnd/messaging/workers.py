@@ -14,35 +14,54 @@ from typing import TypeVar
 
 ResultT = TypeVar("ResultT")
 
-QUEUED_JOBS = 1024
-"""`is_full` beyond this; whoever can make any number of jobs must ask."""
-
 Job = Callable[[], None]
 
 
 class Workers:
-    """A few threads that carry out jobs in the order in which they come."""
+    """Threads that carry out jobs in the order in which they come.
 
-    def __init__(self, name: str, count: int) -> None:
+    A job that blocks keeps its thread; the next one has another thread, so jobs wait for blocked ones only when there
+    are as many of these as there may be threads.
+
+    Args:
+        name: of the threads.
+        most: how many threads there may be; each is started for the first job that finds none idle.
+    """
+
+    def __init__(self, name: str, most: int) -> None:
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self._count = count
+        self._name = name
+        self._most = most
+        self._free = 0
+        """Threads for which no job waits."""
+        self._backlog = 0
+        """Jobs that wait for any thread to come free."""
         self._stopping = False
         self._ended: list[Future[None]] = []
-        for number in range(count):
-            ended: Future[None] = Future()
-            # a running future cannot be cancelled by those who wait for it
-            ended.set_running_or_notify_cancel()
-            self._ended.append(ended)
-            threading.Thread(target=self._work, args=(ended,), name=f"{name} {number}", daemon=True).start()
+        # re-entrant: what is collected while this thread counts may submit a job
+        self._lock = threading.RLock()
 
     @property
-    def is_full(self) -> bool:
-        """Whether so much waits that avoidable jobs should be dropped."""
-        return self._jobs.qsize() >= QUEUED_JOBS
+    def waiting(self) -> int:
+        """How many jobs no thread has begun."""
+        return self._jobs.qsize()
 
     def submit(self, job: Job) -> None:
         """Have a job done that must not raise. Any thread, never blocks."""
-        self._jobs.put(job)
+        ended: Future[None] | None = None
+        with self._lock:
+            self._jobs.put(job)
+            if self._free:
+                self._free -= 1
+            elif len(self._ended) < self._most and not self._stopping:
+                ended = Future()
+                # a running future cannot be cancelled by those who wait for it
+                ended.set_running_or_notify_cancel()
+                self._ended.append(ended)
+            else:
+                self._backlog += 1
+        if ended:
+            threading.Thread(target=self._work, args=(ended,), name=self._name, daemon=True).start()
 
     async def run(self, work: Callable[[], ResultT], timeout_s: float, undo: Callable[[ResultT], None]) -> ResultT:
         """Have work done and return its result.
@@ -66,10 +85,11 @@ class Workers:
 
     async def stop(self, timeout_s: float) -> bool:
         """Finish the jobs there are, take no more, and tell whether that was done in time; safe to call twice."""
-        if not self._stopping:
-            self._stopping = True
-            for _ in range(self._count):
-                self._jobs.put(None)
+        with self._lock:
+            if not self._stopping:
+                self._stopping = True
+                for _ in self._ended:
+                    self._jobs.put(None)
         try:
             async with asyncio.timeout(timeout_s):
                 for ended in self._ended:
@@ -93,6 +113,11 @@ class Workers:
                 job()
                 # what the job holds must not live until the next one comes
                 del job
+                with self._lock:
+                    if self._backlog:
+                        self._backlog -= 1
+                    else:
+                        self._free += 1
         finally:
             ended.set_result(None)
 

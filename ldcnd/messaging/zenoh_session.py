@@ -2,13 +2,15 @@
 
 Zenoh calls back on its own threads: there, items are handed over to the loop and nothing else happens, because one
 blocked callback holds up everything that comes over the same link. What may block on a peer that does not read runs on
-worker threads; a publication drops instead of blocking. Answers of urgent declarations have workers of their own.
+worker threads; a publication drops instead of blocking. Answers to stops, to commands and to reads have threads of
+their own each, and refusals have a single slow one: who does not read, or asks too much, holds up only its own kind.
 
 Source: behaviour of eclipse-zenoh 1.10.2, measured.
 """
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -21,8 +23,10 @@ from zenoh.handlers import Callback, RingChannel
 from ldcnd.errors import SessionError, ValueOutOfRange
 from ldcnd.log import get_logger
 from ldcnd.messaging import zenoh_failures
-from ldcnd.messaging.hand_over import Collector, HandOver, Intake, TokenChanges
+from ldcnd.messaging.codec import Encoding, encode, error_reply
+from ldcnd.messaging.hand_over import Collector, HandOver, Intake, QueryIntake, TokenChanges
 from ldcnd.messaging.login_probe import refusals
+from ldcnd.messaging.reads import ReadIntake, Reads
 from ldcnd.messaging.session import (
     NO_PARAMETERS,
     QUERY_TIMEOUT_S,
@@ -31,6 +35,7 @@ from ldcnd.messaging.session import (
     Declaration,
     Load,
     OnQuery,
+    OnRead,
     OnSample,
     OnSubscribed,
     OnToken,
@@ -42,6 +47,7 @@ from ldcnd.messaging.sweep import Sweep
 from ldcnd.messaging.workers import Workers
 from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.messaging.zenoh_threads import provide_threads
 from ldcnd.messaging.zenoh_values import TRAVEL, Stamps, to_answers, to_sample, to_stamp
 
 __all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
@@ -56,6 +62,15 @@ CLOSE_TIME_S = 1.5
 """Then Zenoh has so long to say goodbye; with a frozen, congested peer it can take 12 s, and is left to itself."""
 QUERY_GRACE_S = 0.5
 """Zenoh ends a query at its time-out; it is given up for lost so much later."""
+
+ANSWER_THREADS = 64
+"""Threads that may wait at the same time for clients that do not take answers to stops, to commands, to reads."""
+OTHER_THREADS = 16
+"""The same for declarations and questions of this session."""
+REFUSALS_WAITING = 4096
+"""Beyond this a query that is too much ends without an answer."""
+REFUSAL_PAUSE_S = 0.001
+"""Who asks again as soon as it is refused takes no more than this leaves."""
 
 
 class _Undeclarable(Protocol):
@@ -72,6 +87,8 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator["ZenohSes
     """
     config = zenoh_config(settings)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
+    if listen:
+        provide_threads()
     workers = Workers("zenoh open", 1)
     try:
         entity = await workers.run(partial(zenoh.open, config), OPEN_TIME_S, zenoh.Session.close)
@@ -126,8 +143,12 @@ class ZenohSession(Session):
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._loop = asyncio.get_running_loop()
-        self._workers = Workers("zenoh", 3)
-        self._urgent_workers = Workers("zenoh urgent", 2)
+        self._workers = Workers("zenoh", OTHER_THREADS)
+        self._urgent_workers = Workers("zenoh stops", ANSWER_THREADS)
+        self._command_workers = Workers("zenoh commands", ANSWER_THREADS)
+        self._read_workers = Workers("zenoh reads", ANSWER_THREADS)
+        self._refusals = Workers("zenoh refusals", 1)
+        self._reads = Reads(self._loop)
         self._declared: list[_Declared] = []
         self._outlets: dict[str, _Outlet] = {}
         self._stamps = Stamps(session.new_timestamp().get_id())
@@ -157,33 +178,48 @@ class ZenohSession(Session):
 
     async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
         """Answer queries."""
-        intake = Intake(self._loop, on_query, urgent=urgent)
-        workers = self._urgent_workers if urgent else self._workers
+        workers = self._urgent_workers if urgent else self._command_workers
+        return await self._serve(key, Intake(self._loop, on_query, urgent=urgent), workers, complete=complete)
 
+    async def serve_reads(self, key: str, on_read: OnRead, *, complete: bool) -> Declaration:
+        """Answer queries in steps."""
+        return await self._serve(key, ReadIntake(self._reads, on_read), self._read_workers, complete=complete)
+
+    async def _serve(self, key: str, intake: QueryIntake, workers: Workers, *, complete: bool) -> Declaration:
         def take(asked: zenoh.Query) -> None:
-            admitted = intake.admit()
-            if not admitted and workers.is_full:
-                # ends the query without an answer, and may hold up the link of this one client
+            source = asked.source_info
+            named = "" if source is None else str(source.source_id.zid)
+            admission = intake.admit(named)
+            if admission is None:
+                # beyond the bound the query ends here, which may hold up the links that share this thread
+                if self._refusals.waiting < REFUSALS_WAITING:
+                    self._refusals.submit(partial(self._refuse, asked, intake, named))
                 return
-            path = _AnswerPath(asked, workers, self._stamps.stamp_id, intake.leave if admitted else lambda: None)
-            query = Query(
-                key=str(asked.key_expr),
-                parameters=dict(asked.parameters),  # type: ignore[call-overload] # its stub has no true iterator
-                payload=b"" if asked.payload is None else asked.payload.to_bytes(),
-                encoding="" if asked.encoding is None else str(asked.encoding),
-                send=path.send,
-                login=partial(self._login_of, asked.source_info),
+            path = _AnswerPath(asked, workers, self._stamps.stamp_id, admission.leave)
+            admission.offer(
+                Query(
+                    key=str(asked.key_expr),
+                    parameters=dict(asked.parameters),  # type: ignore[call-overload] # its stub has no true iterator
+                    payload=b"" if asked.payload is None else asked.payload.to_bytes(),
+                    encoding="" if asked.encoding is None else str(asked.encoding),
+                    send=path.send,
+                    login=partial(self._login_of, source),
+                )
             )
-            if admitted:
-                intake.offer(query)
-            else:
-                query.refuse(intake.refusal(query.key))
 
         return await self._declare(
             lambda: self._session.declare_queryable(key, Callback(take, indirect=False), complete=complete),
             intake.close,
             intake.load,
         )
+
+    def _refuse(self, asked: zenoh.Query, intake: QueryIntake, source: str) -> None:
+        """Refuse a query that was not admitted; on the thread for refusals, one after the other."""
+        path = _AnswerPath(asked, self._refusals, self._stamps.stamp_id, lambda: None)
+        key = str(asked.key_expr)
+        path.answer((Answer(key, *encode(error_reply(intake.refusal(key, source)), Encoding.JSON), is_error=True),))
+        if not self._closed:
+            time.sleep(REFUSAL_PAUSE_S)
 
     async def subscribe(
         self, key: str, on_sample: OnSample, kept: int = UNDELIVERED_SAMPLES, *, linger_s: float = 0.0
@@ -309,8 +345,10 @@ class ZenohSession(Session):
             declared.stop()
         closer = Workers("zenoh close", 1)
         try:
-            await self._workers.stop(DRAIN_TIME_S / 2)
-            await self._urgent_workers.stop(DRAIN_TIME_S / 2)
+            async with asyncio.TaskGroup() as group:
+                answering = (self._urgent_workers, self._command_workers, self._read_workers, self._refusals)
+                for workers in (*answering, self._workers):
+                    group.create_task(workers.stop(DRAIN_TIME_S), name="drain")
         finally:
             try:
                 await closer.run(self._session.close, CLOSE_TIME_S, lambda _: None)
@@ -379,9 +417,9 @@ class _AnswerPath:
     on_gone: Callable[[], None]
 
     def send(self, answers: tuple[Answer, ...]) -> None:
-        self.workers.submit(partial(self._answer, answers))
+        self.workers.submit(partial(self.answer, answers))
 
-    def _answer(self, answers: tuple[Answer, ...]) -> None:
+    def answer(self, answers: tuple[Answer, ...]) -> None:
         """Answer and end the query; takes as long as the client needs to read, until Zenoh closes its link."""
         asked = self.asked
         try:

@@ -1,4 +1,4 @@
-"""Zenoh's own threads beside the event loop: those that send wait for it.
+"""Zenoh's own threads beside the event loop: how many there are, and that those that send wait for it.
 
 Source: thread names of eclipse-zenoh 1.10.2, looked up in a running process.
 """
@@ -9,9 +9,17 @@ import os
 from pathlib import Path
 
 THREADS = Path("/proc/self/task")
+RUNTIME = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
+"""Zenoh's default is one thread that sends. While it closes a link whose peer takes nothing, for the time before closing
+(200 ms), the answers on all other links wait; so there are more threads than such links at a time."""
 SENDERS = "tx-"
 """What the names of Zenoh's sending threads begin with; the first link makes them."""
 LOOK_S = 1.0
+
+
+def provide_threads() -> None:
+    """Have Zenoh start as many threads as a daemon needs, unless the environment says so; before the first session."""
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
 
 
 async def senders_wait() -> None:

@@ -11,7 +11,16 @@ from pathlib import Path
 
 import structlog
 
-from tests.bench import bus_efficiency, console, round_trip, saturated_command, scaling, system_calls, virtual_time
+from tests.bench import (
+    bus_efficiency,
+    console,
+    round_trip,
+    saturated_command,
+    scaling,
+    stops_under_load,
+    system_calls,
+    virtual_time,
+)
 from tests.bench.bus_efficiency import FLOOR, Conditions, Result
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
@@ -51,6 +60,7 @@ def main() -> None:
     if not options.no_processes:
         rows += _processes(options.rounds)
         rows += round_trip.rows()
+        rows += stops_under_load.rows()
     rows += virtual_time.rows(options.virtual_seconds)
     print(table(rows))
     if any(row.name.endswith(BUSY) and row.value > BUSY_US for row in rows):

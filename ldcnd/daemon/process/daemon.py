@@ -66,7 +66,9 @@ class Daemon:
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
         plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)
-        self._describing = Describing(rig, self._keys, publisher, self._info, lambda: self._config, plan, self._health)
+        self._describing = Describing(
+            rig, self._keys, publisher, self._info, lambda: self._config, plan, self._health, clock
+        )
 
     @property
     def config(self) -> RigConfig:
@@ -146,8 +148,8 @@ class Daemon:
             self._declarations.append(declaration)
             declared.push_async_callback(declaration.close)
 
-        await until_end(await session.serve(keys.all_telemetry, describing.on_telemetry, complete=False))
-        await until_end(await session.serve(keys.all_meta, describing.on_meta, complete=True))
+        await until_end(await session.serve_reads(keys.all_telemetry, describing.on_telemetry, complete=False))
+        await until_end(await session.serve_reads(keys.all_meta, describing.on_meta, complete=True))
         for stop in keys.all_stops:
             await until_end(await session.serve(stop, requests.on_stop, complete=True, urgent=True))
         await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))

@@ -11,7 +11,6 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Load
-from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth, StopWaitHealth
 from ldcnd.model.samples import TelemetryItem
 
@@ -73,7 +72,7 @@ class HealthWatch:
         load: Callable[[], Load],
         eeprom_writes: EepromWrites,
     ) -> None:
-        self.latest: dict[str, Frozen] = {}
+        self.latest: dict[str, DaemonHealth | BusHealth] = {}
         self.stop_bounds_s: Mapping[str, float] = {}
         self._rig = rig
         self._keys = keys
@@ -116,7 +115,7 @@ class HealthWatch:
         """
         t = self._clock.now_ns()
         load = self._load()
-        reports: dict[str, Frozen] = {
+        reports: dict[str, DaemonHealth | BusHealth] = {
             self._keys.health: DaemonHealth(
                 t=t,
                 seq=self._seq,

@@ -1,11 +1,12 @@
 """What the rig says about itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
 
 from ldcnd.bus.queue import Lane
 from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.contract import all_schemas
@@ -17,15 +18,56 @@ from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
 from ldcnd.messaging.session import Query
 from ldcnd.model.commands import CommandReply, Verb
 from ldcnd.model.frozen import Frozen, schema_name
+from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo, RegisterInfo
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.samples import Sample, TelemetryItem
 from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
+
+WORK_PER_STEP = 16
+"""Payloads that go into an answer in one turn of the loop; to encode a sample counts for 4, a description for 16."""
+SAMPLE_WORK, DESCRIPTION_WORK = 4, 16
+COUNTERS_HZ = 10
+"""So often the counters of a line's description are brought up to date at most."""
+REMEMBERED = 1024
+"""Encoded samples and reports that are kept at most; more keys than a rig has."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One key of an answer, and the work that it took."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    measured_at_ns: int | None = None
+    work: int = 1
+
+
+class _Encoded:
+    """The payloads of one key, made anew only when what they are made of has changed."""
+
+    __slots__ = ("_model", "_payloads", "_source")
+
+    def __init__(self, source: Callable[[], object], model: Callable[[], Frozen]) -> None:
+        self._source = source
+        self._model = model
+        self._payloads: dict[Encoding, tuple[object, bytes, str]] = {}
+
+    def part(self, key: str, encoding: Encoding) -> _Part:
+        """Return the payload as part of an answer."""
+        source = self._source()
+        known = self._payloads.get(encoding)
+        if known and known[0] == source:
+            return _Part(key, known[1], known[2])
+        payload, name = encode(self._model(), encoding)
+        self._payloads[encoding] = source, payload, name
+        return _Part(key, payload, name, work=DESCRIPTION_WORK)
 
 
 class Describing:
-    """Answers questions about one rig; JSON unless the selector asks for `?enc=msgpack`."""
+    """Answers questions about one rig in steps; JSON unless the selector asks for `?enc=msgpack`."""
 
     def __init__(
         self,
@@ -36,50 +78,88 @@ class Describing:
         configuration: Callable[[], Frozen],
         plan: RigPlan,
         health: HealthWatch,
+        clock: Clock,
     ) -> None:
-        self._rig = rig
-        self._keys = keys
         self._publisher = publisher
-        self._daemon = daemon
-        self._configuration = configuration
+        self._clock = clock
         self.plan = plan
         self._health = health
-        self._schemas: Mapping[str, bytes] = {keys.schema(name): text.encode() for name, text in all_schemas().items()}
-
-    def on_telemetry(self, query: Query) -> None:
-        """Answer with the last value of every key that the query covers."""
-        encoding = _wanted_encoding(query)
-        for key, last in self._publisher.last.items():
-            if matches(query.key, key):
-                payload, name = encode(last, encoding)
-                query.reply(payload, name, key=key, measured_at_ns=last.t)
-        query.finish()
-
-    def on_meta(self, query: Query) -> None:
-        """Answer with every description that the query covers."""
-        encoding = _wanted_encoding(query)
-        models: dict[str, Callable[[], Frozen]] = {
-            self._keys.daemon: self._daemon,
-            self._keys.commands: command_list,
-            self._keys.plan: lambda: self.plan,
-            self._keys.configuration: self._configuration,
+        self._latest: dict[tuple[str, Encoding], tuple[Frozen, bytes, str]] = {}
+        self._described: dict[str, _Encoded] = {
+            keys.daemon: _Encoded(configuration, daemon),
+            keys.commands: _Encoded(lambda: None, command_list),
+            keys.plan: _Encoded(lambda: self.plan, lambda: self.plan),
+            keys.configuration: _Encoded(configuration, configuration),
         }
-        for bus in self._rig.buses:
-            models[self._keys.bus(bus.bus.settings.name)] = partial(bus_info, bus)
+        for bus in rig.buses:
+            self._described[keys.bus(bus.bus.settings.name)] = _Encoded(
+                partial(self._bus_source, bus), partial(bus_info, bus)
+            )
             for axis in bus.axes:
-                models[self._keys.axis(axis.config.name)] = partial(axis_info, bus, axis)
-        for key, model in models.items():
-            if matches(query.key, key):
-                payload, name = encode(model(), encoding)
-                query.reply(payload, name, key=key)
-        for key, report in self._health.latest.items():
-            if matches(query.key, key):
-                payload, name = encode(report, encoding)
-                query.reply(payload, name, key=key)
-        for key, text in self._schemas.items():
-            if matches(query.key, key):
-                query.reply(text, Encoding.JSON.value, key=key)
-        query.finish()
+                self._described[keys.axis(axis.config.name)] = _Encoded(
+                    partial(_axis_source, axis), partial(axis_info, bus, axis)
+                )
+        self._schemas = {keys.schema(name): text.encode() for name, text in all_schemas().items()}
+
+    def on_telemetry(self, query: Query) -> Iterator[None]:
+        """Answer with the last value of every key that the query covers."""
+        return _in_steps(query, self._newest(query, self._publisher.last))
+
+    def on_meta(self, query: Query) -> Iterator[None]:
+        """Answer with every description that the query covers."""
+        return _in_steps(query, self._descriptions(query))
+
+    def _descriptions(self, query: Query) -> Iterator[_Part]:
+        encoding = _wanted_encoding(query)
+        for key in _covered(query.key, tuple(self._described)):
+            yield self._described[key].part(key, encoding)
+        yield from self._newest(query, self._health.latest)
+        for key in _covered(query.key, tuple(self._schemas)):
+            yield _Part(key, self._schemas[key], Encoding.JSON.value)
+
+    def _newest(self, query: Query, newest: Mapping[str, Sample | DaemonHealth | BusHealth]) -> Iterator[_Part]:
+        """Yield what was published last on every key that the query covers."""
+        encoding = _wanted_encoding(query)
+        for key in _covered(query.key, tuple(newest)):
+            published = newest.get(key)
+            if published is None:
+                continue  # withdrawn since the query came
+            known = self._latest.get((key, encoding))
+            if known and known[0] is published:
+                yield _Part(key, known[1], known[2], published.t)
+                continue
+            if len(self._latest) >= REMEMBERED:
+                self._latest.clear()
+            payload, name = encode(published, encoding)
+            self._latest[key, encoding] = published, payload, name
+            yield _Part(key, payload, name, published.t, SAMPLE_WORK)
+
+    def _bus_source(self, bus: BusService) -> object:
+        """Return what the description of a line is made of; its counters never stand still."""
+        return bus.port, bus.bus.baud, bus.report, bus.problem, int(self._clock.now_s() * COUNTERS_HZ)
+
+
+def _in_steps(query: Query, parts: Iterator[_Part]) -> Iterator[None]:
+    """Answer with all parts; each step does a bounded amount of work."""
+    work = 0
+    for part in parts:
+        query.reply(part.payload, part.encoding, key=part.key, measured_at_ns=part.measured_at_ns)
+        work += part.work
+        if work >= WORK_PER_STEP:
+            work = 0
+            yield
+    query.finish()
+
+
+@lru_cache(maxsize=64)
+def _covered(expression: str, keys: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(key for key in keys if matches(expression, key))
+
+
+def _axis_source(axis: AxisService) -> object:
+    """Return what the description of an axis is made of, as far as it changes."""
+    driver = axis.driver
+    return axis.config, driver.identity, driver.registers(), driver.adc_full_scale, axis.traces.channels
 
 
 def bus_info(bus: BusService) -> BusInfo:
