@@ -10,8 +10,8 @@ from pathlib import Path
 
 THREADS = Path("/proc/self/task")
 RUNTIME = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
-"""Zenoh's default is one thread that sends. While it closes a link whose peer takes nothing, for the time before closing
-(200 ms), the answers on all other links wait; so there are more threads than such links at a time."""
+"""Zenoh's default is one thread that sends. While it closes a link whose peer takes nothing (200 ms), the answers on
+all other links wait; so there are more threads than such links at a time."""
 SENDERS = "tx-"
 """What the names of Zenoh's sending threads begin with; the first link makes them."""
 LOOK_S = 1.0

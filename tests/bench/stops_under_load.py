@@ -24,13 +24,13 @@ import structlog
 
 from ldcnd.bus.wire_log import WireEvent
 from ldcnd.config import load_config
-from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.planning import plan_rig
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.planning.plan import plan_rig
 from tests.bench.report import Row, table
-from tests.support.process import free_port
+from tests.support.process import ROOT, free_port
 from tests.support.rig import SIMULATED
 
 STOPS, ROUNDS = 25, 4
@@ -38,11 +38,38 @@ STOP_MOTOR = 0x7
 """Command code in the low half of the third byte."""
 SCHEDULING_S = 0.020
 """How late the machine may let the daemon run, beyond the bound of the line."""
+AHEAD, BEHIND = -10, 10
+"""Nice value of the daemon and of who stops (`deploy/drop-ins/nice.conf`); how much higher that of the readers is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """Clients that read.
+
+    Attributes:
+        what: the selector, below the rig.
+        links: how many clients.
+        outstanding: unanswered queries of each.
+        freeze_s: they read nothing for so long, then others take their place.
+    """
+
+    what: str
+    links: int
+    outstanding: int
+    freeze_s: float | None = None
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """As `tests.bench.reading_clients` takes them."""
+        freeze = () if self.freeze_s is None else ("--freeze", str(self.freeze_s))
+        return (f"ldcn/sim/{self.what}", str(self.links), str(self.outstanding), *freeze)
+
+
 LOADS = {
-    "1 client, 32 outstanding get meta/**": ("meta/**", 1, 32, None),
-    "3 clients, 64 outstanding get tele/** each": ("tele/**", 3, 64, None),
-    "3 clients, 64 outstanding get meta/** each": ("meta/**", 3, 64, None),
-    "4 links, 300 get meta/** each, that stop reading and reconnect": ("meta/**", 4, 300, 1.0),
+    "1 client, 32 outstanding get meta/**": Load("meta/**", 1, 32),
+    "3 clients, 64 outstanding get tele/** each": Load("tele/**", 3, 64),
+    "3 clients, 64 outstanding get meta/** each": Load("meta/**", 3, 64),
+    "4 links, 300 get meta/** each, that stop reading and reconnect": Load("meta/**", 4, 300, 1.0),
 }
 STOPPER = """
 import json, sys, time, zenoh
@@ -64,10 +91,6 @@ class Stops:
     begun_s: list[float] = field(default_factory=list)
     answered_s: list[float] = field(default_factory=list)
     failed: int = 0
-
-
-AHEAD = -10
-"""Nice value of the daemon and of who stops, as in `deploy/drop-ins/nice.conf`."""
 
 
 def rows() -> list[Row]:
@@ -105,27 +128,24 @@ async def _measured(rounds: int, stops: int) -> list[Row]:
 
 
 async def compared(
-    daemon: Daemon, endpoint: str, load: tuple[str, int, int, float | None], rounds: int, stops: int
+    daemon: Daemon, endpoint: str, load: Load, rounds: int, stops: int, nice: int = BEHIND
 ) -> tuple[Stops, Stops]:
-    """Return what stops take without and with a load, in turn."""
+    """Return what stops take without and with a load, in turn; the readers have a nice value."""
     quiet, loaded = Stops(), Stops()
     for _ in range(rounds):
         await _stop(daemon, endpoint, stops, quiet)
-        async with reading(endpoint, *load):
+        async with reading(endpoint, load, nice):
             await _stop(daemon, endpoint, stops, loaded)
     return quiet, loaded
 
 
 @asynccontextmanager
-async def reading(
-    endpoint: str, what: str, links: int, outstanding: int, freeze_s: float | None
-) -> AsyncIterator[Process]:
-    """Have clients read until the context ends; they stand for other machines, so they take what time is left."""
-    command = (sys.executable, "-m", "tests.bench.reading_clients", endpoint, f"ldcn/sim/{what}", str(links))
-    freeze = () if freeze_s is None else ("--freeze", str(freeze_s))
+async def reading(endpoint: str, load: Load, nice: int) -> AsyncIterator[Process]:
+    """Have clients read until the context ends."""
     clients = await asyncio.create_subprocess_exec(
-        *command, str(outstanding), *freeze, stdout=PIPE, start_new_session=True, preexec_fn=lambda: os.nice(-AHEAD)
-    )
+        sys.executable, "-m", "tests.bench.reading_clients", endpoint, *load.arguments, cwd=ROOT, stdout=PIPE,
+        start_new_session=True, preexec_fn=lambda: os.nice(nice),
+    )  # fmt: skip
     try:
         assert clients.stdout
         await clients.stdout.readline()

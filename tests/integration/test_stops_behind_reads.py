@@ -1,0 +1,120 @@
+"""However much is read, and whoever is frozen: a stop begins and is answered as without."""
+
+import asyncio
+import contextlib
+import time
+from statistics import median
+from typing import Any
+
+import pytest
+
+from ldcnd.bus.wire_log import WireEvent
+from ldcnd.config import load_config
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.publish.meta import WORK_PER_STEP
+from ldcnd.messaging.session import READS_OF_A_CLIENT, Query
+from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+from tests.bench.stops_under_load import LOADS, compared
+from tests.support.rig import SIMULATED, RunningRig, running_rig
+from tests.support.session_pair import free_endpoint
+
+STOP_MOTOR = 0x7
+"""Command code in the low half of the third byte."""
+READERS = 4
+
+
+class Turns:
+    """Counts turns of the loop."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._handle: asyncio.Handle | None = None
+        self._turn()
+
+    def _turn(self) -> None:
+        self.count += 1
+        self._handle = asyncio.get_running_loop().call_soon(self._turn)
+
+    def end(self) -> None:
+        assert self._handle
+        self._handle.cancel()
+
+
+def stops_sent(rig: RunningRig) -> int:
+    (bus,) = rig.daemon.rig.buses
+    return sum(
+        record.event is WireEvent.SENT and record.data[2:3] != b"" and record.data[2] & 0xF == STOP_MOTOR
+        for record in bus.bus.wire_log.records()
+    )
+
+
+async def idle(rig: RunningRig) -> None:
+    """Wait until nothing is on the line; while the loop has work the clock stands still, and so does the line."""
+    (bus,) = rig.daemon.rig.buses
+    while not bus.bus.is_idle:
+        await asyncio.sleep(0.001)
+
+
+async def turns_to_the_first_packet(rig: RunningRig, payloads: list[str]) -> tuple[int, int]:
+    """Return in how many turns of the loop a stop reaches the line, and how many payloads are read meanwhile."""
+    before, read_before = stops_sent(rig), len(payloads)
+    turns = Turns()
+    async with asyncio.TaskGroup() as group:
+        group.create_task(rig.client.stop("x"), name="stop")
+        while stops_sent(rig) == before:
+            await asyncio.sleep(0)
+        turns.end()
+        read = len(payloads) - read_before
+    return turns.count, read
+
+
+async def test_a_stop_reaches_the_line_behind_256_reads_in_as_many_turns_as_without_and_a_step_of_reading_in_each(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    payloads: list[str] = []
+    reply = Query.reply
+
+    def counted(self: Query, *args: Any, **kwargs: Any) -> None:
+        payloads.append(self.key)
+        reply(self, *args, **kwargs)
+
+    monkeypatch.setattr(Query, "reply", counted)
+    async with running_rig() as rig, contextlib.AsyncExitStack() as sessions:
+        readers = [await sessions.enter_async_context(rig.broker.session()) for _ in range(READERS)]
+        await idle(rig)
+        alone, _ = await turns_to_the_first_packet(rig, payloads)
+        await idle(rig)
+        async with asyncio.TaskGroup() as group:
+            for reader in readers:
+                for _ in range(READS_OF_A_CLIENT):
+                    group.create_task(reader.query("ldcn/sim/meta/**"), name="read")
+            await asyncio.sleep(0)  # all have asked, none is answered
+
+            behind_reads, read = await turns_to_the_first_packet(rig, payloads)
+
+    print(f"{alone} turns without reads; {behind_reads} turns and {read} payloads of reads behind them")
+    assert behind_reads == alone
+    assert read <= behind_reads * WORK_PER_STEP
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("load", list(LOADS))
+async def test_a_stop_over_its_own_link_waits_for_no_reader(load: str):
+    """Generous: it shares its machine with the readers and all other tests; `make bench` looks at the figures."""
+    endpoint = free_endpoint()
+    async with open_zenoh_session(ZenohSettings(listen=(endpoint,))) as session, asyncio.TaskGroup() as group:
+        daemon = build_daemon(load_config(SIMULATED), session, time.time_ns, "test")
+        running = group.create_task(daemon.run(), name="daemon")
+        await daemon.wait_up()
+        quiet, loaded = await compared(daemon, endpoint, LOADS[load], rounds=1, stops=15, nice=0)
+        daemon.end()
+        await running
+
+    for what, without, with_load in (
+        ("begun", quiet.begun_s, loaded.begun_s),
+        ("answered", quiet.answered_s, loaded.answered_s),
+    ):
+        print(f"{what}: {median(without) * 1e3:.1f} ms without, {median(with_load) * 1e3:.1f} ms with")
+        assert median(with_load) <= 5 * median(without) + 0.05
+    assert (quiet.failed, loaded.failed) == (0, 0)
