@@ -24,7 +24,6 @@ from ldcnd.messaging.session import (
     OnQuery,
     OnRead,
     OnSample,
-    OnSubscribed,
     OnToken,
     Qos,
     Query,
@@ -45,12 +44,6 @@ class _Queryable:
 class _Subscription:
     key: str
     samples: HandOver[Sample]
-
-
-@dataclass(eq=False, slots=True)
-class _SubscriberWatch:
-    key: str
-    changes: HandOver[bool]
 
 
 @dataclass(eq=False, slots=True)
@@ -80,7 +73,6 @@ class MemoryBroker:
     def __init__(self) -> None:
         self.queryables: list[_Queryable] = []
         self.subscriptions: list[_Subscription] = []
-        self.subscriber_watches: list[_SubscriberWatch] = []
         self.watches: list[_TokenWatch] = []
         self.tokens: list[str] = []
 
@@ -101,25 +93,6 @@ class MemoryBroker:
         found = [queryable for queryable in self.queryables if matches(queryable.key, key)]
         complete = [queryable for queryable in found if queryable.complete and "*" not in key]
         return complete[:1] or found
-
-    def has_subscriber(self, key: str) -> bool:
-        """Tell whether anybody subscribes to a key."""
-        return any(matches(subscription.key, key) for subscription in self.subscriptions)
-
-    def add(self, subscription: _Subscription) -> None:
-        """Take a subscription, and tell those whose keys it is the first for."""
-        self._tell_publishers(lambda: self.subscriptions.append(subscription))
-
-    def remove(self, subscription: _Subscription) -> None:
-        """Forget a subscription, and tell those whose keys it was the last for."""
-        self._tell_publishers(lambda: self.subscriptions.remove(subscription))
-
-    def _tell_publishers(self, change: Callable[[], None]) -> None:
-        before = [self.has_subscriber(watch.key) for watch in self.subscriber_watches]
-        change()
-        for watch, was in zip(self.subscriber_watches, before, strict=True):
-            if (now := self.has_subscriber(watch.key)) is not was:
-                watch.changes.offer(now)
 
     def show_token(self, key: str) -> None:
         """Tell the watches of a token, unless another session shows the same."""
@@ -189,24 +162,11 @@ class MemorySession(Session):
         subscription = _Subscription(key, samples)
 
         def undeclare() -> None:
-            self._broker.remove(subscription)
+            self._broker.subscriptions.remove(subscription)
             samples.close()
 
-        self._broker.add(subscription)
+        self._broker.subscriptions.append(subscription)
         return self._declared(undeclare, samples.load)
-
-    async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
-        """Learn whether anybody subscribes; this session's own subscriptions count as well, as with Zenoh."""
-        self._must_be_open()
-        watch = _SubscriberWatch(key, HandOver(self._loop, on_subscribed, 1))
-
-        def undeclare() -> None:
-            self._broker.subscriber_watches.remove(watch)
-            watch.changes.close()
-
-        self._broker.subscriber_watches.append(watch)
-        watch.changes.offer(self._broker.has_subscriber(key))
-        return self._declared(undeclare)
 
     async def query(
         self,

@@ -198,8 +198,6 @@ OnRead = Callable[[Query], Iterator[None]]
 OnSample = Callable[[Sample], None]
 OnToken = Callable[[str, bool], None]
 """Learns that the token of a key has appeared (True) or vanished (False)."""
-OnSubscribed = Callable[[bool], None]
-"""Learns whether anybody subscribes to a key now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,17 +292,6 @@ class Session(ABC):
             on_sample: takes a sample.
             kept: so many samples may wait for the loop.
             linger_s: a sample may wait for so long for others; for those who take very many.
-        """
-
-    @abstractmethod
-    async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
-        """Learn whether anybody subscribes to a key, wherever in the network; first how it is now.
-
-        What comes and goes quicker than the loop takes it may be left out; the last call is always the truth.
-
-        Args:
-            key: a concrete key that this session publishes on.
-            on_subscribed: takes the news.
         """
 
     @abstractmethod

@@ -9,7 +9,6 @@ Source: behaviour of eclipse-zenoh 1.10.2, measured.
 """
 
 import asyncio
-import contextlib
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -37,7 +36,6 @@ from ldcnd.messaging.session import (
     OnQuery,
     OnRead,
     OnSample,
-    OnSubscribed,
     OnToken,
     Qos,
     Query,
@@ -123,18 +121,6 @@ class _Declared:
 
     entity: _Undeclarable
     stop: Callable[[], object]
-
-
-@dataclass(frozen=True, slots=True)
-class _SubscriberWatch:
-    """A publisher that publishes nothing, and the listener that it was declared for."""
-
-    publisher: _Undeclarable
-    listener: _Undeclarable
-
-    def undeclare(self) -> None:
-        self.listener.undeclare()
-        self.publisher.undeclare()
 
 
 class ZenohSession(Session):
@@ -237,26 +223,6 @@ class ZenohSession(Session):
             samples.close,
             samples.load,
         )
-
-    async def watch_subscribers(self, key: str, on_subscribed: OnSubscribed) -> Declaration:
-        """Learn whether anybody subscribes: Zenoh tells it to those who have declared that they publish."""
-
-        def look(publisher: zenoh.Publisher) -> None:
-            with contextlib.suppress(zenoh.ZError):  # it is being taken back at this moment
-                status: zenoh.MatchingStatus = publisher.matching_status  # type: ignore[assignment] # its stub says bool
-                on_subscribed(status.matching)
-
-        # the status is read on the loop, so that two changes cannot pass each other on their way there
-        looks = HandOver[zenoh.Publisher](self._loop, look, 1)
-
-        def declare() -> _SubscriberWatch:
-            publisher = self._session.declare_publisher(key)
-            changed: Callback[zenoh.MatchingStatus] = Callback(lambda _: looks.offer(publisher), indirect=False)
-            listener = publisher.declare_matching_listener(changed)
-            looks.offer(publisher)
-            return _SubscriberWatch(publisher, listener)
-
-        return await self._declare(declare, looks.close)
 
     async def _sweep(self, key: str, on_sample: OnSample, kept: int, period_s: float) -> Declaration:
         """Look for samples now and then: Zenoh's threads then need not run any Python."""

@@ -7,6 +7,7 @@ Daemon and stopping client go ahead of other programs, the readers behind: they 
 
 import asyncio
 import contextlib
+import gc
 import json
 import logging
 import multiprocessing
@@ -22,13 +23,13 @@ from pathlib import Path
 
 import structlog
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.config import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.planning.plan import plan_rig
+from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.report import Row, table
 from tests.support.process import ROOT, free_port
 from tests.support.rig import SIMULATED
@@ -118,6 +119,8 @@ async def _measured(rounds: int, stops: int) -> list[Row]:
         daemon = build_daemon(load_config(SIMULATED), session, time.time_ns, "bench")
         running = group.create_task(daemon.run(), name="daemon")
         await daemon.wait_up()
+        gc.collect()
+        gc.freeze()  # as the service does after start-up
         bound_s = max(bus.stop_wait_s for bus in plan_rig(daemon.config).buses)
         for name, load in LOADS.items():
             quiet, loaded = await compared(daemon, endpoint, load, rounds, stops)

@@ -5,7 +5,7 @@ import asyncio
 from ldcnd.daemon.publish.meta import COUNTERS_HZ, axis_info, command_list
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import Keys
-from ldcnd.model.requests import GainsRequest, HomeRequest, PowerRequest, Verb
+from ldcnd.model.commands import Home, Power, SetGains, Verb
 from tests.support.rig import RunningRig, running_rig
 
 KEYS = Keys("sim")
@@ -51,13 +51,14 @@ async def test_the_counters_of_a_line_are_at_most_a_tenth_of_a_second_old():
 
 async def test_the_description_of_an_axis_is_as_new_as_the_axis():
     async with running_rig() as rig:
+        await rig.until("x", lambda _: True)
         (bus,) = rig.daemon.rig.buses
         axis = rig.daemon.rig.axis("x")
         stale = []
         for verb, request in (
-            (Verb.POWER, PowerRequest(on=True)),
-            (Verb.SET_GAINS, GainsRequest(gains=axis.config.gains.model_copy(update={"kp": 123}))),
-            (Verb.HOME, HomeRequest()),
+            (Verb.POWER, Power(on=True)),
+            (Verb.SET_GAINS, SetGains(kp=123)),
+            (Verb.HOME, Home()),
         ):
             await rig.client.command("x", verb, request)
             fresh, _ = encode(axis_info(bus, axis), Encoding.JSON)

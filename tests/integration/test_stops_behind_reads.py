@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from ldcnd.bus.wire_log import WireEvent
 from ldcnd.config import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.publish.meta import WORK_PER_STEP
 from ldcnd.messaging.session import READS_OF_A_CLIENT, Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.stops_under_load import LOADS, compared
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 from tests.support.session_pair import free_endpoint

@@ -82,45 +82,6 @@ class SampleFacts:
             await kept.get()
         assert dropped == []
 
-    async def test_a_publisher_learns_of_its_first_subscriber_and_of_the_end_of_its_last(self, pair: Pair) -> None:
-        changes: asyncio.Queue[bool] = asyncio.Queue()
-        await pair.server.watch_subscribers(POSITION, changes.put_nowait)
-
-        async with asyncio.timeout(5):
-            told = [await changes.get()]
-            first = await pair.client.subscribe(POSITION, lambda _: None)
-            told.append(await changes.get())
-            second = await pair.client.subscribe("ldcn/**", lambda _: None)
-            await first.close()
-            await second.close()
-            told.append(await changes.get())
-
-        assert told == [False, True, False]
-        assert changes.empty()
-
-    async def test_a_publisher_that_comes_late_learns_of_those_who_wait_for_it(self, pair: Pair) -> None:
-        await subscribed(pair.server, pair.client)
-        changes: asyncio.Queue[bool] = asyncio.Queue()
-
-        declaration = await pair.server.watch_subscribers(POSITION, changes.put_nowait)
-
-        async with asyncio.timeout(5):
-            while not await changes.get():
-                pass
-        await declaration.close()
-
-    async def test_subscribers_of_other_keys_are_no_news(self, pair: Pair) -> None:
-        changes: asyncio.Queue[bool] = asyncio.Queue()
-        await pair.server.watch_subscribers(POSITION, changes.put_nowait)
-
-        async with asyncio.timeout(5):
-            told = [await changes.get()]
-            await pair.client.subscribe(KEYS.telemetry("y", "position"), lambda _: None)
-            await pair.client.subscribe(POSITION, lambda _: None)
-            told.append(await changes.get())
-
-        assert told == [False, True]
-
 
 class TokenFacts:
     """Facts about liveliness tokens and the end of a session."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -29,3 +30,30 @@ async def test_sending_threads_interrupt_nobody_once_there_are_some():
 
 def threads() -> list[Path]:
     return list(Path("/proc/self/task").iterdir())
+
+
+LISTENING = """
+import asyncio, sys
+from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+from pathlib import Path
+async def main():
+    async with (
+        open_zenoh_session(ZenohSettings(listen=(sys.argv[1],))),
+        open_zenoh_session(ZenohSettings(connect=(sys.argv[1],), mode="client")),
+    ):
+        names = [(thread / "comm").read_text() for thread in Path("/proc/self/task").iterdir()]
+        print(sum(name.startswith("tx-") for name in names))
+asyncio.run(main())
+"""
+
+
+@pytest.mark.real_time
+async def test_a_daemon_starts_enough_sending_threads():
+    """While one closes the link of a client that takes nothing, the others send."""
+    program = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", LISTENING, free_endpoint(), stdout=asyncio.subprocess.PIPE, cwd=Path(__file__).parents[2]
+    )
+    async with asyncio.timeout(30):
+        said, _ = await program.communicate()
+
+    assert int(said) >= 8
