@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import session_settings
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.zenoh_config import zenoh_config

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.model.plan import BusPlan
 from ldcnd.planning.plan import plan_rig
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.replay import Played, Take, config_of, play, published_line, virtual_time
 from ldcnd.log import configure_logging
 from ldcnd.messaging.codec import decode_received

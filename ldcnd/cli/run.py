@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.config import RigConfig, load_config, single_line
+from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.daemon.process.assembly import open_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.process.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap

@@ -6,7 +6,7 @@ import click
 
 from ldcnd.cli.manual import as_markdown as as_reference
 from ldcnd.cli.manual import man_pages
-from ldcnd.config_reference import config_reference
+from ldcnd.config.reference import config_reference
 from ldcnd.daemon.publish.asyncapi import asyncapi_text
 from ldcnd.daemon.publish.contract import all_schemas, as_markdown
 from ldcnd.errors import ConfigError

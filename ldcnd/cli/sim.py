@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
+from ldcnd.config.simulation import FaultPlanConfig, SimulationConfig
+from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import serve_pty
-from ldcnd.simulation_config import FaultPlanConfig, SimulationConfig
-from ldcnd.toml_file import read_toml
 
 DEFAULT_SEED = 1
 

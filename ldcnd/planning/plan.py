@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from ldcnd.axis_config import AxisConfig, RatesConfig
 from ldcnd.bus.settings import ServoCycle
-from ldcnd.bus_config import BAUDS, BusConfig
-from ldcnd.config import RigConfig
+from ldcnd.config.axis import AxisConfig, RatesConfig
+from ldcnd.config.bus import BAUDS, BusConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.costs import price_list
 from ldcnd.drivers.ldcn.network import RESET_BAUD
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ldcnd.axis_config import AxisConfig
-from ldcnd.bus_config import BusConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
 from ldcnd.drivers.smartstep.costs import BAUD, price_list, words_of
 from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile

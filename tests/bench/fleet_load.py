@@ -7,7 +7,7 @@ every sample at the cost that `tests.bench.sample_cost` has measured; bursts, qu
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ldcnd.axis_config import RatesConfig
+from ldcnd.config.axis import RatesConfig
 
 BITS = 8
 DEFAULT_RATES = RatesConfig()

@@ -15,7 +15,7 @@ from asyncio.subprocess import PIPE
 
 import structlog
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.messaging.session import Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 

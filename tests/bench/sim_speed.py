@@ -21,6 +21,7 @@ from pathlib import Path
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
+from ldcnd.config.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.drivers.driver import AxisSpec, Gains, Motion
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
@@ -31,7 +32,6 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import build_chain
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.simulation_config import SimulatedModuleConfig, SimulationConfig
 from tests.support.rough_host import enumeration, frame, jog, powered
 
 COUNTS = (1, 8, 31)

@@ -3,9 +3,9 @@
 import math
 from itertools import pairwise
 
-from ldcnd.axis_config import AxisConfig, RatesConfig
 from ldcnd.client.traces import take_trace
-from ldcnd.config import RigConfig
+from ldcnd.config.axis import AxisConfig, RatesConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, Function
 from ldcnd.drivers.smartstep.trace_data import chunk_plan

@@ -11,7 +11,7 @@ import pytest
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.service import require_writable
 from ldcnd.drivers.ldcn.addressing import LineRate, nulls
 from ldcnd.drivers.ldcn.registers import BaudCodes

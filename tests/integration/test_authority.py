@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus_config import GroupConfig
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import load_config
+from ldcnd.config.bus import GroupConfig
+from ldcnd.config.rig import load_config
 from ldcnd.errors import (
     CommandExpired,
     CommandIdReused,

@@ -5,7 +5,7 @@ from typing import Any
 
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.axis.axis import QUEUED_COMMANDS
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import StopLatched, TooManyRequests

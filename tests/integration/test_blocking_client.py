@@ -12,7 +12,7 @@ import pytest
 from ldcnd.client import blocking
 from ldcnd.client.connecting import at
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import LeaseHeld, SessionError, UnknownAxis
 from ldcnd.messaging.zenoh_session import open_zenoh_session

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from ldcnd.config import CapturesConfig, load_config
+from ldcnd.config.rig import CapturesConfig, load_config
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.wirelog.capture import parse_capture
 from tests.support.captures import FOLDER, replayed

@@ -8,7 +8,7 @@ from types import CodeType, FrameType
 
 import ldcnd
 from ldcnd.bus.queue import CHOICE
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from tests.support.rig import running_rig
 
 PACKAGE = str(Path(ldcnd.__file__).parent)

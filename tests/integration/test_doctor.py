@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.doctor import examine_line
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.errors import BusDown
 from ldcnd.model.health import Finding, Verdict
 

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command

@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.bus.queue import Lane
 from ldcnd.bus.statistics import bucket_limit_s
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.line.smartstep_line import LEDGER_FILE
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys

@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, wait_for_trace
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
 from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.samples import TelemetryItem

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.axis_config import LossConfig, LossPolicy
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.axis import LossConfig, LossPolicy
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.errors import NotReferenced, WrongState
 from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power, Reset, Verb
 from ldcnd.model.rig_commands import Rehearsal, RehearsalReply, Rehearse

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.bus.queue import Lane
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
 from ldcnd.model.commands import MoveVelocity, Power, Reset, Verb

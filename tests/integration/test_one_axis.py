@@ -2,7 +2,7 @@
 
 import asyncio
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.model.samples import TelemetryItem
 from tests.support.rig import running_rig
 

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from tests.support.rig import running_rig
 
 DRIVES = 8

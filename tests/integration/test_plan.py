@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from ldcnd.bus.queue import Lane
 from ldcnd.cli.main import cli
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl

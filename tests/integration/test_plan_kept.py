@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from ldcnd.bus.queue import Lane
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.model.plan import BusPlan
 from ldcnd.planning.plan import require_plan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

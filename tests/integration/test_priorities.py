@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.client.traces import arm_trace
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES

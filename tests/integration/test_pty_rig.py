@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.model.commands import Home, MoveAbsolute, Power, Verb
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, client, daemon, simulated_terminal

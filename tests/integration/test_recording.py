@@ -10,7 +10,7 @@ from asyncio.subprocess import PIPE
 import pytest
 from mcap.reader import make_reader
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.session import Sample, SampleKind

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState

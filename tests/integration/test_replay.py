@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.replay import config_of
 from ldcnd.errors import ConfigError, MalformedRequest, ReplayDeviation
 from ldcnd.wirelog.capture import Capture, parse_capture

@@ -10,7 +10,7 @@ from typing import TypeVar
 import pytest
 
 from ldcnd.client.rig_client import RigClient, Samples, find_rigs
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.session import Session

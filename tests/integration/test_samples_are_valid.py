@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.model.commands import Power, Verb
 from ldcnd.model.samples import AxisState
 from tests.support.rig import SIMULATED, running_rig

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP
 from ldcnd.planning.plan import plan_rig

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus_config import RecorderConfig
 from ldcnd.client.wire_log import fetch_wire_log
-from ldcnd.config import load_config
+from ldcnd.config.bus import RecorderConfig
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.capture.flight_recorder import LONGEST_DATA_BYTES
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.rig_commands import ReadWireLog, WireLogReply

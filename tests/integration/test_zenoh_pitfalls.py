@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import ErrorCode, ValueOutOfRange
 from ldcnd.messaging.codec import decode

@@ -11,7 +11,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import LdcndError, RequestRefused

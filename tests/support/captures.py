@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.capture.captures import lines_of
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.replay import config_of, overheard, play, published_line, virtual_time

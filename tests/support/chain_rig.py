@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Message, Scope
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.console.feed import Feed
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.rigs import Endpoint, Rigs

@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.model.commands import AxisCommand, CommandReply, Power, Verb
 from ldcnd.model.samples import AxisState, FaultSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.messaging.codec import decode
 from ldcnd.model.health import AxisHealth, BusHealth
 from ldcnd.model.plan import PollPriority

@@ -13,7 +13,7 @@ from typing import Any
 import jsonschema_rs
 from mcap.reader import make_reader
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.messaging.session import Sample
 from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder
 from ldcnd.sim.chain import Chain

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from ldcnd.axis_config import AxisConfig, RatesConfig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.axis import AxisConfig, RatesConfig
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.drivers.smartstep.config import SmartStepUnitConfig
 from ldcnd.drivers.smartstep.parameters import PN000
 from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
@@ -20,7 +21,6 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.smartstep_config import SmartStepUnitConfig
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support.process import free_port
 from tests.support.rig import RunningRig, running_rig

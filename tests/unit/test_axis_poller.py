@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ldcnd.axis_config import RatesConfig
+from ldcnd.config.axis import RatesConfig
 from ldcnd.daemon.axis.polling import AxisPoller
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning.plan import wanted_rates_hz

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.config import load_config, single_line
+from ldcnd.config.rig import load_config, single_line
 from ldcnd.errors import ConfigError
 
 GOOD = """

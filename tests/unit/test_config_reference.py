@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from ldcnd.config_reference import config_reference
+from ldcnd.config.reference import config_reference
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
 

@@ -11,7 +11,7 @@ import pytest
 from ldcnd.cli.fleet import table
 from ldcnd.client.fleet import survey
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import MalformedRequest
 from ldcnd.messaging.keys import Keys

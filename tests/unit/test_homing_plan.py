@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.axis_config import AxisConfig
+from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.procedures.home import plan_search
 from ldcnd.drivers.driver import StopMode
 from ldcnd.drivers.scaling import Scale

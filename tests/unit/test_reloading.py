@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.reload import plan_reload
 from ldcnd.errors import ConfigError
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.sim import command
+from ldcnd.config.simulation import FaultPlanConfig, ModuleKnobs, PlantConfig, SimulatedChainConfig, SimulationConfig
+from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
@@ -15,8 +17,6 @@ from ldcnd.sim.ldcn.chain import MODELS, build_chain
 from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.simulation_config import FaultPlanConfig, ModuleKnobs, PlantConfig, SimulatedChainConfig, SimulationConfig
-from ldcnd.toml_file import read_toml
 
 TESTS = Path(__file__).parents[1]
 DOCS = TESTS.parent / "docs"

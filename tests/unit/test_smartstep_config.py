@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
 from ldcnd.model.samples import MonitorName
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.line import Phase
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.process.service import Service, describe

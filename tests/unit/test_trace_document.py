@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.trace import command
+from ldcnd.drivers.smartstep.config import SmartStepTraceConfig
 from ldcnd.messaging.codec import decode
 from ldcnd.model.traces import TakeTrace
-from ldcnd.smartstep_trace_config import SmartStepTraceConfig
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "take-a-trace.md").read_text(encoding="utf-8")
 

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.messaging.zenoh_config import endpoints, root_certificate, zenoh_config
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 

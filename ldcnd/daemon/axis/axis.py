@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
+from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.motion import AxisMotion, preview

@@ -9,8 +9,8 @@ import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
+from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.guards import AxisView, check_acceleration, check_position, check_velocity
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion

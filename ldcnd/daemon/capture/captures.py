@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
-from ldcnd.config import CapturesConfig, RigConfig, ZenohConfig
+from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
 from ldcnd.drivers.transcript import describer

@@ -7,7 +7,7 @@ so that it shows what came of it, and never sooner than `PAUSE_S` after the one 
 import asyncio
 from collections.abc import Callable, Iterator
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import CaptureStore, Run, Snapshot, capture_of, snapshot_of
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig

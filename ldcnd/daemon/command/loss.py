@@ -2,7 +2,7 @@
 
 import asyncio
 
-from ldcnd.axis_config import LossPolicy
+from ldcnd.config.axis import LossPolicy
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority

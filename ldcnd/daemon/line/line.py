@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, Priority
+from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.polling import AxisPoller
 from ldcnd.drivers.driver import ReadingListeners, StopMode

@@ -4,11 +4,11 @@ import asyncio
 from collections.abc import Mapping
 from pathlib import Path
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus_config import BusConfig
-from ldcnd.config import RigConfig, SimulatedLineConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.rig import RigConfig, SimulatedLineConfig
 from ldcnd.drivers.driver import AxisSpec
 from ldcnd.drivers.smartstep.drive import UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger

@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager
 from itertools import count
 from types import MappingProxyType
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus_config import BusConfig
-from ldcnd.config import RigConfig, SimulatedLineConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.rig import RigConfig, SimulatedLineConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import random_token

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
 from ldcnd.daemon.capture.watch import CaptureWatch
 from ldcnd.daemon.clock import Clock

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel, ValidationError
 
-from ldcnd.axis_config import AxisConfig
-from ldcnd.bus_config import BusConfig
-from ldcnd.config import RigConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.errors import ConfigError
 
 APPLICABLE = ("limits", "velocity", "acceleration", "rates", "priority")

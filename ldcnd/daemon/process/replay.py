@@ -13,7 +13,7 @@ from itertools import pairwise
 
 from pydantic import ValidationError
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import of_one_line
 from ldcnd.daemon.capture.flight_recorder import STOP
 from ldcnd.daemon.command.authority import random_token

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.process import systemd
 from ldcnd.daemon.process.daemon import Daemon

@@ -10,7 +10,7 @@ from enum import StrEnum
 from functools import cache
 from types import MappingProxyType
 
-from ldcnd.config import RigConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.messaging.keys import EVENT, RIG_ITSELF, Keys
 from ldcnd.model.catalogue import PUBLIC_MODELS
 from ldcnd.model.commands import CommandReply, Stop, StopReply

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from ldcnd.axis_config import AxisConfig, HomeConfig
+from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import LARGEST_COUNT, AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import Procedure, Turn

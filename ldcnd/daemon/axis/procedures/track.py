@@ -1,6 +1,6 @@
 """A stream of set-points that an axis follows without a profile, bounded in step and rate."""
 
-from ldcnd.axis_config import TrackingConfig
+from ldcnd.config.axis import TrackingConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion
 from ldcnd.daemon.axis.procedure import Procedure, Turn

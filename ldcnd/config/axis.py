@@ -5,15 +5,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from ldcnd import smartstep_config
-from ldcnd.config_names import DeviceIdentity, Name
+from ldcnd.config.toml import DeviceIdentity, Name
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
+from ldcnd.drivers.smartstep import config as smartstep_config
+from ldcnd.drivers.smartstep.config import SmartStepUnitConfig
 from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
 from ldcnd.model.commands import HomeMethod, HomeStop
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisLimits
 from ldcnd.model.plan import PollPriority
-from ldcnd.smartstep_config import SmartStepUnitConfig
 
 
 def _known_model(model: str) -> str:

@@ -4,14 +4,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ldcnd import smartstep_config
-from ldcnd.axis_config import AxisConfig
-from ldcnd.config_names import DeviceIdentity, Name, refuse_duplicates
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.toml import DeviceIdentity, Name, refuse_duplicates
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.line import AdoptFallback, StartPolicy
+from ldcnd.drivers.smartstep import config as smartstep_config
+from ldcnd.drivers.smartstep.config import SmartStepLineConfig
 from ldcnd.drivers.smartstep.profiles import Wiring
 from ldcnd.model.frozen import Frozen
-from ldcnd.smartstep_config import SmartStepLineConfig
 from ldcnd.transport.line_discipline import LONGEST_RTS_DELAY_MS, Rs485
 
 BAUDS = (9600, 19_200, 57_600, 115_200, 230_400)

@@ -5,13 +5,12 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from ldcnd.bus_config import BusConfig
-from ldcnd.config_names import NAME_CHARACTERS, Name, refuse_duplicates
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.simulation import SimulatedChainConfig
+from ldcnd.config.toml import NAME_CHARACTERS, Name, read_toml, refuse_duplicates
+from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
 from ldcnd.errors import ConfigError
 from ldcnd.model.frozen import Frozen
-from ldcnd.simulation_config import SimulatedChainConfig
-from ldcnd.smartstep_config import SimulatedUnitConfig
-from ldcnd.toml_file import read_toml
 
 
 class SimulatedLineConfig(SimulatedChainConfig):

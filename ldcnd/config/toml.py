@@ -3,9 +3,9 @@
 import difflib
 import tomllib
 from pathlib import Path
-from typing import TypeVar, get_args
+from typing import Annotated, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from ldcnd.errors import ConfigError
 from ldcnd.model.frozen import Frozen
@@ -87,3 +87,23 @@ def _table_in(annotation: object) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((found for each in get_args(annotation) if (found := _table_in(each))), None)
+
+
+NAME_CHARACTERS = 63
+
+Name = Annotated[str, Field(pattern=rf"^[a-z0-9][a-z0-9_]{{0,{NAME_CHARACTERS - 1}}}$")]
+"""One chunk of a key: lower-case letters, digits, underscores."""
+
+DeviceIdentity = tuple[Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]]
+"""Id and version, as an LDCN or NMC module reports them."""
+
+
+def refuse_duplicates(what: str, names: list[str]) -> None:
+    """Refuse a list in which something stands twice.
+
+    Raises:
+        ValueError: names what stands twice.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{what} {name!r} is given more than once")
