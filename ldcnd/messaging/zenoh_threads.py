@@ -29,10 +29,10 @@ async def senders_wait() -> None:
     sleeps again. As a batch thread it has its share of the processor, but interrupts nobody: what belongs to one poll
     leaves together. Under a real-time policy threads do not interrupt each other anyway.
     """
-    while True:
-        if _let_senders_wait():
-            return
+    while not _let_senders_wait():
         await asyncio.sleep(LOOK_S)
+    await asyncio.sleep(LOOK_S)
+    _let_senders_wait()  # those that had just been started, and had no name yet
 
 
 def _let_senders_wait() -> bool:
