@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import ClassVar
 
 from ldcnd.fault_pages import page_of
+from ldcnd.printable import printable
 
 
 class ErrorCode(StrEnum):
@@ -94,13 +95,14 @@ class LdcndError(Exception):
         nearest: float | None = None,
         remedy: str | None = None,
     ) -> None:
-        super().__init__(message)
-        self.message = message
-        self.axis = axis
-        self.value = value
-        self.limit = limit
+        # a message repeats what strangers have sent, and is printed on terminals and in logs
+        self.message = printable(message, keep="\n")
+        super().__init__(self.message)
+        self.axis = axis if axis is None else printable(axis)
+        self.value = printable(value) if isinstance(value, str) else value
+        self.limit = printable(limit) if isinstance(limit, str) else limit
         self.nearest = nearest
-        self.remedy = remedy
+        self.remedy = remedy if remedy is None else printable(remedy, keep="\n")
 
     @property
     def page(self) -> str | None:

@@ -7,12 +7,16 @@ Source: sd-daemon(3) for the prefixes of lines, systemd.exec(5) "$JOURNAL_STREAM
 
 import importlib
 import logging
+import math
 import os
 import sys
-from collections.abc import Mapping, MutableMapping
+import time
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any, TextIO
 
 import structlog
+
+from ldcnd.printable import printable
 
 PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Levels as syslog and the journal number them."""
@@ -24,6 +28,36 @@ def get_logger(name: str) -> structlog.typing.FilteringBoundLogger:
     return logger
 
 
+class LogLimit:
+    """Keeps a record that anyone can cause from filling a disk.
+
+    Args:
+        count: so many records pass in a period.
+        period_s: how long it is, s.
+        now_s: returns the time, s.
+    """
+
+    def __init__(self, count: int = 20, period_s: float = 10.0, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._count = count
+        self._period_s = period_s
+        self._now_s = now_s
+        self._since_s = -math.inf
+        self._passed = 0
+        self._held_back = 0
+
+    def admit(self) -> dict[str, int] | None:
+        """Return fields for a record that may pass, with how many have not since the last one; None for the others."""
+        now_s = self._now_s()
+        if now_s - self._since_s >= self._period_s:
+            self._since_s, self._passed = now_s, 0
+        if self._passed >= self._count:
+            self._held_back += 1
+            return None
+        self._passed += 1
+        held_back, self._held_back = self._held_back, 0
+        return {"held_back": held_back} if held_back else {}
+
+
 def configure_logging(*, json: bool = False, level: str = "info") -> None:
     """Send log records to standard error, as text for people or as JSON lines; to the journal where that listens there.
 
@@ -32,7 +66,7 @@ def configure_logging(*, json: bool = False, level: str = "info") -> None:
         level: debug, info, warning or error.
     """
     journal = not json and is_journal(sys.stderr, os.environ)
-    processors: list[structlog.typing.Processor] = [structlog.processors.format_exc_info]
+    processors: list[structlog.typing.Processor] = [structlog.processors.format_exc_info, _fit_for_terminals]
     if journal:
         handler = _journal_handler(sys.stderr)
         processors.append(_text_and_fields)
@@ -81,6 +115,14 @@ def _journal_handler(stream: TextIO) -> logging.Handler:
     else:
         handler = journald.JournaldLogHandler(identifier="ldcnd", use_message_id=False)
     return handler
+
+
+def _fit_for_terminals(_logger: object, _method: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    """Show control characters as escapes: fields repeat what strangers have sent."""
+    for key, value in event.items():
+        if isinstance(value, str):
+            event[key] = printable(value, keep="\n\t" if key == "exception" else "")
+    return event
 
 
 def _text_and_fields(

@@ -6,7 +6,9 @@ schema.
 """
 
 import math
+import re
 import sys
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
 from functools import cache, lru_cache
 from typing import TypeVar
@@ -18,6 +20,7 @@ import pydantic_core
 from ldcnd.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge
 from ldcnd.model.commands import ErrorReply, ReceivedError
 from ldcnd.model.frozen import Frozen, schema_name
+from ldcnd.printable import is_printable, printable
 
 MAX_PAYLOAD_BYTES = 16 * 1024
 """No request is longer: the largest has a quarter of this."""
@@ -78,18 +81,28 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
 
     Raises:
         PayloadTooLarge: the payload is too long.
-        MalformedRequest: anything else; names the first field that is wrong and what is allowed there.
+        MalformedRequest: anything else; names the first field that is wrong and what is allowed there. No text may have
+            control or formatting characters: it would reach terminals by way of events and logs.
     """
     try:
-        return model.model_validate_json(as_json(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
+        request = model.model_validate_json(as_json(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
     except pydantic.ValidationError as error:
         raise _explained(model, error) from None
+    for field, text in _texts(request):
+        if not is_printable(text):
+            raise MalformedRequest(
+                f"{field}: control and formatting characters are not accepted, not {_short(repr(text))}",
+                value=_short(repr(text)),
+                remedy="leave them out",
+            )
+    return request
 
 
 def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
     """Return the model that a daemon's answer or sample stands for, without the fields that only a newer daemon knows.
 
     For clients: within one version of the interface fields are only ever added, so what is unknown may be ignored.
+    Control and formatting characters in texts become escapes: what the daemon says may end on a terminal.
 
     Args:
         model: what it must be.
@@ -100,8 +113,11 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
         PayloadTooLarge: the payload is too long.
         MalformedRequest: a known field is missing or wrong.
     """
+    text = as_json(payload, encoding, MAX_RECEIVED_BYTES)
     try:
-        return model.model_validate_json(as_json(payload, encoding, MAX_RECEIVED_BYTES), strict=True, extra="ignore")
+        if _SUSPICIOUS.search(text):
+            text = _with_escapes(text)
+        return model.model_validate_json(text, strict=True, extra="ignore")
     except pydantic.ValidationError as error:
         raise _explained(model, error) from None
 
@@ -146,6 +162,49 @@ def rebuild_error(reply: ReceivedError) -> LdcndError:
         nearest=reply.nearest,
         remedy=reply.remedy,
     )
+
+
+_SUSPICIOUS = re.compile(
+    # escapes of JSON that may stand for a character that is not printable, and such characters themselves
+    rb"\\u|\\[bfnrt]|[\x7f]|\xc2[\x80-\x9f\xad]|\xd8\x9c|\xe1\xa0\x8e|\xe2\x80|\xe2\x81|\xef\xbb|\xef\xbf|\xf3\xa0"
+)
+
+
+def _with_escapes(text: bytes) -> bytes:
+    """Return JSON whose texts have no unprintable characters but line feeds."""
+    try:
+        return pydantic_core.to_json(_escaped(pydantic_core.from_json(text)))
+    except ValueError:
+        return text  # validation says what is wrong with it
+
+
+def _escaped(value: object) -> object:
+    match value:
+        case str():
+            return printable(value, keep="\n")
+        case list():
+            return [_escaped(item) for item in value]
+        case dict():
+            return {_escaped(key): _escaped(item) for key, item in value.items()}
+        case _:
+            return value
+
+
+def _texts(value: object, field: str = "") -> Iterator[tuple[str, str]]:
+    """Yield every text in a model, with the name of its field."""
+    match value:
+        case str():
+            yield field, value
+        case Frozen():
+            for name, item in vars(value).items():
+                yield from _texts(item, f"{field}.{name}" if field else name)
+        case tuple() | list():
+            for item in value:
+                yield from _texts(item, field)
+        case Mapping():
+            for key, item in value.items():
+                yield from _texts(key, field)
+                yield from _texts(item, f"{field}.{key}")
 
 
 @cache

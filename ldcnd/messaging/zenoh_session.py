@@ -20,7 +20,7 @@ import zenoh
 from zenoh.handlers import Callback, RingChannel
 
 from ldcnd.errors import SessionError, ValueOutOfRange
-from ldcnd.log import get_logger
+from ldcnd.log import LogLimit, get_logger
 from ldcnd.messaging import zenoh_failures
 from ldcnd.messaging.codec import Encoding, encode, error_reply
 from ldcnd.messaging.hand_over import Collector, HandOver, Intake, QueryIntake, TokenChanges
@@ -47,10 +47,12 @@ from ldcnd.messaging.zenoh_config import endpoints, root_certificate, share_sock
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.messaging.zenoh_threads import provide_threads
 from ldcnd.messaging.zenoh_values import TRAVEL, Stamps, to_answers, to_sample, to_stamp
+from ldcnd.printable import printable
 
 __all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
 
 log = get_logger("zenoh")
+_LOST_ANSWERS = LogLimit()
 
 OPEN_TIME_S = 10.0
 DECLARE_TIME_S = 5.0
@@ -354,7 +356,8 @@ class ZenohSession(Session):
         if source is None or self._closed:
             return None
         zid = str(source.source_id.zid)
-        return next((link.auth_identifier for link in self._session.info.links() if str(link.zid) == zid), None)
+        login = next((link.auth_identifier for link in self._session.info.links() if str(link.zid) == zid), None)
+        return login if login is None else printable(login)
 
     def _new_outlet(self, key: str, qos: Qos) -> _Outlet:
         outlet = self._outlets[key] = _Outlet(qos)
@@ -397,6 +400,7 @@ class _AnswerPath:
                     asked.reply(answer.key, answer.payload, encoding=answer.encoding, timestamp=stamp)
             asked.drop()  # type: ignore[no-untyped-call] # the stub leaves its result open
         except zenoh.ZError as error:
-            log.warning("answer lost", reason=str(error))
+            if (fields := _LOST_ANSWERS.admit()) is not None:
+                log.warning("answer lost", reason=str(error), **fields)
         finally:
             self.on_gone()

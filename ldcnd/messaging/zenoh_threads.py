@@ -29,9 +29,11 @@ async def senders_wait() -> None:
     sleeps again. As a batch thread it has its share of the processor, but interrupts nobody: what belongs to one poll
     leaves together. Under a real-time policy threads do not interrupt each other anyway.
     """
-    while not _let_senders_wait():
+    while True:
+        found = _let_senders_wait()
         await asyncio.sleep(LOOK_S)
-    await asyncio.sleep(LOOK_S)
+        if found:
+            break
     _let_senders_wait()  # those that had just been started, and had no name yet
 
 

@@ -15,6 +15,8 @@ from pydantic import ConfigDict, Field
 from ldcnd.errors import ErrorCode
 from ldcnd.model.frozen import Frozen
 
+LARGEST_INTEGER = 2**53 - 1
+"""The largest integer that every reader of JSON keeps exactly."""
 LONGEST_NAME = 64
 """Characters of a name or an id that a client gives."""
 ANSWER_S = 5.0
@@ -171,12 +173,12 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
     """Who sends it: a name for people, in events and the log; not authenticated. A lease knows its own."""
     lease: str | None = None
     """The lease under which it is sent."""
-    sequence: int | None = Field(default=None, ge=0)
+    sequence: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
     """Grows with every command under the lease; an older one that comes later is refused."""
     instance: str | None = None
     """The run of the daemon that it is meant for, as in `meta/daemon`; after a restart, which forgets all command ids,
     a command that was sent again is refused instead of being carried out twice."""
-    not_after: int | None = None
+    not_after: int | None = Field(default=None, ge=0, le=2**63 - 1)
     """Do not start it after this instant, UTC in ns since 1970; needs clocks that agree."""
 
 

@@ -3,9 +3,11 @@ import logging
 import os
 from pathlib import Path
 
+import pytest
 import structlog
 
-from ldcnd.log import PrefixedLines, configure_logging, get_logger, is_journal
+from ldcnd.log import LogLimit, PrefixedLines, configure_logging, get_logger, is_journal
+from ldcnd.printable import is_printable
 
 
 def test_stream_is_the_journal_only_when_the_numbers_agree(tmp_path: Path):
@@ -49,3 +51,32 @@ def test_journal_entries_have_text_priority_and_fields(tmp_path: Path, monkeypat
     assert (record.bus, record.axis, record.command_id, record.code) == ("line0", "x", "a-1", "bus_down")
     assert record.name == "ldcnd.test"
     assert record.name_ == "n"
+
+
+@pytest.mark.parametrize("json", [False, True])
+def test_what_strangers_send_is_logged_as_escapes(*, json: bool, monkeypatch: pytest.MonkeyPatch):
+    said = io.StringIO()
+    monkeypatch.setattr("sys.stderr", said)
+    try:
+        configure_logging(json=json)
+        get_logger("test").info("refused", key="ldcn/sim/@cmd/\x1b[2J/\u202efly\nforged line")
+    finally:
+        logging.getLogger().handlers.clear()
+        structlog.reset_defaults()
+
+    text = said.getvalue()
+    assert text.count("\n") == 1
+    assert is_printable(text.rstrip("\n"))
+    assert "\\x1b[2J" in text.replace("\\\\", "\\")
+
+
+def test_records_that_anyone_can_cause_are_limited_and_those_held_back_are_counted():
+    now_s = 0.0
+    limit = LogLimit(count=2, period_s=10, now_s=lambda: now_s)
+
+    admitted = [limit.admit() for _ in range(5)]
+    now_s = 10.0
+
+    assert admitted == [{}, {}, None, None, None]
+    assert limit.admit() == {"held_back": 3}
+    assert limit.admit() == {}

@@ -10,7 +10,7 @@ from ldcnd.daemon.command.dispatch import Control, move_together
 from ldcnd.daemon.command.loss import LeaseWatch, rehearse
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import InternalError, LdcndError, MalformedRequest, ShuttingDown, TooManyRequests, UnknownVerb
-from ldcnd.log import get_logger
+from ldcnd.log import LogLimit, get_logger
 from ldcnd.messaging.codec import decode, encode, reply_encoding
 from ldcnd.messaging.keys import RIG_ITSELF, Keys
 from ldcnd.messaging.session import Query
@@ -41,6 +41,7 @@ class Requests:
         self._pending = 0
         self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
         self._closing = False
+        self._refusals_logged = LogLimit(now_s=asyncio.get_running_loop().time)
 
     def close(self) -> None:
         """Refuse further commands; stops are still taken."""
@@ -183,5 +184,6 @@ class Requests:
         return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
 
     def _refuse(self, query: Query, error: LdcndError) -> None:
-        log.info("refused", key=query.key, code=error.code.value, reason=error.message)
+        if (fields := self._refusals_logged.admit()) is not None:
+            log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
         query.refuse(error)
