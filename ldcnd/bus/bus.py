@@ -14,6 +14,7 @@ from ldcnd.bus.turn import Job, PollTurn, StopProbe, Turn
 from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
 from ldcnd.exchange import Exchange
 from ldcnd.log import get_logger
+from ldcnd.transport.adapter import LineErrors
 from ldcnd.transport.transport import Opener, Transport
 from ldcnd.wirelog.recorder import WireEvent, WireLog
 
@@ -222,6 +223,10 @@ class Bus:
     def offers(self, baud: int) -> bool:
         """Tell whether the port can be set to a rate; without an open port nothing says that it cannot."""
         return self._line is None or self._line.wire.offers(baud)
+
+    def line_errors(self) -> LineErrors | None:
+        """Return what the port's driver has counted since it was loaded; None without a port that counts."""
+        return self._line.wire.line_errors() if self._line else None
 
     async def wait_opened(self) -> None:
         """Return as soon as the line is open."""

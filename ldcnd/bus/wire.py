@@ -10,6 +10,7 @@ from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Turn
 from ldcnd.errors import TransportLost
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.transport.adapter import LineErrors
 from ldcnd.transport.transport import Receiver, Transport
 from ldcnd.wirelog.recorder import WireEvent, WireLog
 
@@ -192,6 +193,10 @@ class Wire:
     def offers(self, baud: int) -> bool:
         """See `Transport`."""
         return self._transport.offers(baud)
+
+    def line_errors(self) -> LineErrors | None:
+        """See `Transport`."""
+        return self._transport.line_errors()
 
     def attach(self, receiver: Receiver) -> None:
         """See `Transport`."""

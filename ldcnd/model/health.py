@@ -146,7 +146,7 @@ class Finding(Frozen):
     """One thing that was examined."""
 
     axis: str
-    """The drive."""
+    """The drive, or the line where it is no single one."""
     what: str
     """What was examined."""
     verdict: Verdict
@@ -155,3 +155,5 @@ class Finding(Frozen):
     """The result, for a person."""
     verifies: str | None = None
     """The assumption of the drive's profile that it says something about."""
+    remedy: str | None = None
+    """What to type, or to write into the configuration, to put it right."""

@@ -24,6 +24,7 @@ import serial_asyncio
 import structlog
 
 from ldcnd.errors import TransportLost
+from ldcnd.transport.adapter import LineErrors, line_errors
 from ldcnd.transport.incoming import Incoming
 from ldcnd.transport.line_discipline import (
     STANDARD_BAUDS,
@@ -176,6 +177,10 @@ class SerialPort(Transport):
     def offers(self, baud: int) -> bool:
         """See `Transport`: standard rates were tried when the port was opened, another one shows when it is set."""
         return baud not in STANDARD_BAUDS or baud in self._port.bauds
+
+    def line_errors(self) -> LineErrors | None:
+        """See `Transport`."""
+        return None if self._incoming.reason else line_errors(self._descriptor)
 
     def attach(self, receiver: Receiver) -> None:
         """See `Transport`."""

@@ -7,6 +7,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from typing import Protocol
 
+from ldcnd.transport.adapter import LineErrors
+
 
 class Receiver(Protocol):
     """Who gets the bytes; called on the event loop, must not block and must not raise."""
@@ -35,6 +37,10 @@ class Transport(ABC):
     def offers(self, baud: int) -> bool:  # noqa: ARG002 - the general answer
         """Tell whether the pipe can be set to a rate, as far as is known before it is tried."""
         return not self.fixed_baud
+
+    def line_errors(self) -> LineErrors | None:
+        """Return what the port's driver has counted; None where it counts nothing."""
+        return None
 
     @abstractmethod
     def attach(self, receiver: Receiver) -> None:

@@ -1,6 +1,5 @@
 """The composition root: from a configuration to a daemon that is ready to run. The only place that knows every part."""
 
-import asyncio
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -9,40 +8,31 @@ from itertools import count
 from types import MappingProxyType
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
-from ldcnd.config.axis import AxisConfig
-from ldcnd.config.bus import BusConfig
-from ldcnd.config.rig import RigConfig, SimulatedLineConfig
+from ldcnd.bus_config import BusConfig
+from ldcnd.config import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import random_token
 from ldcnd.daemon.command.dispatch import build_control
 from ldcnd.daemon.command.events import EventLog
 from ldcnd.daemon.command.ledger import Ledger
+from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.line.smartstep_line import build_line, open_ledger
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.drivers.driver import AxisDriver, AxisSpec, Gains
-from ldcnd.drivers.ldcn.network import RESET_BAUD
-from ldcnd.drivers.line import GroupSpec, LineSpec, ModuleEntry
-from ldcnd.drivers.registry import FAMILIES
+from ldcnd.drivers.driver import AxisDriver
 from ldcnd.drivers.smartstep.ledger import EepromLedger
 from ldcnd.messaging.codec import Encoding
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.planning.plan import servo_cycle, with_probes_that_fit
+from ldcnd.planning.plan import with_probes_that_fit
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.ldcn.chain import build_chain
-from ldcnd.sim.line import open_simulated_line
-from ldcnd.transport.port_url import SOCKET, port_opener
 from ldcnd.transport.transport import Opener
 
-SIMULATED = "sim:"
-"""A port of this kind names a simulated line instead of a device."""
 ENCODINGS = {"msgpack": Encoding.MSGPACK, "json": Encoding.JSON}
 
 
@@ -123,20 +113,7 @@ def _build_bus(
         line, units = build_line(config, settings, eeprom, chains, openers.get(settings.name))
         services = tuple(make_axis(axis, line, units.axes[axis.name]) for axis in settings.axis)
         return BusService(line, units, services, port=settings.port, family=settings.family)
-    opening_baud = settings.baud if settings.port.startswith(SOCKET) else RESET_BAUD
-    bus = Bus(
-        BusSettings(
-            settings.name,
-            opening_baud,
-            margin_s=settings.margin_ms / 1000,
-            cycle=servo_cycle(settings),
-            recorded_s=settings.recorder.seconds,
-            recorded_bytes=settings.recorder.memory_mb * 1_000_000,
-        ),
-        openers.get(settings.name) or _opener(config, settings, opening_baud, chains),
-    )
-    specs = tuple(_spec(axis) for axis in settings.axis)
-    network = FAMILIES[settings.family](bus, specs, settings.baud, _line(settings))
+    bus, network = build_ldcn_line(config, settings, chains, openers.get(settings.name))
     axes = tuple(make_axis(axis, bus, network.axes[axis.name]) for axis in settings.axis)
     return BusService(
         bus,
@@ -146,31 +123,3 @@ def _build_bus(
         family=settings.family,
         stop_probe_hz=with_probes_that_fit(settings).stop_probe_hz,
     )
-
-
-def _spec(axis: AxisConfig) -> AxisSpec:
-    gains = Gains(**axis.gains.model_dump()) if axis.gains else None
-    return AxisSpec(axis.name, axis.address, axis.model, gains, axis.identity)
-
-
-def _line(settings: BusConfig) -> LineSpec:
-    return LineSpec(
-        start=settings.start,
-        adopt_fallback=settings.adopt_fallback,
-        alternate_divisors=settings.divisors == "alternate",
-        snapshot=settings.snapshot,
-        modules=tuple(ModuleEntry(module.address, module.model, module.identity) for module in settings.module),
-        groups=tuple(GroupSpec(group.name, group.axes, group.leader) for group in settings.group),
-    )
-
-
-def _opener(config: RigConfig, settings: BusConfig, baud: int, chains: Mapping[str, Chain]) -> Opener:
-    if not settings.port.startswith(SIMULATED):
-        return port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.transmitter)
-    name = settings.port.removeprefix(SIMULATED)
-    chain = chains.get(name) or _chain(next(line for line in config.sim if line.name == name))
-    return lambda: open_simulated_line(chain)
-
-
-def _chain(line: SimulatedLineConfig) -> Chain:
-    return build_chain(line.spec(starts_at_s=asyncio.get_running_loop().time()))

@@ -77,7 +77,7 @@ class Adoption:
                 like one that another host has set up; says precisely what differs.
             BusError: the line failed meanwhile.
         """
-        await self._search()
+        await self.search()
         identities = {address: found.identity for address, found in self.found.items()}
         problems = list(differences(self._expected, identities))
         bauds = sorted({found.baud for found in self.found.values()})
@@ -116,7 +116,7 @@ class Adoption:
                 moving.append(f"address {address}, {found.identity}, moves")
         return tuple(moving)
 
-    async def _search(self) -> None:
+    async def search(self) -> None:
         """Ask every expected address at every rate, the working rate first, until all have answered."""
         self.found.clear()
         others = sorted(set(self._rate.candidates) - {self._rate.working}, reverse=True)

@@ -27,7 +27,7 @@ from ldcnd.drivers.ldcn.addressing import (
     differences,
     read_identity,
 )
-from ldcnd.drivers.ldcn.adoption import Adopted, Adoption, Rejoin
+from ldcnd.drivers.ldcn.adoption import Adopted, Adoption, Found, Rejoin
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.profiles import PROFILES
@@ -239,6 +239,23 @@ class LdcnNetwork(Network):
             for address, found in sorted(modules.items())
             if address not in known
         )
+
+    async def survey(self) -> Mapping[int, Found]:
+        """Find who answers where, by reading only.
+
+        The host is at the rate of the first of them afterwards, or at that of power-up.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        await self._adoption.search()
+        found = dict(sorted(self._adoption.found.items()))
+        await self._rate.host_to(next(iter(found.values())).baud if found else RESET_BAUD)
+        return found
+
+    def differences(self, found: Mapping[int, Found]) -> tuple[str, ...]:
+        """Return in words what of that is not as configured."""
+        return differences(self._expected, {address: each.identity for address, each in found.items()})
 
     # -- while the line is up ----------------------------------------------------------------------------------------
 
