@@ -10,9 +10,9 @@ import click
 from ldcnd.bus.bus import Bus
 from ldcnd.bus_config import BusConfig
 from ldcnd.config import RigConfig, load_config
+from ldcnd.daemon.line import examination
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.smartstep_line import build_line
-from ldcnd.drivers.ldcn import commissioning
 from ldcnd.drivers.smartstep.commissioning import examine
 from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.drivers.smartstep.network import SmartStepNetwork
@@ -76,16 +76,16 @@ async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Find
     if settings.family == "smartstep":
         bus, units = build_line(rig, settings, None, {})
         bus.resync = units.resync
-        examination = _smartstep(bus, units)
+        findings = _smartstep(bus, units)
     else:
         bus, network = build_ldcn_line(rig, settings, {})
         bus.resync = network.resync
-        examination = commissioning.examine(bus, network, _as_configured(settings))
+        findings = examination.examine(bus, network, _as_configured(settings))
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name=f"bus {settings.name}")
         try:
             await _opened(bus, settings)
-            async for finding in examination:
+            async for finding in findings:
                 show(finding)
         finally:
             owner.cancel()
@@ -98,8 +98,8 @@ async def _smartstep(bus: Bus, network: SmartStepNetwork) -> AsyncIterator[Findi
                 yield finding
 
 
-def _as_configured(settings: BusConfig) -> commissioning.LineAsConfigured:
-    return commissioning.LineAsConfigured(
+def _as_configured(settings: BusConfig) -> examination.LineAsConfigured:
+    return examination.LineAsConfigured(
         settings.name, settings.port, settings.adapter_latency_ms, settings.margin_ms, settings.axis[0].model
     )
 

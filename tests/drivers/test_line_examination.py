@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.daemon.line.examination import LineAsConfigured, adapter_findings, examine
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
-from ldcnd.drivers.ldcn.commissioning import LineAsConfigured, adapter_findings, examine
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -11,8 +11,6 @@ from pathlib import Path
 from statistics import median
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.cost import LineTiming, cost_of
-from ldcnd.bus.wire_log import WireEvent, WireRecord
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import ANY_DIALECT, UNADDRESSED, read_identity
 from ldcnd.drivers.ldcn.adoption import Found
@@ -24,7 +22,9 @@ from ldcnd.errors import BusError, LdcndError
 from ldcnd.exchange import Exchange
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.model.samples import TelemetryItem
+from ldcnd.planning.cost import LineTiming, cost_of
 from ldcnd.transport.adapter import Adapter, adapter_of
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 EXCHANGES = 100
 """So many at each drive: the shortest and the longest wait for the end of a servo cycle are among them."""
