@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus_config import BusConfig
-from ldcnd.config import RigConfig, load_config
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.line import examination
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.smartstep_line import build_line

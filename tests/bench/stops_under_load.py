@@ -23,7 +23,7 @@ from pathlib import Path
 
 import structlog
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.messaging.zenoh_session import open_zenoh_session

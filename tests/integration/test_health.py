@@ -10,6 +10,7 @@ from ldcnd.bus.queue import Lane
 from ldcnd.bus.statistics import bucket_limit_s
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.line.smartstep_line import LEDGER_FILE
+from ldcnd.daemon.publish.health import _Rate
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import PENDING_QUERIES, SampleKind
@@ -163,6 +164,12 @@ async def test_rates_of_drives_that_pace_themselves_are_reported_like_those_of_o
             assert feed.rate_hz == pytest.approx(feed.rate_wanted_hz, rel=0.1)
             for item in feed.items:
                 assert item.granted_hz == pytest.approx(item.asked_hz, rel=0.1)
+
+
+def test_rate_of_two_reports_at_one_instant_is_the_one_before():
+    rate = _Rate(0.0, 0)
+
+    assert [rate.of(count, at_s, 0.01) for count, at_s in ((0, 0.0), (8, 2.0), (9, 2.0))] == [0.0, 4.0, 4.0]
 
 
 async def test_reports_leave_the_network_with_the_daemon():

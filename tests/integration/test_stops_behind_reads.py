@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from ldcnd.config import load_config
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.publish.meta import WORK_PER_STEP
 from ldcnd.messaging.session import READS_OF_A_CLIENT, Query

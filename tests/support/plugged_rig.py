@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.axes import LinkState
+from ldcnd.model.samples import LinkState
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config

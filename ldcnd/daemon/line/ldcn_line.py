@@ -3,11 +3,11 @@
 import asyncio
 from collections.abc import Mapping
 
-from ldcnd.axis_config import AxisConfig
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus_config import BusConfig
-from ldcnd.config import RigConfig, SimulatedLineConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.rig import RigConfig, SimulatedLineConfig
 from ldcnd.drivers.driver import AxisSpec, Gains
 from ldcnd.drivers.ldcn.network import RESET_BAUD, LdcnNetwork
 from ldcnd.drivers.line import GroupSpec, LineSpec, ModuleEntry

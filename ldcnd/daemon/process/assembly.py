@@ -8,8 +8,9 @@ from itertools import count
 from types import MappingProxyType
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus_config import BusConfig
-from ldcnd.config import RigConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import random_token

@@ -39,7 +39,7 @@ class _Rate:
     def of(self, count: int, now_s: float, least_s: float) -> float:
         """Return the rate since at least `least_s` ago; before that the one found last."""
         elapsed_s = now_s - self._since_s
-        if elapsed_s >= least_s - CLOCK_S:
+        if elapsed_s > 0 and elapsed_s >= least_s - CLOCK_S:
             self._hz = max(0, count - self._count) / elapsed_s
             self._since_s, self._count = now_s, count
         elif not self._hz and elapsed_s > 0:
