@@ -14,7 +14,7 @@ from ldcnd.errors import ConfigError
 from ldcnd.model.events import FINAL, CommandEvent, CommandStatus
 
 if TYPE_CHECKING:
-    from ldcnd.recording.axis_history import AxisHistory
+    from ldcnd.recording.reading import AxisHistory
 
 NS_PER_S = 1e9
 MOST_LABELS = 40
@@ -28,8 +28,7 @@ MOST_LABELS = 40
 def command(recording: Path, axis: str, output: Path) -> None:
     """Draw AXIS of RECORDING: its quantities, commands and faults against time; needs the extras record and plot."""
     require_mcap()
-    from ldcnd.recording.axis_history import axis_history  # noqa: PLC0415 - needs an optional package
-    from ldcnd.recording.reading import Recording  # noqa: PLC0415
+    from ldcnd.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
 
     file = Recording(recording)
     history = axis_history(file, axis)

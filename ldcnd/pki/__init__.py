@@ -1,1 +1,4 @@
-"""Certificates and roles of a site: a small authority of its own, and the access rules that follow from the roles."""
+"""Certificates and roles for a network with mutual TLS, and the access rules that Zenoh enforces for them.
+
+For those who install a rig on a shared network, through `ldcnd pki`. Start with `site`.
+"""

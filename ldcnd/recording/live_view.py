@@ -14,8 +14,7 @@ from ldcnd.errors import ConfigError, LdcndError
 from ldcnd.messaging.codec import to_json
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.frozen import Frozen
-from ldcnd.recording.messages import message_of, schema_of
-from ldcnd.recording.topics import decode_published
+from ldcnd.recording.messages import decode_published, message_of, schema_of
 
 
 class LiveView:

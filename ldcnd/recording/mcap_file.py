@@ -5,6 +5,7 @@ Source: MCAP specification (mcap.dev), version 0; message encoding `json`, schem
 """
 
 import os
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
@@ -14,8 +15,7 @@ from mcap.writer import CompressionType, Writer
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import to_json
 from ldcnd.model.frozen import Frozen
-from ldcnd.recording.messages import message_of, schema_of
-from ldcnd.recording.topics import Published
+from ldcnd.recording.messages import Published, message_of, schema_of
 
 CHUNK_BYTES = 1024 * 1024
 """What is compressed and written together at most; `McapFile.flush` ends a chunk earlier."""
@@ -100,3 +100,40 @@ def part_of(path: Path) -> Path:
         remedy = f"`ldcnd record recover {part} WHOLE.mcap` saves what it holds; then delete it, or choose another name"
         raise ConfigError(f"{part} is left from a recording that was cut short", value=str(part), remedy=remedy)
     return part
+
+
+_NUMBERS = 2**32
+"""Recordings carry sequence numbers of 32 bits."""
+
+
+class Losses:
+    """Looks at the sequence number of each value of each key, in the order in which they came.
+
+    What was lost before the first value of a key, or after the last, leaves no gap and is not counted.
+
+    Attributes:
+        missing: how many values of each key are missing.
+        restarts: how often numbers of a key began anew, because its daemon was restarted.
+    """
+
+    def __init__(self) -> None:
+        self.missing: Counter[str] = Counter()
+        self.restarts = 0
+        self._last: dict[str, int] = {}
+
+    def saw(self, key: str, seq: int) -> None:
+        """Count what is missing between the value before and this one."""
+        last = self._last.get(key)
+        self._last[key] = seq
+        if last is None:
+            return
+        step = (seq - last) % _NUMBERS
+        if 0 < step < _NUMBERS // 2:
+            self.missing[key] += step - 1
+        else:
+            self.restarts += 1
+
+    def facts(self) -> dict[str, str]:
+        """Return what was counted, by name, for a file."""
+        gaps = {f"missing {key}": str(count) for key, count in sorted((+self.missing).items())}
+        return {"missing": str(self.missing.total()), "restarts": str(self.restarts), **gaps}

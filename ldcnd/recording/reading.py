@@ -1,16 +1,21 @@
 """Reading recordings that may be damaged: what can be read, and where something cannot."""
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Chunk, McapRecord
+from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
+from pydantic import ValidationError
 from zstandard import ZstdError
 
-from ldcnd.errors import ConfigError
+from ldcnd.errors import ConfigError, UnknownAxis
+from ldcnd.model.events import CommandEvent
+from ldcnd.model.samples import AdcSample, FaultSample, MonitorSample, PositionSample, Quality, Sample, VelocitySample
+from ldcnd.recording.messages import LogMessage, axis_of, model_of
 
 _UNREADABLE = (McapError, ZstdError, struct.error, ValueError)
 """What the package raises on bytes that make no sense; wrong checksums are a ValueError."""
@@ -83,3 +88,106 @@ class Recording:
 
     def _damaged(self, at: int, reason: str) -> None:
         self.damages.append(Damage(at, reason))
+
+
+@dataclass(slots=True)
+class Series:
+    """One quantity.
+
+    Attributes:
+        title: what it is.
+        unit: its unit; empty without one.
+        t_ns: when each value was true, UTC in ns since 1970.
+        values: as many; NaN where the value was worth nothing.
+    """
+
+    title: str
+    unit: str
+    t_ns: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+
+class AxisHistory:
+    """What is known of one axis.
+
+    Attributes:
+        axis: its name.
+        series: the quantities, in the order in which they were first published.
+        events: what became of its commands, in order.
+        not_understood: how many messages were not what this version knows, such as those of a much older one.
+        faults: from when to when a fault stood that stops the motor, UTC in ns since 1970; an end of None is not known.
+    """
+
+    def __init__(self, axis: str) -> None:
+        self.axis = axis
+        self.series: list[Series] = []
+        self.events: list[CommandEvent] = []
+        self.not_understood = 0
+        self.faults: list[tuple[int, int | None]] = []
+
+    def add(self, key: str, data: bytes) -> None:
+        """Take a message of the axis, in JSON."""
+        model = model_of(key)
+        if model is None:
+            return
+        recorded = LogMessage if model is CommandEvent else model
+        try:
+            message = recorded.model_validate_json(data, extra="ignore")
+        except ValidationError:
+            self.not_understood += 1
+            return
+        match message:
+            case LogMessage() as log:
+                self.events.append(log.event)
+            case FaultSample() as sample:
+                self._fault(sample.t, stands=any(fault.stops for fault in sample.active))
+            case PositionSample() as sample:
+                self._value(sample, "position", sample.unit, sample.value)
+                if sample.following_error is not None:
+                    self._value(sample, "following error", sample.unit, sample.following_error)
+            case VelocitySample() as sample:
+                self._value(sample, "velocity", sample.unit, sample.value)
+            case AdcSample() as sample:
+                self._value(sample, "analog input", "V", sample.volts)
+            case MonitorSample() as sample:
+                self._value(sample, sample.title, sample.unit, sample.value)
+
+    def _fault(self, t_ns: int, *, stands: bool) -> None:
+        open_since = self.faults[-1][0] if self.faults and self.faults[-1][1] is None else None
+        if stands and open_since is None:
+            self.faults.append((t_ns, None))
+        elif not stands and open_since is not None:
+            self.faults[-1] = (open_since, t_ns)
+
+    def _value(self, sample: Sample, title: str, unit: str, value: float) -> None:
+        series = next((series for series in self.series if series.title == title), None)
+        if series is None:
+            series = Series(title, unit)
+            self.series.append(series)
+        series.t_ns.append(sample.t)
+        series.values.append(math.nan if sample.quality is Quality.BAD else value)
+
+
+def axis_history(recording: Recording, axis: str) -> AxisHistory:
+    """Read one axis of a recording.
+
+    Raises:
+        ConfigError: the file is no recording.
+        UnknownAxis: it has no such axis; names those that it has.
+    """
+    history = AxisHistory(axis)
+    axes: set[str] = set()
+    keys: dict[int, str] = {}
+    for record in recording.records():
+        if isinstance(record, Channel):
+            name = axis_of(key := record.topic.removeprefix("/"))
+            if name is not None:
+                axes.add(name)
+            if name == axis:
+                keys[record.id] = key
+        elif isinstance(record, Message) and record.channel_id in keys:
+            history.add(keys[record.channel_id], record.data)
+    if axis not in axes:
+        known = ", ".join(sorted(axes)) or "none"
+        raise UnknownAxis(f"{recording.path} has no axis {axis!r}; it has {known}", axis=axis, value=axis)
+    return history

@@ -8,9 +8,8 @@ from typing import Self
 
 from ldcnd.errors import ConfigError, LdcndError
 from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.recording.losses import Losses
-from ldcnd.recording.mcap_file import McapFile
-from ldcnd.recording.topics import decode_published
+from ldcnd.recording.mcap_file import Losses, McapFile
+from ldcnd.recording.messages import decode_published
 
 FLUSH_PERIOD_S = 1.0
 """What has come is put on the disk so often: a recorder that is killed loses no more."""

@@ -6,8 +6,7 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 from mcap.writer import Writer
 
-from ldcnd.recording.losses import Losses
-from ldcnd.recording.mcap_file import FACTS, part_of, start_writer
+from ldcnd.recording.mcap_file import FACTS, Losses, part_of, start_writer
 from ldcnd.recording.reading import Damage, Recording
 
 

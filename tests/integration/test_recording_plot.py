@@ -11,8 +11,7 @@ from ldcnd.config.rig import load_config
 from ldcnd.model.commands import MoveAbsolute, Power, Verb
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState
-from ldcnd.recording.axis_history import AxisHistory, axis_history
-from ldcnd.recording.reading import Recording
+from ldcnd.recording.reading import AxisHistory, Recording, axis_history
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.recordings import recorded_rig
 from tests.support.rig import SIMULATED

@@ -14,8 +14,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from ldcnd.cli.main import cli
 from ldcnd.errors import ConfigError
 from ldcnd.pki.access import PERMITTED, Role, Subject, access_control
-from ldcnd.pki.roster import Login, read_roster
-from ldcnd.pki.site import Site, new_login, set_up
+from ldcnd.pki.site import Login, Site, new_login, read_roster, set_up
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 SETUPS = Path(__file__).parents[2] / "config" / "zenoh"
