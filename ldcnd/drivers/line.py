@@ -19,7 +19,7 @@ class AdoptFallback(StrEnum):
     REFUSE = "refuse"
     """It stays down, and the daemon says why and tries again."""
     RESET = "reset"
-    """It is reset, unless a drive is seen to move."""
+    """It is reset, unless a drive moves or is not known to stand."""
 
 
 @dataclass(frozen=True, slots=True)

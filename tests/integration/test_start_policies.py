@@ -1,14 +1,21 @@
 """How a daemon comes to a line that somebody else left behind."""
 
 import asyncio
+import contextlib
+
+import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.received import LoadTrajectory
+from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.model.commands import MoveAbsolute, Power, Verb
-from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 from tests.support.rig import running_rig
 
+ONE = 1 << 16
+"""One count per tick, as programmed velocity."""
 HARMLESS = {Command.READ_STATUS, Command.NO_OPERATION}
 ADOPTING = simulated_config(start="adopt")
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
@@ -127,6 +134,86 @@ async def test_a_drive_that_moves_is_not_reset_by_the_fallback():
     assert still_moving
     assert "address 1, Logosol LS-182AP (id 90, version 20), moves" in bus.problem
     assert (later.up, later.started_by) == (True, "reset")
+
+
+def creep(chain, counts_per_tick):
+    """Let axis x jog as a foreign host would have it, and forget who did it."""
+    command = Trajectory(
+        velocity=round(counts_per_tick * ONE), acceleration=ONE, mode=ProfileMode.VELOCITY, start_now=True
+    )
+    drive(chain, 1).execute(LoadTrajectory(command))
+
+
+async def left_creeping(chain, counts_per_tick):
+    async with rig_on(chain, simulated_config()) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.kill()
+    creep(chain, counts_per_tick)
+
+
+@pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9, 3.0])
+async def test_a_drive_that_creeps_is_not_reset_by_the_fallback(counts_per_tick):
+    chain = chain_of()
+    await left_creeping(chain, counts_per_tick)
+    chain.modules[3].power(on=False, at_s=asyncio.get_running_loop().time())
+
+    async with rig_on(chain, simulated_config(start="adopt", adopt_fallback="reset"), up=False) as rig:
+        await asyncio.sleep(5)
+        (bus,) = await rig.client.buses()
+
+    assert drive(chain, 1).loop.servo_on
+    assert "address 1, Logosol LS-182AP (id 90, version 20), moves" in bus.problem
+    assert Command.HARD_RESET not in commands_in(rig.sent)
+
+
+async def test_a_drive_that_is_silent_is_not_known_to_stand_and_not_reset():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await rig.kill()
+    chain.modules[3].power(on=False, at_s=asyncio.get_running_loop().time())
+
+    async with rig_on(chain, simulated_config(start="adopt", adopt_fallback="reset"), up=False) as rig:
+        await asyncio.sleep(5)
+        (bus,) = await rig.client.buses()
+
+    assert "address 4 (axis c) does not answer and may move" in bus.problem
+    assert Command.HARD_RESET not in commands_in(rig.sent)
+
+
+async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_moves():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        creep(chain, 0.3)
+        now_s = asyncio.get_running_loop().time()
+        chain.unplug(now_s, 1.0)
+        chain.modules[3].power(on=False, at_s=now_s)
+        await asyncio.sleep(5)
+
+    assert drive(chain, 1).loop.servo_on
+
+
+@pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9])
+async def test_a_drive_that_creeps_moves_and_is_not_at_standstill(counts_per_tick):
+    chain = chain_of()
+    await left_creeping(chain, counts_per_tick)
+    seen = set()
+
+    async with rig_on(chain, ADOPTING) as rig:
+        first = await rig.until("x", lambda state: state.link is LinkState.UP)
+        async with rig.client.samples("x", "state") as states, asyncio.timeout(10):
+            await rig.until("x", lambda state: state.moving is Moving.YES)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(5):
+                    async for _, sample in states:
+                        seen.add((sample.state, sample.moving))
+        last = await rig.client.state("x")
+
+    assert first.moving is Moving.UNKNOWN
+    assert (last.state, last.moving) == (AxisState.DISCRETE_MOTION, Moving.YES)
+    assert (AxisState.STANDSTILL, Moving.NO) not in seen
 
 
 async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():

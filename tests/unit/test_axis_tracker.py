@@ -51,11 +51,60 @@ def test_an_open_loop_is_disabled_and_a_closed_one_stands():
     tracker = AxisTracker("x", "mm")
 
     tracker.observed(OFF, at(1.0), 0)
+    assert (tracker.state, tracker.moving) == (AxisState.DISABLED, Moving.UNKNOWN)
+    tracker.observed(OFF, at(1.3), 0)
     assert (tracker.state, tracker.moving) == (AxisState.DISABLED, Moving.NO)
 
     tracker.powered(on=True, now_s=2.0)
     tracker.observed(ON, at(3.0), 0)
     assert (tracker.state, tracker.moving) == (AxisState.STANDSTILL, Moving.NO)
+
+
+def creeping(counts_per_s, seconds, reading=ON, every_s=0.05) -> list[tuple[AxisState, Moving]]:
+    """Return what is known after each reading of a shaft that nobody is known to move."""
+    tracker = AxisTracker("x", "mm")
+    seen = []
+    for step in range(round(seconds / every_s)):
+        position = round(counts_per_s * step * every_s)
+        tracker.observed(replace(reading, position_counts=position), at(1.0 + step * every_s), 0)
+        seen.append((tracker.state, tracker.moving))
+    return seen
+
+
+@pytest.mark.parametrize("counts_per_s", [39.0, 584.0, 1757.0, -584.0])
+@pytest.mark.parametrize("reading", [ON, OFF])
+def test_a_shaft_that_creeps_below_a_count_per_tick_never_stands(counts_per_s, reading):
+    seen = creeping(counts_per_s, 5.0, reading)
+
+    assert seen[0][1] is Moving.UNKNOWN
+    assert Moving.NO not in {moving for _, moving in seen}
+    assert seen[-1][1] is Moving.YES
+
+
+def test_a_shaft_that_creeps_out_of_the_band_is_believed_to_stand_only_after_it_stayed_longer():
+    moving = [moving for _, moving in creeping(5.0, 20.0)]
+    left = moving.index(Moving.YES)
+
+    assert Moving.NO in moving[:left]  # in the first second 5 counts look like a loop that hunts
+    assert Moving.NO not in moving[left:]
+
+
+def test_a_closed_loop_that_hunts_by_some_counts_stands():
+    tracker = AxisTracker("x", "mm")
+    for step in range(100):
+        tracker.observed(replace(ON, position_counts=step % 6), at(1.0 + 0.05 * step), 0)
+
+    assert (tracker.state, tracker.moving) == (AxisState.STANDSTILL, Moving.NO)
+
+
+def test_after_a_gap_rest_must_be_proven_again(moving):
+    moving.observed(ON, at(2.2), 0)
+    assert moving.moving is Moving.NO
+
+    moving.disconnected(0)
+    moving.observed(ON, at(9.0), 0)
+
+    assert moving.moving is Moving.UNKNOWN
 
 
 def test_a_shaft_turned_by_hand_moves():
@@ -154,7 +203,10 @@ def test_an_adopted_drive_that_runs_is_in_motion():
     tracker.observed(RUNNING, at(1.0), 0)
     assert (tracker.state, tracker.moving) == (AxisState.DISCRETE_MOTION, Moving.YES)
 
-    tracker.observed(ON, at(1.1), 0)
+    for sent_at_s in (1.1, 1.2, 1.3):
+        tracker.observed(ON, at(sent_at_s), 0)
+    assert tracker.state is AxisState.DISCRETE_MOTION
+    tracker.observed(ON, at(1.4), 0)
     assert tracker.state is AxisState.STANDSTILL
 
 

@@ -14,6 +14,13 @@ from ldcnd.model.samples import AxisState, FaultEntry, LinkState, Moving, Qualit
 
 MISSES_UNTIL_DOWN = 3
 """So many polls in a row must fail before the drive counts as gone."""
+REST_S = 0.25
+"""A shaft that nobody is known to hold stands when its position has stayed within `REST_COUNTS` for so long."""
+REST_COUNTS = 5
+"""Highest less lowest position of a shaft at rest: a closed loop hunts by some counts. More than 20 counts/s never pass
+for rest."""
+MOST_REST_S = 2.0
+"""A shaft that crept out of that band must stay in it for twice as long as it took, at most this."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
 LOOP_OPENED = Fault("loop_opened", "the drive opened its position loop by itself; find out why, then send reset")
 
@@ -62,6 +69,53 @@ def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None
     pass
 
 
+class RestJudge:
+    """Decides from readings whether a shaft stands.
+
+    The velocity of a status packet has no fraction, and a drive in velocity mode says that its profile is done as soon
+    as the velocity is reached: a shaft that creeps below one count per tick shows velocity 0 and a finished profile. So
+    one reading proves rest only of a closed loop whose profile this daemon commanded, in which done means at rest; of
+    any other it takes positions.
+
+    Attributes:
+        rests: whether it does; None while that is not known.
+        commanded: the drive's profile is one of this daemon's.
+    """
+
+    def __init__(self) -> None:
+        self.rests: bool | None = None
+        self.commanded = False
+        self._since_s: float | None = None  # from when on positions have stayed together
+        self._low = self._high = 0
+        self._quiet_s = REST_S
+
+    def forget(self, *, rests: bool | None = None, commanded: bool = False) -> None:
+        """Begin anew: the drive was out of sight, or something was commanded."""
+        self.rests, self.commanded = rests, commanded
+        self._since_s, self._quiet_s = None, REST_S
+
+    def observed(self, reading: AxisReading, at_s: float) -> None:
+        """Take a reading that was asked for at an instant."""
+        position = reading.position_counts
+        runs = reading.enabled and not reading.profile_done
+        if runs or abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s:
+            self.rests, self._since_s, self._quiet_s = False, None, REST_S
+            return
+        if self.commanded and reading.enabled:
+            self.rests = True
+            return
+        if self._since_s is None:
+            self._since_s, self._low, self._high = at_s, position, position
+            return
+        self._low, self._high = min(self._low, position), max(self._high, position)
+        held_s = at_s - self._since_s
+        if self._high - self._low > REST_COUNTS:
+            self.rests, self._quiet_s = False, min(max(2 * held_s, REST_S), MOST_REST_S)
+            self._since_s, self._low, self._high = at_s, position, position
+        elif held_s >= self._quiet_s:
+            self.rests = True
+
+
 class AxisTracker:
     """The state of one axis, changed only by what was observed or commanded."""
 
@@ -89,7 +143,7 @@ class AxisTracker:
         self._failure: str | None = None
         self._misses = 0
         self._effective_from_s = 0.0
-        self._at_rest = False
+        self._rest = RestJudge()
 
     # -- what others ask ---------------------------------------------------------------------------------------------
 
@@ -109,12 +163,12 @@ class AxisTracker:
 
     @property
     def moving(self) -> Moving:
-        """Whether the axis moves, as far as the latest reading tells; never "no" without a reading that says so."""
+        """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
         if self.link is not LinkState.UP:
             return Moving.UNKNOWN
-        if self.state in MOTION_STATES or not self._at_rest:
+        if self._rest.rests is False or (self.command and self.state in MOTION_STATES):
             return Moving.YES
-        return Moving.NO
+        return Moving.NO if self._rest.rests else Moving.UNKNOWN
 
     @property
     def quality(self) -> Quality:
@@ -129,8 +183,8 @@ class AxisTracker:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the latest reading shows no velocity."""
-        return self._at_rest
+        """Whether the readings prove that nothing moves."""
+        return self._rest.rests is True
 
     @property
     def energised(self) -> bool:
@@ -153,9 +207,9 @@ class AxisTracker:
         self.position_lost = bool(faults) and any(fault.loses_position for fault in faults)
         if self.position_lost:
             self.referenced = False
-        self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
         if not self.concerns(timing):
             return  # asked before the latest command took effect: says nothing about it
+        self._rest.observed(reading, timing.sent_at_s)
         self.enabled = reading.enabled
         if faults and any(fault.stops for fault in faults):
             self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")
@@ -170,14 +224,15 @@ class AxisTracker:
     def _enabled_reading(self, reading: AxisReading) -> None:
         command = self.command
         if command is None:
-            if self.state is not AxisState.ERROR_STOP:
-                resting = reading.profile_done and self._at_rest
-                self.state = AxisState.STANDSTILL if resting else AxisState.DISCRETE_MOTION
+            if self.state is not AxisState.ERROR_STOP and (
+                self._rest.rests is not None or self.state is AxisState.DISABLED
+            ):
+                self.state = AxisState.STANDSTILL if self._rest.rests else AxisState.DISCRETE_MOTION
             return
         match command.completion:
             case Completion.PROFILE if reading.profile_done:
                 self.finished()
-            case Completion.REST if reading.profile_done and self._at_rest:
+            case Completion.REST if reading.profile_done and self.at_rest:
                 self.finished()
             case _:
                 pass
@@ -196,7 +251,7 @@ class AxisTracker:
             return
         self.link = LinkState.DOWN
         self.referenced = False
-        self._at_rest = False
+        self._rest.forget()
         self._faults((LINK_LOST,), now_ns)
         if self.state is not AxisState.DISABLED:
             self._fail(LINK_LOST.text)
@@ -242,11 +297,12 @@ class AxisTracker:
         self.command = command
         self.state = command.state
         self._effective_from_s = now_s
-        self._at_rest = False
+        self._rest.forget(rests=False, commanded=self._rest.commanded)
 
     def started(self, now_s: float) -> None:
         """The drive acknowledged: only readings asked for from now on tell how the command goes."""
         self._effective_from_s = now_s
+        self._rest.forget(rests=False, commanded=True)
 
     def failing(self, reason: str) -> None:
         """The active command will not end as it was asked, for this reason, once the axis has come to rest."""
@@ -267,7 +323,7 @@ class AxisTracker:
         self._effective_from_s = now_s
         self._end(CommandStatus.ABORTED, "aborted by power")
         self.enabled = on
-        self._at_rest = on
+        self._rest.forget(rests=True if on else None, commanded=on)
         if self.state is not AxisState.ERROR_STOP:
             self.state = AxisState.STANDSTILL if on else AxisState.DISABLED
 
@@ -275,7 +331,7 @@ class AxisTracker:
         """The loop was opened or closed in the course of a command, which goes on."""
         self._effective_from_s = now_s
         self.enabled = on
-        self._at_rest = False
+        self._rest.forget(rests=False, commanded=self._rest.commanded)
 
     def cleared(self, now_s: float) -> None:
         """Reset: latch and first cause are forgotten; the next readings tell what stands."""
@@ -299,7 +355,8 @@ class ObservedTracker(AxisTracker):
         self._faults(reading.faults, now_ns)
         if not self.active_faults:
             self.first_fault = None
-        self._at_rest = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
+        # SmartStep shows the speed in revolutions a minute, and its position comes from another poll
+        self._rest.rests = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
         self.enabled = reading.enabled
         self.state = self._shown(reading)
 
@@ -308,4 +365,4 @@ class ObservedTracker(AxisTracker):
             return AxisState.ERROR_STOP
         if not reading.enabled:
             return AxisState.DISABLED
-        return AxisState.STANDSTILL if self._at_rest else AxisState.DISCRETE_MOTION
+        return AxisState.STANDSTILL if self.at_rest else AxisState.DISCRETE_MOTION

@@ -12,6 +12,7 @@ drives are polled at the lower rate. Some may have missed a change of rate, or h
 address: while a module is missing afterwards, it is looked for, too.
 """
 
+import asyncio
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -20,12 +21,21 @@ from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import RESET_BAUD, Addressing, Expected, Identity, LineRate, differences
 from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.profiles import Support
+from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.errors import BusDown, BusError, LdcndError, NetworkMismatch
 from ldcnd.log import get_logger
 
-MOTION_ITEMS = StatusItem.VELOCITY | StatusItem.AUX
+log = get_logger("ldcn")
+
+UNADDRESSED = 0
+LOOKS_FOR_STRAYS = 3
+"""How often each that may be where it should not be is looked for there."""
+MOTION_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+WATCH_S = 0.5
+"""How long positions are watched before drives count as standing: the velocity in a status has no fraction."""
+STILL_COUNTS = 2
+"""A drive that stands changes its position by no more than that: a closed loop hunts a little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,24 +107,46 @@ class Adoption:
         states = {each.address: await self._motion_state(each) for each in self._expected if _is_servo(each)}
         return Adopted(baud, identities, states)
 
-    async def moving(self) -> tuple[str, ...]:
-        """Return in words which of the modules found move, or may move as far as can be told.
+    async def not_standing(self) -> tuple[str, ...]:
+        """Return in words what keeps the line from a reset: what moves, and what is not known to stand.
+
+        A module that waits for its address has just been powered on or reset, and so has what is behind it if it is
+        silent; a silent one is not known to stand otherwise.
 
         Raises:
             BusError: the line failed meanwhile.
         """
-        moving = []
+        obstacles = []
+        watched: dict[int, tuple[Found, Profile]] = {}
         for address, found in sorted(self.found.items()):
             profile = found.identity.profile
             if profile is None:
-                moving.append(f"address {address}, {found.identity}, may move: its status is unknown")
-                continue
-            if profile.support is not Support.FULL or not await self._rate.host_to(found.baud):
-                continue
-            status = await self._bus.execute(commands.read_status(Node(address, profile), MOTION_ITEMS))
-            if _moves(status):
-                moving.append(f"address {address}, {found.identity}, moves")
-        return tuple(moving)
+                obstacles.append(f"address {address}, {found.identity}, may move: its status is unknown")
+            elif profile.support is Support.FULL:
+                watched[address] = (found, profile)
+        before = await self._motion_states(watched)
+        await asyncio.sleep(WATCH_S)
+        after = await self._motion_states(watched)
+        for address, (found, _) in watched.items():
+            if _moves(before[address], after[address]):
+                obstacles.append(f"address {address}, {found.identity}, moves")
+        silent = [each for each in self._expected if each.address not in self.found]
+        if silent and not await self._newcomer():
+            obstacles += [f"address {each.address} ({each.what}) does not answer and may move" for each in silent]
+        return tuple(obstacles)
+
+    async def _newcomer(self) -> bool:
+        """Tell whether a module waits for its address."""
+        return await self._rate.host_to(RESET_BAUD) and await self._rate.who_is(UNADDRESSED, patient=True) is not None
+
+    async def _motion_states(self, watched: Mapping[int, tuple[Found, Profile]]) -> dict[int, Status | None]:
+        states: dict[int, Status | None] = dict.fromkeys(watched)
+        for address, (found, profile) in watched.items():
+            exchange = commands.read_status(Node(address, profile), MOTION_ITEMS)
+            if await self._rate.host_to(found.baud):
+                status = await self._bus.execute(exchange)
+                states[address] = status
+        return states
 
     async def search(self) -> None:
         """Ask every expected address at every rate, the working rate first, until all have answered."""
@@ -163,17 +195,16 @@ def _is_servo(each: Expected) -> bool:
     return each.profile.support is Support.FULL
 
 
-def _moves(status: Status) -> bool:
-    """Judge by velocity, and by a profile that runs with the loop closed."""
-    servo_on = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
-    return bool(status.velocity) or (servo_on and not status.flags & StatusFlag.MOVE_DONE)
-
-
-log = get_logger("ldcn")
-
-UNADDRESSED = 0
-LOOKS_FOR_STRAYS = 3
-"""How often each that may be where it should not be is looked for there."""
+def _moves(before: Status | None, after: Status | None) -> bool:
+    """Judge by velocity, by a profile that runs with the loop closed, and by two positions; not known counts as yes."""
+    if before is None or after is None or before.position is None or after.position is None:
+        return True
+    runs = any(
+        bool(status.velocity)
+        or (status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON) and not status.flags & StatusFlag.MOVE_DONE)
+        for status in (before, after)
+    )
+    return runs or abs(after.position - before.position) > STILL_COUNTS
 
 
 class Rejoin:

@@ -162,19 +162,17 @@ class LdcnNetwork(Network):
         return tuple(remarks)
 
     async def _check_may_reset(self, refused: NetworkMismatch) -> None:
-        """Decide what follows a take-over that was not possible.
+        """Decide what follows a take-over that was not possible: drives that move are never reset after it.
 
         Raises:
             NetworkMismatch: nothing: the line stays down.
         """
-        if self._line.start is StartPolicy.RESET:
-            return
-        if self._line.adopt_fallback is AdoptFallback.REFUSE:
+        if self._line.start is StartPolicy.ADOPT and self._line.adopt_fallback is AdoptFallback.REFUSE:
             raise refused
-        moving = await self._adoption.moving()
-        if moving:
+        obstacles = await self._adoption.not_standing()
+        if obstacles:
             raise NetworkMismatch(
-                f"{refused.message}; not reset either: {'; '.join(moving)}", remedy="wait, or stop the motion"
+                f"{refused.message}; not reset either: {'; '.join(obstacles)}", remedy="wait, or stop the motion"
             ) from refused
 
     async def _start_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
