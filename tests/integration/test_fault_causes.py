@@ -7,7 +7,7 @@ import pytest
 from ldcnd.drivers.ldcn.faults import FaultCode
 from ldcnd.errors import NotReferenced, WrongState
 from ldcnd.model.commands import MoveAbsolute, Power, Reset, SetPosition, Stop, Verb
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.model.samples import AxisState, LinkState, Moving
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
 
@@ -106,6 +106,7 @@ async def test_a_second_without_the_cable_leaves_the_fault_its_name(condition):
 async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(condition):
     async with dialect_rig(LS_182AP, gains=GAINS | {"el": 500}) as rig:
         await trip(rig, condition)
+        await rig.until(lambda state: state.moving is Moving.NO)  # else the daemon would stop it as it ends
 
     async with adopting_rig(LS_182AP, rig) as later:
         await later.until(lambda state: state.state is AxisState.ERROR_STOP)
