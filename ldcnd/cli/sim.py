@@ -10,7 +10,7 @@ from ldcnd.config.simulation import FaultPlanConfig, SimulationConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
 from ldcnd.sim.faults import FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import serve_pty
 
 DEFAULT_SEED = 1
@@ -58,7 +58,7 @@ def _spec(chain: str | None, file: Path | None, seed: int | None) -> ChainSpec:
 
 
 def _spec_of_names(chain: str, seed: int | None) -> ChainSpec:
-    names = chain.replace(",", " ").split()
+    names = [OLD_NAMES.get(name, name) for name in chain.replace(",", " ").split()]
     unknown = [name for name in names if name not in MODELS]
     if unknown or not names:
         wrong = f"no such module: {', '.join(unknown)}" if unknown else "no module"

@@ -14,18 +14,27 @@ from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.model.frozen import Frozen
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, TimedEvent
-from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing
+from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, ChainSpec, ModuleSpec, TimedEvent
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.quirks import (
+    AnalogEnd,
+    CommandBuffer,
+    LimitInPath,
+    ModuleSettings,
+    PathOverflow,
+    PositionErrorClearing,
+    RelativeTo,
+)
 from ldcnd.sim.plant import MotorPlant
 
 ENDLESS_TRAVEL_COUNTS = (-(1 << 30), 1 << 30)
 
 
 def _known_module(model: str) -> str:
-    if model not in MODELS:
+    name = OLD_NAMES.get(model, model)
+    if name not in MODELS:
         raise ValueError(f"no such simulated module; known are {', '.join(MODELS)}")
-    return model
+    return name
 
 
 ModuleName = Annotated[str, AfterValidator(_known_module)]
@@ -71,27 +80,81 @@ class PlantConfig(Frozen):
     """Standard deviation of its reading, as a share of full scale."""
 
 
-class ModuleKnobs(Frozen):
-    """How one module behaves where the manuals allow variants."""
+class Quirks(Frozen):
+    """How one module behaves where manuals and data sheets leave room; what is left out is as the model has it."""
 
     version: int | None = Field(default=None, ge=0, le=255)
     """Second byte of its identity."""
     phase_s: float | None = Field(default=None, ge=0, lt=SERVO_CYCLE_S)
-    """Where its servo cycles lie; drawn by lot when left out."""
+    """Where its servo cycles lie; drawn from the seed when left out."""
     drift_ppm: float | None = Field(default=None, ge=-10_000, le=10_000)
-    """How much longer its servo cycles are than nominal; drawn by lot when left out."""
+    """How much longer its servo cycles are than nominal; drawn from the seed when left out."""
     reply_latency_s: float | None = Field(default=None, ge=0, le=10)
     """Added between the end of the servo cycle and the reply."""
     reset_dead_s: float | None = Field(default=None, ge=0, le=10)
     """How long it is deaf after Hard Reset and power-up."""
     always_obeys_global_reset: bool | None = None
     """Whether Hard Reset to FF is obeyed in any group, or only in group FF."""
+    yields_to_host: bool | None = None
+    """Whether it drops its reply as soon as the host sends."""
+    command_buffer: CommandBuffer | None = None
+    """What becomes of a command that has not been executed yet when another packet begins."""
+    undefined_status_bits: int | None = Field(default=None, ge=0, le=255)
+    """Set in a PIC-I/O's status byte, of which only bit 1 is defined."""
+    counter_cleared_by_mode: bool | None = None
+    """Whether Set Timer Mode sets a PIC-I/O's counter to 0."""
     stop_clears_velocity: bool | None = None
-    """Whether Stop Motor sets the velocity register to 0."""
+    """Whether stopping smoothly or abruptly sets the velocity register to 0."""
     position_error_clearing: PositionErrorClearing | None = None
-    """What takes the position error bit back: Clear Sticky Bits only, or closing the loop, too."""
+    """What clears the position error bit: Clear Sticky Bits only, or closing the loop, too."""
     sense_counts_per_a: float | None = Field(default=None, ge=0)
     """A/D counts per ampere of motor current, PIC-SERVO."""
+    encoder_counts_per_s: float | None = Field(default=None, ge=0)
+    """Faster encoder transitions are lost; the model's rate when left out, 0 for no limit."""
+    analog_end: AnalogEnd | None = None
+    """Whether a motion to an analog target begins to stop at the exact value only, or also behind it."""
+    peak_current_a: float | None = Field(default=None, ge=0)
+    """The motor current cannot exceed it, Logosol; 0 for no limit."""
+    overload_s: float | None = Field(default=None, gt=0)
+    """Limited for so long without a pause, a Logosol drive trips."""
+    deadband_at_zero: bool | None = None
+    """Whether deadband compensation is also added to an output of 0."""
+    il_times_256: bool | None = None
+    """Whether the integral sum is bounded by 256 times IL or by IL."""
+    velocity_sign: Literal[-1, 1] | None = None
+    """Sign of the velocity item while the motor runs forward; the model's when left out."""
+    relative_to: RelativeTo | None = None
+    """Which command position a relative goal is added to, PIC-SERVO SC: that of the load or of the start."""
+    home_shifts: bool | None = None
+    """Whether Reset Position also shifts the captured home position."""
+    aux_after_reset: bool | None = None
+    """Whether auxiliary bit 4 is set after a reset, PIC-SERVO SC."""
+    path_overflow: PathOverflow | None = None
+    """What happens to path points that the buffer has no room for."""
+    path_cleared_by_stop: bool | None = None
+    """Whether Stop Motor clears the path points that are left."""
+    path_cleared_by_fault: bool | None = None
+    """Whether the servo being switched off by an error does."""
+    path_counts_point_under_way: bool | None = None
+    """Whether the number of points left includes the one under way."""
+    path_ends_with_buffer: bool | None = None
+    """Whether PATH_MODE falls when the last point begins, or when it ends."""
+    path_rate_at_load: bool | None = None
+    """Whether the fast path option counts when a point is loaded, or when it begins."""
+    path_move_done: bool | None = None
+    """Whether MOVE_DONE is set during a path,"""
+    path_slew: bool | None = None
+    """and whether auxiliary bit 4 is."""
+    path_ignores_divisor: bool | None = None
+    """Whether the servo rate divisor of a CMC leaves its path as it is."""
+    path_ended_by_enable: bool | None = None
+    """Whether Stop Motor with the enable bit alone ends a path."""
+    limit_in_path: LimitInPath | None = None
+    """What limit protection does to a path, PIC-SERVO SC."""
+    advanced_sticky: bool | None = None
+    """Whether a CMC keeps its advanced features when a later Stop Motor lacks their bit."""
+    items_before_advanced: bool | None = None
+    """Whether a CMC sends status items 6 and 7 before its advanced features are on."""
 
 
 class SimulatedModuleConfig(Frozen):
@@ -103,7 +166,7 @@ class SimulatedModuleConfig(Frozen):
     """Where the limit switches sit, in counts from the power-up position; endless when left out."""
     plant: PlantConfig = PlantConfig()
     """Constants of the machine."""
-    behaviour: ModuleKnobs = ModuleKnobs()
+    behaviour: Quirks = Quirks()
     """Where the manuals allow variants."""
     conditions: tuple[Condition, ...] = ()
     """What is wrong around the drive from the beginning."""

@@ -56,6 +56,7 @@ class Shaft:
         position_counts: where the shaft is, with fraction.
         velocity_counts: counts per step.
         stalled: something holds it.
+        current_limited: the motor would have drawn more current in the last step than the amplifier gives.
     """
 
     def __init__(self, plant: MotorPlant, step_s: float) -> None:
@@ -63,6 +64,9 @@ class Shaft:
         self.position_counts = 0.0
         self.velocity_counts = 0.0
         self.stalled = False
+        self.current_limited = False
+        self._peak_v = math.inf
+        self._peak_change = 0.0
         self._dice = random.Random(plant.seed)  # noqa: S311 - reproducible on purpose
         radians_per_count = math.tau / plant.counts_per_rev
         torque, resistance, inertia = plant.torque_nm_per_a, plant.resistance_ohm, plant.inertia_kg_m2
@@ -75,13 +79,28 @@ class Shaft:
         self._gain = full_duty * (1.0 - self._driven_decay)
         self._friction = plant.friction_nm / inertia * step_s * counts_per_step
         self._back_emf_v = torque / counts_per_step
+        self._change_per_a = torque / inertia * step_s * counts_per_step
         self._lowest = float(plant.reverse_limit_counts - plant.stop_margin_counts)
         self._highest = float(plant.forward_limit_counts + plant.stop_margin_counts)
+
+    def limit_current(self, peak_a: float) -> None:
+        """Let the amplifier give no more than this current; 0 for no limit."""
+        self._peak_v = peak_a * self.plant.resistance_ohm if peak_a else math.inf
+        self._peak_change = peak_a * self._change_per_a
 
     def step(self, duty: float | None) -> None:
         """Let one step pass with a duty of -1 to 1 on the motor, or None with its windings open."""
         before = self.velocity_counts
-        velocity = before * self._coasting_decay if duty is None else before * self._driven_decay + duty * self._gain
+        self.current_limited = False
+        if duty is None:
+            velocity = before * self._coasting_decay
+        else:
+            winding_v = duty * self.plant.supply_v - self._back_emf_v * before
+            if -self._peak_v <= winding_v <= self._peak_v:
+                velocity = before * self._driven_decay + duty * self._gain
+            else:
+                self.current_limited = True
+                velocity = before * self._coasting_decay + math.copysign(self._peak_change, winding_v)
         if velocity > self._friction:
             velocity -= self._friction
         elif velocity < -self._friction:
@@ -104,7 +123,8 @@ class Shaft:
         """Return the motor current with that duty on the motor, positive when it drives forward."""
         if duty is None:
             return 0.0
-        return (duty * self.plant.supply_v - self._back_emf_v * self.velocity_counts) / self.plant.resistance_ohm
+        winding_v = duty * self.plant.supply_v - self._back_emf_v * self.velocity_counts
+        return min(max(winding_v, -self._peak_v), self._peak_v) / self.plant.resistance_ohm
 
     @property
     def on_reverse_limit(self) -> bool:

@@ -10,7 +10,7 @@ from ldcnd.model.commands import AxisCommand, CommandReply, Power, Verb
 from ldcnd.model.samples import AxisState, FaultSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
@@ -109,7 +109,7 @@ async def dialect_rig(
         faults: of the line.
         axis: overrides and additions to the axis's configuration.
     """
-    settings = replace(MODELS[dialect.module][1], version=dialect.version)
+    settings = replace(model(dialect.module)[1], version=dialect.version)
     chain = build_chain(ChainSpec((ModuleSpec(dialect.module, plant, settings),), faults=faults))
     drive = chain.modules[0]
     assert isinstance(drive, SimulatedDrive)

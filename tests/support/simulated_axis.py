@@ -9,8 +9,8 @@ from ldcnd.drivers.ldcn.status import Status, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from ldcnd.sim.ldcn.module import ModuleSettings
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_host import SimulatedHost
 

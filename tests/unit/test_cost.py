@@ -17,7 +17,7 @@ from ldcnd.exchange import Exchange
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning.cost import LineTiming, cost_of
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.module import ModuleSettings
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit

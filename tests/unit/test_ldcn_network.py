@@ -16,7 +16,7 @@ from ldcnd.model.commands import HomeMethod
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from ldcnd.sim.ldcn.module import ModuleSettings
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.bare_network import bare_network, specs
 

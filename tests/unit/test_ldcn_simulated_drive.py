@@ -6,8 +6,8 @@ from ldcnd.drivers.ldcn.controls import LimitPins, StopControl
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis
 from tests.support.simulated_host import little

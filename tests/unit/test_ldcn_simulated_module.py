@@ -10,7 +10,7 @@ from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.status import StatusFlag, StatusItem
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.module import ModuleSettings
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 from tests.support.simulated_host import SimulatedHost, little
 
 IDENTITY = StatusItem.IDENTITY
@@ -47,7 +47,7 @@ def test_modules_tell_their_identity():
         assert len(reply) == 4
         identities.append((reply[1], reply[2]))
 
-    assert identities == [(90, 20), (90, 1), (0, 1), (0, 2), (0, 3), (0, 4), (0, 10), (2, 1), (3, 1)]
+    assert identities == [(90, 20), (90, 1), (0, 1), (0, 2), (0, 3), (0, 4), (0, 5), (0, 10), (2, 1), (3, 1)]
 
 
 def test_second_set_address_renames_a_module():
@@ -352,16 +352,16 @@ def test_io_module_keeps_its_place_in_the_chain():
 
 
 def test_settings_of_a_module_override_those_of_its_name():
-    settings = replace(MODELS["picservo-v1"][1], version=1, phase_s=0.0002)
+    settings = replace(MODELS["pic-servo-v1"][1], version=1, phase_s=0.0002)
 
-    host = host_on("picservo-v1", settings=settings)
+    host = host_on("pic-servo-v1", settings=settings)
 
     assert host.read(1, PIC_SERVO_V1, IDENTITY).version == 1
     assert host.chain.modules[0].settings is settings
 
 
 def test_unknown_module_name_is_refused_with_the_known_ones():
-    with pytest.raises(ValueOutOfRange, match="ls182ap"):
+    with pytest.raises(ValueOutOfRange, match="ls-182ap"):
         build_chain(ChainSpec((ModuleSpec("ls999"),)))
     with pytest.raises(ValueOutOfRange, match="at least one"):
         build_chain(ChainSpec(()))

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.sim import command
-from ldcnd.config.simulation import FaultPlanConfig, ModuleKnobs, PlantConfig, SimulatedChainConfig, SimulationConfig
+from ldcnd.config.simulation import FaultPlanConfig, Quirks, PlantConfig, SimulatedChainConfig, SimulationConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
 from ldcnd.sim.ldcn.chain import MODELS, build_chain
-from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.plant import MotorPlant
 
 TESTS = Path(__file__).parents[1]
@@ -33,8 +33,8 @@ def load(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ('[[module]]\nmodel = "ls999"', "module[0].model: no such simulated module; known are ls182ap"),
-        ('[[module]]\nmodel = "picio"\nconditions = ["stalled"]', "module[0]: conditions: a picio has no motor"),
+        ('[[module]]\nmodel = "ls999"', "module[0].model: no such simulated module; known are ls-182ap"),
+        ('[[module]]\nmodel = "picio"\nconditions = ["stalled"]', "module[0]: conditions: a pic-io has no motor"),
         ('[[module]]\nmodel = "ls182ap"\nplant = { mass = 1 }', "module[0].plant.mass: there is no such key"),
         ('[[module]]\nmodel = "ls182ap"\n[[event]]\nat_s = 1\nmodule = 1', "event[0]: an event needs exactly one"),
         ('[[module]]\nmodel = "ls182ap"\n[[event]]\nat_s = 1\nmodule = 2\npower = "off"', "there is no module 2"),
@@ -54,11 +54,11 @@ def test_a_wrong_file_is_refused_with_file_key_and_reason(tmp_path, text, compla
     assert complaint in refused.value.message
 
 
-def test_every_constant_of_the_plant_and_every_setting_has_its_knob():
+def test_every_constant_of_the_plant_and_every_setting_can_be_configured():
     travel = {"reverse_limit_counts", "forward_limit_counts", "seed"}
 
     assert set(PlantConfig.model_fields) == {field.name for field in fields(MotorPlant)} - travel
-    assert set(ModuleKnobs.model_fields) == {field.name for field in fields(ModuleSettings)}
+    assert set(Quirks.model_fields) == {field.name for field in fields(ModuleSettings)}
 
 
 def test_what_is_left_out_stays_as_it_is_for_the_model(tmp_path):

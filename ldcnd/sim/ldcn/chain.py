@@ -9,12 +9,14 @@ from ldcnd.drivers.ldcn.profiles import (
     LS_173AP,
     LS_182AP,
     PIC_IO,
+    PIC_SERVO_CMC,
     PIC_SERVO_SC,
     PIC_SERVO_V1,
     PIC_SERVO_V2,
     PIC_SERVO_V3,
     PIC_SERVO_V4,
     PIC_STEP,
+    Profile,
     Support,
 )
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
@@ -23,8 +25,9 @@ from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
-from ldcnd.sim.ldcn.module import ModuleSettings, SimulatedModule
+from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 
 MOST_DRIFT_PPM = 50.0
@@ -32,18 +35,52 @@ MOST_DRIFT_PPM = 50.0
 
 MODELS = MappingProxyType(
     {
-        "ls182ap": (LS_182AP, ModuleSettings(version=20, always_obeys_global_reset=True)),
-        "ls173ap": (LS_173AP, ModuleSettings(version=1, always_obeys_global_reset=True)),
-        "picservo-v1": (PIC_SERVO_V1, ModuleSettings(version=1)),
-        "picservo-v2": (PIC_SERVO_V2, ModuleSettings(version=2)),
-        "picservo-v3": (PIC_SERVO_V3, ModuleSettings(version=3)),
-        "picservo-v4": (PIC_SERVO_V4, ModuleSettings(version=4)),
-        "picservo-sc": (PIC_SERVO_SC, ModuleSettings(version=10, always_obeys_global_reset=True)),
-        "picio": (PIC_IO, ModuleSettings(version=1)),
-        "picstep": (PIC_STEP, ModuleSettings(version=1)),
+        profile.name: (profile, settings)
+        for profile, settings in (
+            (LS_182AP, ModuleSettings(version=20, always_obeys_global_reset=True)),
+            (LS_173AP, ModuleSettings(version=1, always_obeys_global_reset=True)),
+            (PIC_SERVO_V1, ModuleSettings(version=1)),
+            (PIC_SERVO_V2, ModuleSettings(version=2)),
+            (PIC_SERVO_V3, ModuleSettings(version=3)),
+            (PIC_SERVO_V4, ModuleSettings(version=4)),
+            (PIC_SERVO_CMC, ModuleSettings(version=5)),
+            (PIC_SERVO_SC, ModuleSettings(version=10, always_obeys_global_reset=True, stop_clears_velocity=False)),
+            (PIC_IO, ModuleSettings(version=1)),
+            (PIC_STEP, ModuleSettings(version=1)),
+        )
     }
 )
-"""Module names, with the dialect each speaks and how it is when nothing else is asked for."""
+"""By the name of the profile: the dialect, and how the module is when nothing else is asked for."""
+OLD_NAMES = MappingProxyType(
+    {
+        "ls182ap": "ls-182ap",
+        "ls173ap": "ls-173ap",
+        "picservo-v1": "pic-servo-v1",
+        "picservo-v2": "pic-servo-v2",
+        "picservo-v3": "pic-servo-v3",
+        "picservo-v4": "pic-servo-v4",
+        "picservo-sc": "pic-servo-sc",
+        "picio": "pic-io",
+        "picstep": "pic-step",
+    }
+)
+"""Other spellings, which configurations may still have."""
+
+
+def model(name: str) -> tuple[Profile, ModuleSettings]:
+    """Return the dialect of a module and how it is when nothing else is asked for.
+
+    Args:
+        name: as in `MODELS` or `OLD_NAMES`.
+
+    Raises:
+        ValueOutOfRange: there is no such module.
+    """
+    known = MODELS.get(OLD_NAMES.get(name, name))
+    if known is None:
+        names = ", ".join(MODELS)
+        raise ValueOutOfRange(f"simulated module {name!r} is not one of {names}", value=name, limit=names)
+    return known
 
 
 def _unchanged(settings: ModuleSettings) -> ModuleSettings:
@@ -55,7 +92,7 @@ class ModuleSpec:
     """One module of a chain.
 
     Attributes:
-        name: a key of `MODELS`.
+        name: as in `MODELS`.
         plant: the machine on its shaft; modules without a motor ignore it.
         settings: None for those of `MODELS`, with phase and drift of the servo cycle drawn from the chain's seed.
         adjust: changes single settings and leaves the others as they are.
@@ -136,10 +173,7 @@ def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], 
 
 
 def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
-    if spec.name not in MODELS:
-        known = ", ".join(MODELS)
-        raise ValueOutOfRange(f"simulated module {spec.name!r} is not one of {known}", value=spec.name, limit=known)
-    profile, default = MODELS[spec.name]
+    profile, default = model(spec.name)
     drawn = replace(
         default, phase_s=dice.uniform(0.0, SERVO_CYCLE_S), drift_ppm=dice.uniform(-MOST_DRIFT_PPM, MOST_DRIFT_PPM)
     )

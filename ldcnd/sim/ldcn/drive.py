@@ -2,20 +2,26 @@
 
 Decisions where the manuals leave room:
 
-* A trapezoidal move always starts from standstill; loaded in mid-move it is an offset on LS-182AP, and a jump of the
-  command velocity on PIC-SERVO.
+* A trapezoidal move starts from standstill. Loaded in mid-move it is an offset on LS-182AP, a jump of the command
+  velocity on older PIC-SERVOs, and just another goal on PIC-SERVO SC.
+* Loads of Load Trajectory add up until the start; on PIC-SERVO SC each replaces all that still waited.
 * On Logosol drives the loop can only be closed with Pic_ae = 1 and nothing latched. Position error and sensor fault are
   latched too, as the footnote of the diagnostics table demands.
 * The motion lock of LS-182AP from version 22 on: homing on a limit switch locks; then nothing starts until Stop Motor
   with bit 7, which also keeps further homing from locking until the next reset.
+* Path points are taken with the servo off and during other motions; a path starts with the servo on only. A start with
+  an empty buffer, or while a path runs, does nothing.
 
-Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3.
+Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3; PIC-SERVO SC data sheet, 4.6, 4.7, 5.
 """
 
-from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl
+from dataclasses import dataclass, replace
+
+from ldcnd.drivers.ldcn.controls import HomingControl, IoOption, LimitPins, StartUp, StopControl
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile
 from ldcnd.drivers.ldcn.received import (
+    AddPathPoints,
     IoControl,
     LoadTrajectory,
     PlainCommand,
@@ -25,17 +31,34 @@ from ldcnd.drivers.ldcn.received import (
     SetHomingMode,
     StopMotor,
 )
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, Gains
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.sim.ldcn.module import ModuleSettings, PositionErrorClearing, SimulatedModule
-from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage
+from ldcnd.sim.ldcn.module import SimulatedModule
+from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage, ScPower
+from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing, RelativeTo
 from ldcnd.sim.ldcn.servo import COUNTER_SPAN, HomeSearch, ServoLoop
 from ldcnd.sim.plant import MotorPlant, Shaft
 
 SHORTS = range(-0x8000, 0x8000)
 _NO_TRAJECTORY = Trajectory(servo=False)
 _ALL_INPUTS = LimitPins.LIMIT1_INPUT | LimitPins.LIMIT2_INPUT
+_WAYS_TO_STOP = StopControl.MOTOR_OFF | StopControl.ABRUPT | StopControl.SMOOTH | StopControl.HERE
+_LIMIT_PROTECTION = IoOption.LIMIT_OFF | IoOption.LIMIT_STOP
+
+
+@dataclass(frozen=True, slots=True)
+class SavedConfiguration:
+    """The EEPROM of a PIC-SERVO SC; only a loss of its supply brings it back."""
+
+    start_up: StartUp
+    address: int
+    group: int
+    leader: bool
+    speed: int
+    acceleration: int
+    gains: Gains
+    protection: IoOption
 
 
 class SimulatedDrive(SimulatedModule):
@@ -45,14 +68,23 @@ class SimulatedDrive(SimulatedModule):
         shaft: the machine, for looking at and for pushing.
         stage: the power stage.
         loop: the servo loop.
+        saved: the EEPROM; None where nothing was saved.
     """
 
     def __init__(self, profile: Profile, settings: ModuleSettings, plant: MotorPlant) -> None:
         self.shaft = Shaft(plant, SERVO_CYCLE_S)
         self.stage: PowerStage
         self.loop: ServoLoop
+        self.saved: SavedConfiguration | None = None
         self._conditions: set[Condition] = set()
         self._overrun = False
+        if settings.velocity_sign is not None:
+            profile = replace(profile, velocity_sign=settings.velocity_sign)
+        self._compatible = self._advanced = profile
+        if profile.advanced_stop:
+            self._advanced = replace(PIC_SERVO_CMC_ADVANCED, velocity_sign=profile.velocity_sign)
+            items = self._advanced if settings.items_before_advanced else profile
+            self._compatible = replace(items, path_points=0)
         super().__init__(profile, settings)
 
     def set_condition(self, condition: Condition, *, present: bool, at_s: float) -> None:
@@ -70,12 +102,20 @@ class SimulatedDrive(SimulatedModule):
 
     # -- module ------------------------------------------------------------------------------------------------------
 
+    @property
+    def dialect(self) -> Profile:
+        """See `SimulatedModule`: a CMC knows its own commands only after Stop Motor with bit 5."""
+        return self._advanced if self._is_advanced else self._compatible
+
     def restart(self) -> None:
         """See `SimulatedModule`: everything but the shaft and its troubles starts anew."""
-        self.stage = LogosolPower() if self.profile.pic_ae_diagnostics else PicServoPower()
+        if self.profile.pic_ae_diagnostics:
+            self.stage = LogosolPower()
+        else:
+            self.stage = ScPower() if self.profile.sc_extensions else PicServoPower()
         self.stage.conditions = self._conditions
         self.stage.check()
-        self.loop = ServoLoop(self.profile, self.shaft, self.stage, self.settings.sense_counts_per_a)
+        self.loop = ServoLoop(self.profile, self.shaft, self.stage, self.settings)
         self._trajectory = _NO_TRAJECTORY
         self._goal = 0
         self._new_goal = False
@@ -88,6 +128,9 @@ class SimulatedDrive(SimulatedModule):
         self._may_lock = self.profile.motion_lock_from is not None and (
             self.settings.version >= self.profile.motion_lock_from
         )
+        self._is_advanced = False
+        self._energised_by_address = StartUp(0)
+        self._shows_slew = self.settings.aux_after_reset
 
     def run(self, cycles: int) -> None:
         """See `SimulatedModule`."""
@@ -96,12 +139,12 @@ class SimulatedDrive(SimulatedModule):
             self.loop.homed_on_limit = False
             self._locked = self._may_lock
 
-    def execute(self, command: ReceivedCommand) -> None:
+    def execute(self, command: ReceivedCommand) -> None:  # noqa: C901 - one branch per command
         """See `SimulatedModule`."""
         loop = self.loop
         match command:
             case ResetPosition(position, relative_to_home):
-                loop.renumber(loop.position - loop.home if relative_to_home else position)
+                self._renumber(loop.position - loop.home if relative_to_home else position)
             case LoadTrajectory(trajectory):
                 self._load(trajectory)
             case PlainCommand(Command.START_MOTION):
@@ -110,10 +153,15 @@ class SimulatedDrive(SimulatedModule):
                 loop.set_gains(gains)
             case StopMotor(control, position):
                 self._stop(control, position)
-            case IoControl(control) if self.profile.limit_outputs:
-                self._pins = LimitPins(control & 0x0F)
+            case IoControl(control):
+                self._set_options(control)
             case SetHomingMode(control):
                 self._arm_homing(control)
+            case AddPathPoints(()):
+                if loop.servo_on:
+                    loop.trajectory.start_path()
+            case AddPathPoints(points):
+                loop.trajectory.path.add(points)
             case PlainCommand(Command.CLEAR_STICKY_BITS):
                 self._clear_sticky_bits()
             case PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME):
@@ -134,7 +182,7 @@ class SimulatedDrive(SimulatedModule):
         if loop.search:
             flags |= StatusFlag.HOME_IN_PROGRESS
         return encode_status(
-            self.profile,
+            self.dialect,
             items,
             Status(
                 flags,
@@ -146,7 +194,7 @@ class SimulatedDrive(SimulatedModule):
                 device_id=self.profile.device_id,
                 version=self.settings.version,
                 position_error=_short(loop.following_error),
-                bit7=0,
+                bit7=loop.trajectory.path.points_left,
             ),
         )
 
@@ -160,27 +208,100 @@ class SimulatedDrive(SimulatedModule):
 
     def _aux(self) -> AuxFlag:
         loop = self.loop
-        flags = self.stage.aux(AuxFlag(0) if loop.inputs.index else AuxFlag.INDEX)
-        if loop.wrapped:
-            flags |= AuxFlag.POSITION_WRAP
-        if loop.servo_on:
-            flags |= AuxFlag.SERVO_ON
-        if loop.trajectory.accel_done:
-            flags |= AuxFlag.ACCEL_DONE
-        if loop.trajectory.slew_done:
-            flags |= AuxFlag.SLEW_DONE
-        if self._overrun:
-            flags |= AuxFlag.SERVO_OVERRUN
-        if self._locked:
-            flags |= AuxFlag.MOTION_LOCKED
+        trajectory, live = loop.trajectory, self.profile.live_aux
+        flags = self.stage.aux(AuxFlag.INDEX if loop.inputs.index is live else AuxFlag(0))
+        accelerates, slews = trajectory.accel_done, trajectory.slew_done
+        if live:
+            running = trajectory.path.running
+            accelerates = trajectory.accelerating and not running
+            slews = (self.settings.path_slew if running else trajectory.steady) and self._shows_slew
+        for present, flag in (
+            (loop.wrapped, AuxFlag.POSITION_WRAP),
+            (loop.servo_on, AuxFlag.SERVO_ON),
+            (accelerates, AuxFlag.ACCEL_DONE),
+            (slews, AuxFlag.SLEW_DONE),
+            (self._overrun, AuxFlag.SERVO_OVERRUN),
+            (trajectory.path.path_mode, AuxFlag.PATH_MODE),
+            (self._locked, AuxFlag.MOTION_LOCKED),
+        ):
+            if present:
+                flags |= flag
         return flags
+
+    # -- the EEPROM of PIC-SERVO SC ----------------------------------------------------------------------------------
+
+    def save(self, start_up: int) -> None:
+        """See `SimulatedModule`; without the bit for saving the EEPROM is erased."""
+        control = StartUp(start_up)
+        if not control & StartUp.SAVE:
+            self.saved = None
+            return
+        self.saved = SavedConfiguration(
+            control,
+            self.address,
+            self.group,
+            self.leader,
+            self._speed,
+            self._acceleration,
+            self.loop.gains,
+            self.loop.protection,
+        )
+
+    def restore(self) -> None:
+        """See `SimulatedModule`."""
+        saved = self.saved
+        if saved is None:
+            return
+        self._speed, self._acceleration = saved.speed, saved.acceleration
+        self.loop.set_gains(saved.gains)
+        if saved.start_up & StartUp.LIMIT_PROTECTION:
+            self.loop.protection = saved.protection
+        self._energised_by_address = saved.start_up & (StartUp.AMPLIFIER_ON | StartUp.SERVO_ON)
+        if saved.start_up & StartUp.ADDRESSES:
+            self.address, self.group, self.leader = saved.address, saved.group, saved.leader
+            self.address_out = True
+            self.addressed()
+
+    def addressed(self) -> None:
+        """See `SimulatedModule`: what was saved for the start-up energises the motor now."""
+        start_up, self._energised_by_address = self._energised_by_address, StartUp(0)
+        if start_up & StartUp.AMPLIFIER_ON:
+            self.stage.enable(on=True)
+        if start_up & StartUp.SERVO_ON and self.stage.allows_servo:
+            self._close()
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
+    def _renumber(self, position: int) -> None:
+        """Name the present position anew: 0; on PIC-SERVO SC also relative to home, or any number."""
+        loop = self.loop
+        if self.settings.home_shifts:
+            loop.home += position - loop.position
+        loop.renumber(position)
+
+    def _set_options(self, control: int) -> None:
+        loop = self.loop
+        if self.profile.limit_outputs:
+            self._pins = LimitPins(control & 0x0F)
+        else:
+            loop.protection = IoOption(control) & _LIMIT_PROTECTION
+        loop.trajectory.path.fast = bool(control & IoOption.FAST_PATH)
+
     def _load(self, trajectory: Trajectory) -> None:
+        if trajectory.relative and self.settings.relative_to is RelativeTo.LOAD and trajectory.position is not None:
+            trajectory = replace(trajectory, position=self._from_command_position(trajectory.position), relative=False)
         self._trajectory = trajectory
+        if not self.profile.sc_extensions:
+            self._take_registers()
+        if trajectory.start_now:
+            self._start()
+
+    def _take_registers(self) -> None:
+        """Let the values of the last load take effect in the registers."""
+        trajectory = self._trajectory
         if trajectory.position is not None:
-            self._goal = trajectory.position
+            relative = trajectory.relative
+            self._goal = self._from_command_position(trajectory.position) if relative else trajectory.position
             self._new_goal = True
         if trajectory.velocity is not None:
             self._speed = trajectory.velocity
@@ -188,24 +309,29 @@ class SimulatedDrive(SimulatedModule):
             self._acceleration = trajectory.acceleration
         if trajectory.pwm_or_target is not None:
             self._pwm_or_target = trajectory.pwm_or_target
-        if trajectory.start_now:
-            self._start()
+
+    def _from_command_position(self, counts: int) -> int:
+        return self.loop.trajectory.position // FRACTION + counts
 
     def _start(self) -> None:
         """Execute what was loaded last."""
-        new_goal, self._new_goal = self._new_goal, False
         if self._locked:
             return
+        if self.profile.sc_extensions:
+            self._take_registers()
+        new_goal, self._new_goal = self._new_goal, False
         loop, trajectory = self.loop, self._trajectory
         if not trajectory.servo:
-            loop.open()
-            loop.pwm = -self._pwm_or_target if trajectory.reverse else self._pwm_or_target
+            self._run_pwm(trajectory)
             return
         if not self.stage.allows_servo:
             return
         profiler = loop.trajectory
         moving = loop.servo_on and profiler.mode is ProfileMode.TRAPEZOIDAL and not profiler.done
         self._close()
+        if not loop.may_run(self._direction(trajectory)):
+            return
+        self._end_path()
         if trajectory.mode is ProfileMode.VELOCITY:
             self._run_at_velocity(trajectory)
         elif moving and self.profile.offset_on_the_fly:
@@ -213,7 +339,26 @@ class SimulatedDrive(SimulatedModule):
                 profiler.add_offset(self._goal)
         else:
             loop.analog_target = None
-            profiler.go_to(self._goal, self._speed, self._acceleration)
+            on_the_fly = self.profile.sc_extensions
+            profiler.go_to(self._goal, self._speed, self._acceleration, from_velocity=on_the_fly)
+
+    def _direction(self, trajectory: Trajectory) -> int:
+        """Return the sign of the velocity that a motion needs."""
+        if trajectory.mode is ProfileMode.VELOCITY:
+            speed = -self._speed if trajectory.reverse else self._speed
+            return (speed > 0) - (speed < 0)
+        ahead = self._goal * FRACTION - self.loop.trajectory.position
+        return (ahead > 0) - (ahead < 0)
+
+    def _run_pwm(self, trajectory: Trajectory) -> None:
+        loop = self.loop
+        pwm = -self._pwm_or_target if trajectory.reverse else self._pwm_or_target
+        if self.profile.sc_extensions and trajectory.pwm_or_target is None:
+            pwm = loop.pwm
+        self._end_path()
+        loop.open()
+        if loop.may_run(pwm):
+            loop.pwm = pwm
 
     def _run_at_velocity(self, trajectory: Trajectory) -> None:
         loop = self.loop
@@ -223,20 +368,30 @@ class SimulatedDrive(SimulatedModule):
         loop.analog_target = None
         loop.trajectory.run_at(-self._speed if trajectory.reverse else self._speed, self._acceleration)
 
+    def _end_path(self) -> None:
+        path = self.loop.trajectory.path
+        if path.running:
+            path.end(clear=self.settings.path_cleared_by_stop)
+
     def _stop(self, control: StopControl, position: int | None) -> None:
         self.stage.enable(on=bool(control & StopControl.AMP_ENABLE))
         if control & StopControl.LOCK_DISABLE and self._may_lock:
             self._locked = self._may_lock = False
-        if self.settings.stop_clears_velocity:
+        if self.profile.advanced_stop:
+            keeps = self._is_advanced and self.settings.advanced_sticky
+            self._is_advanced = keeps or bool(control & StopControl.ADVANCED)
+        profiled = control & (StopControl.ABRUPT | StopControl.SMOOTH)
+        if profiled and self.settings.stop_clears_velocity:
             self._speed = 0
-        self._obey_stage()
         loop = self.loop
+        if control & _WAYS_TO_STOP or self.settings.path_ended_by_enable:
+            loop.trajectory.path.end(clear=self.settings.path_cleared_by_stop)
+        self._obey_stage()
         if control & StopControl.MOTOR_OFF:
             loop.open()
             return
         if not self.profile.stop_here:
             position = None
-        profiled = control & (StopControl.ABRUPT | StopControl.SMOOTH)
         if not self.stage.allows_servo or not (profiled or position is not None):
             return
         self._close()
@@ -263,6 +418,7 @@ class SimulatedDrive(SimulatedModule):
     def _close(self) -> None:
         if not self.loop.servo_on and self.settings.position_error_clearing is PositionErrorClearing.BY_CLOSING:
             self.loop.position_error = False
+        self._shows_slew = True
         self.loop.close()
 
     def _obey_stage(self) -> None:

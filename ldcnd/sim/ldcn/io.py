@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from ldcnd.drivers.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drivers.ldcn.received import ReceivedCommand
 from ldcnd.drivers.ldcn.status import StatusFlag, StatusItem
-from ldcnd.sim.ldcn.module import ModuleSettings, SimulatedModule
+from ldcnd.sim.ldcn.module import SimulatedModule
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 
 PIC_IO_ITEM_BYTES = (2, 1, 1, 1, 4, 2, 2, 4)
 """Inputs, A/D 1 to 3, timer, identity, inputs and timer as captured by the synchronisation command."""

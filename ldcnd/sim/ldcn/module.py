@@ -3,8 +3,8 @@
 A packet is executed at the end of the servo cycle in which it became complete, and the status packet starts there;
 every module has its own phase and drift of that grid. Decisions where the manuals leave room:
 
-* A byte of the host that arrives before the status packet has been sent takes back the packet, not the command: the
-  command is executed unless a whole new one for the same module overwrites it first (PIC-SERVO manual, 4.1).
+* A byte of the host that arrives before the status packet has been sent makes a module drop that packet. The command
+  itself waits in the buffer into which the next packet is received, and is overwritten by the address byte of any.
 * A framing error in the middle of a packet counts as a wrong checksum; outside of packets it is nothing.
 * Nothing is heard while the address input is high. It is a level, not a latch: a module behind one that was reset is
   deaf until that one has an address again.
@@ -14,8 +14,6 @@ Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface"
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
-from enum import StrEnum
 
 from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader
 from ldcnd.drivers.ldcn.profiles import Profile
@@ -29,50 +27,14 @@ from ldcnd.drivers.ldcn.received import (
     SetBaudRate,
     received_command,
 )
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, module_baud
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
+from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings
 
 EVERYBODY = 0xFF
-RESET_BAUD_DIVISOR = 0x3F
+RESET_BAUD_CODE = 0x3F
 _ROUNDING = 1e-6
-
-
-class PositionErrorClearing(StrEnum):
-    """What takes the sticky pos_error bit back once the loop is closed."""
-
-    BY_COMMAND = "by_command"
-    """Clear Sticky Bits only, as both manuals say."""
-    BY_CLOSING = "by_closing"
-    """Closing the loop does, too."""
-
-
-@dataclass(frozen=True, slots=True)
-class ModuleSettings:
-    """How one module behaves where the manuals allow variants.
-
-    Attributes:
-        version: second byte of its identity.
-        phase_s: where its servo cycles lie, 0 to 0.000512.
-        drift_ppm: how much longer its servo cycles are than nominal.
-        reply_latency_s: added between the end of the cycle and the reply.
-        reset_dead_s: how long it is deaf after Hard Reset and power-up.
-        always_obeys_global_reset: obeys Hard Reset to FF in any group; PIC-SERVO version 4 and PIC-I/O do so only in
-            group FF.
-        stop_clears_velocity: Stop Motor sets the velocity register to 0.
-        position_error_clearing: what takes pos_error back.
-        sense_counts_per_a: A/D counts per ampere of motor current (PIC-SERVO).
-    """
-
-    version: int
-    phase_s: float = 0.0
-    drift_ppm: float = 0.0
-    reply_latency_s: float = 0.0
-    reset_dead_s: float = 0.0
-    always_obeys_global_reset: bool = False
-    stop_clears_velocity: bool = False
-    position_error_clearing: PositionErrorClearing = PositionErrorClearing.BY_COMMAND
-    sense_counts_per_a: float = 12.0
 
 
 class SimulatedModule(Module):
@@ -83,6 +45,8 @@ class SimulatedModule(Module):
         group: group address, 128 to 255.
         leader: answers for its group.
         items: what Define Status asked for.
+        overwritten: how many commands were lost because another packet came before they were executed.
+        unknown_bauds: how many codes of Set Baud Rate it did not know.
     """
 
     def __init__(self, profile: Profile, settings: ModuleSettings) -> None:
@@ -95,6 +59,10 @@ class SimulatedModule(Module):
         self.group = EVERYBODY
         self.leader = False
         self.items = StatusItem(0)
+        self.overwritten = 0
+        self.unknown_bauds = 0
+        self.yields_to_host = settings.yields_to_host
+        self._loses_commands = settings.command_buffer is CommandBuffer.OVERWRITTEN
         self._powered = True
         self._deaf_until_s = -math.inf
         self._packet: Packet | None = None
@@ -110,6 +78,8 @@ class SimulatedModule(Module):
         if not self._powered or at_s < self._deaf_until_s:
             return
         self._fall_silent()
+        if self._reader.in_packet:
+            self._overwrite()
         if value is None:
             self._damaged = self._reader.in_packet
             if not self._damaged:
@@ -134,12 +104,13 @@ class SimulatedModule(Module):
         return _is_packet(data) or HEADER not in data
 
     def hear_all(self, data: bytes, starts_at_s: float, byte_s: float) -> None:
-        """See `Module`: a packet for somebody else only takes back what this module was about to send."""
+        """See `Module`: a packet for another module only ends what this one was about to do."""
         deaf = not self._powered or starts_at_s + byte_s < self._deaf_until_s
         if deaf or not _is_packet(data) or self._is_for_me(data[1], data[2] & 0x0F):
             super().hear_all(data, starts_at_s, byte_s)
         else:
             self._fall_silent()
+            self._overwrite()
 
     def advance(self, to_s: float) -> Reply | None:
         """See `Module`."""
@@ -157,11 +128,18 @@ class SimulatedModule(Module):
                 return None
         return Reply(reply, at_s, BITS_PER_BYTE / self.baud) if reply else None
 
+    @property
+    def dialect(self) -> Profile:
+        """What it understands at present; some devices learn more by a command."""
+        return self.profile
+
     def power(self, *, on: bool, at_s: float) -> None:
-        """Switch the module off, or on again: it then starts as after a reset."""
+        """Switch the module off, or on again: it then starts as after a reset, and restores what it has saved."""
         self.catch_up(at_s)
         self._reset(at_s)
         self._powered = on
+        if on:
+            self.restore()
 
     def catch_up(self, to_s: float) -> None:
         """See `Module`: let the servo cycles up to that instant pass; also before something is changed from outside."""
@@ -172,6 +150,15 @@ class SimulatedModule(Module):
     @abstractmethod
     def restart(self) -> None:
         """Take the state of power-up."""
+
+    def restore(self) -> None:
+        """Restore what was saved, at power-up."""
+
+    def save(self, start_up: int) -> None:
+        """Save the configuration, as the control byte of Hard Reset asks for."""
+
+    def addressed(self) -> None:
+        """Do what is due when an address has been set."""
 
     @abstractmethod
     def run(self, cycles: int) -> None:
@@ -188,10 +175,19 @@ class SimulatedModule(Module):
     # -- what all have in common -------------------------------------------------------------------------------------
 
     def _fall_silent(self) -> None:
-        """The host sends: take back what was to be sent."""
+        """Drop what was to be sent, because the host sends."""
+        if not self.yields_to_host:
+            return
         self._answers = False
         if self._reply is not None:
             self._reply = None
+            self.next_event_s = NEVER_S
+
+    def _overwrite(self) -> None:
+        """Lose the command that waits, because its buffer takes the next packet."""
+        if self._packet is not None and self._loses_commands:
+            self._packet = None
+            self.overwritten += 1
             self.next_event_s = NEVER_S
 
     def _is_for_me(self, address: int, command: int) -> bool:
@@ -210,17 +206,24 @@ class SimulatedModule(Module):
         if not self._intact:
             return self.status(self.items, checksum_error=True) if self._answers else None
         items = self.items
-        match received_command(self.profile, packet):
+        match received_command(self.dialect, packet):
             case SetAddress() as addresses:
                 self.address, self.group, self.leader = addresses.address, addresses.group, addresses.leader
                 self.address_out = True
+                self.addressed()
             case DefineStatus(items):
                 self.items = items
             case ReadStatus(items):
                 pass
             case SetBaudRate(code):
-                self.baud = actual_baud(code)
-            case HardReset():
+                baud = module_baud(self.profile, code)
+                if baud is None:
+                    self.unknown_bauds += 1
+                else:
+                    self.baud = baud
+            case HardReset(start_up):
+                if start_up is not None:
+                    self.save(start_up)
                 self._reset(at_s)
                 return None
             case PlainCommand(Command.NO_OPERATION):
@@ -238,7 +241,7 @@ class SimulatedModule(Module):
         self.group = EVERYBODY
         self.leader = False
         self.items = StatusItem(0)
-        self.baud = actual_baud(RESET_BAUD_DIVISOR)
+        self.baud = module_baud(self.profile, RESET_BAUD_CODE) or self.baud
         self.address_out = False
         self.next_event_s = NEVER_S
         self._reader.reset()

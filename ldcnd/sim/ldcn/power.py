@@ -130,6 +130,22 @@ class PicServoPower(PowerStage):
         return index
 
 
+class ScPower(PicServoPower):
+    """PIC-SERVO SC watches the supply: too low opens the loop, too high only disables the amplifier until it is over.
+
+    Source: PIC-SERVO SC data sheet, 4.7.
+    """
+
+    def check(self) -> None:
+        """See `PowerStage`."""
+        super().check()
+        self.drives = self.drives and Condition.OVERVOLTAGE not in self.conditions
+
+    def flags(self, limits: StatusFlag) -> StatusFlag:
+        """See `PowerStage`."""
+        return super().flags(limits) if Condition.OVERVOLTAGE not in self.conditions else limits
+
+
 class LogosolPower(PowerStage):
     """A built-in power driver that latches the cause of its shut-down until Pic_ae = 0 and Clear Sticky Bits.
 

@@ -4,21 +4,30 @@ One call of `run` lets servo cycles of 0.512 ms pass. Where nothing changes any 
 
 The filter is that of both manuals (PIC-SERVO manual, 4.3), with one correction: the derivative term is printed with a
 minus sign, which would drive the motor away from its target; it damps, as the text around it says. The integral error
-is the running sum of the position error divided by 256, rounded down; the sum is bounded by 256 times IL. Deadband
-compensation is added to any output that is not 0.
+is the running sum of the position error divided by 256, rounded down; the sum is bounded by 256 times IL, also on
+PIC-SERVO SC, whose data sheet is silent about the factor. Deadband compensation is added to any output that is not 0.
+
+Where the manuals leave room:
+
+* A servo rate divisor of 0, which no manual allows, counts as 256.
+* Encoder transitions faster than the model counts are lost for good; so are those of a stuck encoder.
+* Limit protection of PIC-SERVO SC with both of its options set turns the motor off.
 """
 
 import math
 from dataclasses import dataclass
 
-from ldcnd.drivers.ldcn.controls import HomingControl
+from ldcnd.drivers.ldcn.controls import HomingControl, IoOption
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, Gains
+from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, Gains
 from ldcnd.sim.ldcn.power import Condition, PowerStage, Trip
-from ldcnd.sim.ldcn.trajectory import ProfileGenerator
+from ldcnd.sim.ldcn.quirks import AnalogEnd, LimitInPath, ModuleSettings
+from ldcnd.sim.ldcn.trajectory import PathBuffer, ProfileGenerator
 from ldcnd.sim.plant import Shaft
 
 FULL_PWM = 255
+MOST_CURRENT_LIMIT = 255
+"""Switches current limiting off on PIC-SERVO SC, as 0 does everywhere."""
 COUNTER_SPAN = 1 << 32
 SENSOR_RANGE = (8 / 1024, 1015 / 1024)
 """Outside this share of the A/D range an absolute positioning sensor counts as disconnected (LS-182AP manual)."""
@@ -56,6 +65,12 @@ class HomeSearch:
 class ServoLoop:
     """What the firmware does in every servo cycle, and the registers it works on.
 
+    Args:
+        profile: the dialect.
+        shaft: the machine.
+        stage: what drives it.
+        quirks: see `ModuleSettings`.
+
     Attributes:
         position: the encoder counter, counts.
         velocity: its change in the last servo tick.
@@ -64,7 +79,9 @@ class ServoLoop:
         trajectory: the command position.
         servo_on: the position loop is closed.
         pwm: signed output to the power stage, -255 to 255.
-        analog_target: the A/D value that an absolute positioning motion goes to.
+        analog_target: the A/D value that an absolute positioning motion goes to; the mode lasts beyond the arrival,
+            and with it the check of the sensor.
+        protection: limit protection as selected by I/O Control.
         search: the armed search for home.
         homed_on_limit: the last search ended on a limit switch.
         position_error: the sticky bits: error limit exceeded or loop opened,
@@ -72,26 +89,35 @@ class ServoLoop:
         overcurrent: current limiting occurred.
     """
 
-    def __init__(self, profile: Profile, shaft: Shaft, stage: PowerStage, sense_counts_per_a: float) -> None:
+    def __init__(self, profile: Profile, shaft: Shaft, stage: PowerStage, quirks: ModuleSettings) -> None:
         self.shaft = shaft
         self.stage = stage
         self.position = 0
         self.velocity = 0
         self.home = 0
         self.gains = _NO_GAINS
-        self.trajectory = ProfileGenerator()
+        self.trajectory = ProfileGenerator(PathBuffer(profile.path_points, quirks))
         self.servo_on = False
         self.pwm = 0
         self.analog_target: int | None = None
+        self.protection = IoOption(0)
         self.search: HomeSearch | None = None
         self.homed_on_limit = False
         self.position_error = True
         self.wrapped = False
         self.overcurrent = False
         self._profile = profile
-        self._divisor = 256
-        self._tick_cycles = self._divisor if profile.divisor_slows_profile else 1
-        self._sense_counts_per_a = sense_counts_per_a
+        self._quirks = quirks
+        self._il_shift = 8 if quirks.il_times_256 else 0
+        self._divisor = 1
+        self._tick_cycles = 1
+        self._path_every_cycle = quirks.path_ignores_divisor and profile.divisor_slows_profile
+        rate = profile.encoder_counts_per_s if quirks.encoder_counts_per_s is None else quirks.encoder_counts_per_s
+        self._most_counts = round(rate * SERVO_CYCLE_S) if rate else COUNTER_SPAN
+        self._overload_cycles = round(quirks.overload_s / SERVO_CYCLE_S)
+        self._overloaded = 0  # cycles for which the motor current has been limited
+        self._arrived = False  # at the analog target
+        shaft.limit_current(quirks.peak_current_a if profile.pic_ae_diagnostics else 0.0)
         self._zero = math.floor(shaft.position_counts)
         self._ticked_position = 0
         self._previous_error = 0
@@ -120,7 +146,9 @@ class ServoLoop:
     @property
     def move_done(self) -> bool:
         """Bit 0 of the status byte."""
-        return not self.servo_on or (self.trajectory.done and self.analog_target is None)
+        if self.trajectory.path.running:
+            return self._quirks.path_move_done
+        return not self.servo_on or (self.trajectory.done and (self.analog_target is None or self._arrived))
 
     def adc(self) -> int:
         """Read the A/D converter: the potentiometer on Logosol drives, the current sense input on PIC-SERVO."""
@@ -128,7 +156,7 @@ class ServoLoop:
         if self._profile.analog_target:
             lost = Condition.SENSOR_LOST in self.stage.conditions
             return 0 if lost else round(self.shaft.potentiometer() * full_scale)
-        sensed = round(abs(self.shaft.current_a(self._duty())) * self._sense_counts_per_a)
+        sensed = round(abs(self.shaft.current_a(self._duty())) * self._quirks.sense_counts_per_a)
         falling = self.gains.cl != 0 and not self.gains.cl & 1
         return full_scale - min(sensed, full_scale) if falling else min(sensed, full_scale)
 
@@ -163,6 +191,9 @@ class ServoLoop:
         self.pwm = 0
         self.position_error = True
         self.analog_target = None
+        path = self.trajectory.path
+        if path.running:
+            path.end(clear=self._quirks.path_cleared_by_fault)
         self.trajectory.follow(self.position, self.velocity)
 
     def run(self, cycles: int) -> None:
@@ -172,7 +203,7 @@ class ServoLoop:
         while cycles > 0:
             cycles -= 1
             steady = steady + 1 if self._cycle() else 0
-            if steady > enough and self.analog_target is None:
+            if steady > enough and (self.analog_target is None or self._arrived):
                 # two servo ticks have changed nothing, so no later one will
                 self._cycles_left = (self._cycles_left - 1 - cycles) % self._tick_cycles + 1
                 break
@@ -187,7 +218,14 @@ class ServoLoop:
         pwm, error_sum, before = self.pwm, self._error_sum, self.position
         shaft.step(pwm / FULL_PWM if stage.drives else None)
         if not stage.conditions or Condition.ENCODER_STUCK not in stage.conditions:
-            self.position = math.floor(shaft.position_counts) - self._zero
+            position = math.floor(shaft.position_counts) - self._zero
+            if abs(position - before) > self._most_counts:
+                position = self._lose_counts(position, before)
+            self.position = position
+        else:
+            self._zero = math.floor(shaft.position_counts) - before
+        if self._path_every_cycle and self.trajectory.path.running:
+            self.trajectory.step()
         self._cycles_left -= 1
         if self._cycles_left <= 0:
             self._cycles_left = self._tick_cycles
@@ -196,13 +234,31 @@ class ServoLoop:
             self._limit_current()
         if self.search:
             self._look_for_home(self.search)
+        if self.protection:
+            self._protect()
+        if shaft.current_limited or self._overloaded:
+            self._count_overload()
         return (
             shaft.velocity_counts == 0.0
             and self.position == before
             and self.pwm == pwm
             and self._error_sum == error_sum
             and self.trajectory.at_rest
+            and not self._overloaded
         )
+
+    def _lose_counts(self, position: int, before: int) -> int:
+        """Return what the counter shows after transitions that came too fast; the rest is lost."""
+        counted = before + (self._most_counts if position > before else -self._most_counts)
+        self._zero += position - counted
+        return counted
+
+    def _count_overload(self) -> None:
+        """Trip when the current has been limited for the overload time (LS-182AP manual, "Overcurrent Protection")."""
+        self._overloaded = self._overloaded + 1 if self.shaft.current_limited else 0
+        if self._overloaded >= self._overload_cycles:
+            self._overloaded = 0
+            self._give_up(Trip.OVERCURRENT)
 
     def _tick(self) -> None:
         """Let one servo tick pass: the profile generator and the filter run at the divided rate."""
@@ -216,7 +272,8 @@ class ServoLoop:
             return
         if self.analog_target is not None:
             self._approach_analog_target(self.analog_target)
-        trajectory.step()
+        if not (self._path_every_cycle and trajectory.path.running):
+            trajectory.step()
         error = (trajectory.position >> 16) - position
         gains = self.gains
         if not -gains.el <= error <= gains.el:
@@ -232,7 +289,7 @@ class ServoLoop:
             self._ticks_to_derivative = 1 if self._profile.divisor_slows_profile else self._divisor
             self._derivative = error - self._previous_error
             self._previous_error = error
-        bound = gains.il << 8
+        bound = gains.il << self._il_shift
         total = self._error_sum + error
         if not -bound <= total <= bound:
             total = bound if total > 0 else -bound
@@ -243,7 +300,7 @@ class ServoLoop:
             magnitude = gains.ol
         if self._limited:
             magnitude -= min(magnitude, self._limited)
-        if output and gains.deadband:
+        if gains.deadband and (output or self._quirks.deadband_at_zero):
             magnitude = min(magnitude + gains.deadband, FULL_PWM)
         self.pwm = magnitude if output >= 0 else -magnitude
 
@@ -254,15 +311,20 @@ class ServoLoop:
     # -- absolute positioning, current limit, home -------------------------------------------------------------------
 
     def _approach_analog_target(self, target: int) -> None:
-        """Stop smoothly once the A/D value has reached or passed the target; give up when the sensor is gone."""
+        """Stop smoothly at the target; give up when the sensor is gone, also after the arrival."""
         value = self.adc()
         low, high = SENSOR_RANGE
         if not low <= value / (1 << self._profile.adc_bits) <= high:
             self._give_up(Trip.SENSOR)
         elif self.trajectory.velocity == 0 and self.trajectory.done:
-            self.analog_target = None
-        elif (value >= target) if self._runs_forward else (value <= target):
+            self._arrived = True
+        elif self._is_at_analog_target(value, target):
             self.trajectory.stop_smoothly()
+
+    def _is_at_analog_target(self, value: int, target: int) -> bool:
+        if self._quirks.analog_end is AnalogEnd.EQUAL:
+            return value == target
+        return value >= target if self._runs_forward else value <= target
 
     def run_to_analog_target(self, target: int, speed: int, acceleration: int) -> None:
         """Start an absolute positioning motion; the direction follows from the A/D value.
@@ -274,20 +336,59 @@ class ServoLoop:
         """
         value = self.adc()
         self.analog_target = target
+        self._arrived = False
         self._runs_forward = target >= value
         self.trajectory.run_at(speed if self._runs_forward else -speed, acceleration)
 
     def _limit_current(self) -> None:
-        """Take one PWM unit away per cycle of too much current, and give one back per cycle without."""
-        threshold, value = self.gains.cl & 0xFE, self.adc()
+        """Take PWM units away per cycle of too much current, and give as many back per cycle without."""
+        value = self.adc()
+        if self._profile.live_aux:  # PIC-SERVO SC
+            threshold, step = self.gains.cl, 2
+            if threshold == MOST_CURRENT_LIMIT:
+                return
+        else:
+            threshold, step = self.gains.cl & 0xFE, 1
         over = value > threshold if self.gains.cl & 1 else value < threshold
         if not over:
-            self._limited = max(0, self._limited - 1)
+            self._limited = max(0, self._limited - step)
             return
         self.overcurrent = True
-        self._limited += min(1, abs(self.pwm))
+        self._limited += min(step, abs(self.pwm))
         if self.search and self.search.control & HomingControl.CURRENT:
             self._capture(self.search)
+
+    # -- limit protection of PIC-SERVO SC ----------------------------------------------------------------------------
+
+    def may_run(self, direction: int) -> bool:
+        """Tell whether limit protection lets a motion in this direction begin: 1 forward, -1 reverse, 0 none."""
+        if not self.protection or direction == 0:
+            return True
+        forward, reverse = self.shaft.on_forward_limit, self.shaft.on_reverse_limit
+        return not ((forward and reverse) or (forward if direction > 0 else reverse))
+
+    def _protect(self) -> None:
+        """End what runs into a limit switch (PIC-SERVO SC data sheet, 4.7)."""
+        if not self.servo_on:
+            if not self.may_run(self.pwm):
+                self.pwm = 0
+            return
+        path = self.trajectory.path
+        if self.may_run(path.velocity if path.running else self.trajectory.velocity):
+            return
+        if path.running:
+            match self._quirks.limit_in_path:
+                case LimitInPath.NOTHING:
+                    return
+                case LimitInPath.KEEPS_PATH_MODE:
+                    path.block()
+                    return
+                case LimitInPath.ENDS_PATH:
+                    path.end(clear=self._quirks.path_cleared_by_stop)
+        if self.protection & IoOption.LIMIT_OFF:
+            self.open()
+        else:
+            self.trajectory.stop_abruptly()
 
     def _look_for_home(self, search: HomeSearch) -> None:
         inputs = self.inputs
