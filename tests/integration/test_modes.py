@@ -118,6 +118,7 @@ async def test_a_plain_move_after_an_analog_one_ignores_the_sensor():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
         await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=600, velocity=5.0))
+        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.5))
         rig.condition(Condition.SENSOR_LOST)
 
         state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))

@@ -72,20 +72,11 @@ async def test_both_families_of_divisors_reach_the_working_rate(baud, alternate,
 
 
 async def test_the_highest_rate_is_reached_where_every_module_has_it():
-    chain = build_chain(ChainSpec((ModuleSpec("picservo-sc"), ModuleSpec("picservo-sc")), baud_check=False))
+    chain = build_chain(ChainSpec((ModuleSpec("picservo-sc"), ModuleSpec("picservo-sc"))))
     async with bare_network(chain, specs("pic-servo-sc", "pic-servo-sc"), 230_400) as line:
         report = await line.network.bring_up()
 
     assert (report.baud, report.remarks) == (230_400, ())
-
-
-async def test_modules_whose_highest_rate_is_off_are_found_again():
-    chain = chain_of("picservo-sc", "picservo-sc")
-    async with bare_network(chain, specs("pic-servo-sc", "pic-servo-sc"), 230_400) as line:
-        report = await line.network.bring_up()
-
-    assert report.baud == 19_200
-    assert report.remarks == ("address 1 does not answer at 230400 baud; the line stays at 19200",)
 
 
 async def test_a_module_that_does_not_follow_takes_everybody_back_by_reset():

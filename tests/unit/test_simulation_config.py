@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.sim import command
-from ldcnd.config.simulation import FaultPlanConfig, Quirks, PlantConfig, SimulatedChainConfig, SimulationConfig
+from ldcnd.config.simulation import FaultPlanConfig, PlantConfig, Quirks, SimulatedChainConfig, SimulationConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
 from ldcnd.sim.chain import Delivery

@@ -16,7 +16,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node, unanswered
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes
 from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
 from ldcnd.drivers.line import GroupSpec
 from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
@@ -169,9 +169,7 @@ RESET_BAUD = 19_200
 COMMON_BAUDS = (115_200, 57_600, 9600, RESET_BAUD)
 """Where a crashed host may have left the drives; the last one is where a reset puts them."""
 FASTEST_BAUD = 230_400
-"""PIC-SERVO SC only. By the manuals' formula its code makes 208333 baud, which no receiver takes for 230400: a line
-that tries this rate must be found at both.
-"""
+"""PIC-SERVO SC only: it looks the code up and sets exactly this rate."""
 EVERYBODY = 0xFF
 """The group address after power-up."""
 NULLS = bytes(16)
@@ -196,10 +194,8 @@ class LineRate:
     def __init__(self, bus: Bus, working: int, codes: BaudCodes, groups: tuple[int, ...], *, fastest: bool) -> None:
         self.working = working
         self._possible: tuple[int, ...] = COMMON_BAUDS
-        if fastest:
+        if fastest or working == FASTEST_BAUD:
             self._possible = (FASTEST_BAUD, *COMMON_BAUDS)
-        if working == FASTEST_BAUD:
-            self._possible = (FASTEST_BAUD, round(actual_baud(baud_divisor(working, codes))), *COMMON_BAUDS)
         self.groups = groups
         self._bus = bus
         self._codes = codes
