@@ -18,6 +18,7 @@ from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.motion import AxisMotion, preview
 from ldcnd.daemon.axis.parameters import Parameters
+from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.state import AxisTracker, Ended, ObservedTracker
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
@@ -28,10 +29,10 @@ from ldcnd.daemon.trace.recorder import TRACE_VERBS, TraceRecorder
 from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import BusError, LdcndError, NotSupported, ShuttingDown, StopLatched, TooManyRequests
+from ldcnd.errors import BusError, LdcndError, NotSupported, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
-from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, PlanReply, Preview, Verb
+from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Move, PlanReply, Preview, Verb
 from ldcnd.model.samples import Moving, TelemetryItem
 
 log = get_logger("axis")
@@ -156,6 +157,7 @@ class AxisService:
             adc_full_scale=driver.adc_full_scale,
             adc_volts=config.adc_volts,
         )
+        self._gate = Gate(driver, self.tracker)
         self._bus = bus
         self._clock = clock
         self._next_command_id = next_command_id
@@ -168,8 +170,6 @@ class AxisService:
         self.traces = TraceRecorder(config.name, tracer, publisher, clock)
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
-        self._epoch = 0
-        self._closed = False
 
     # -- life --------------------------------------------------------------------------------------------------------
 
@@ -187,12 +187,11 @@ class AxisService:
                     else:
                         await self._step()
         finally:
-            self._closed = True
-            self._epoch += 1
+            self._gate.close()
             self._changed.set()
             if waiting:
-                waiting.refuse(self._ending())
-            self._turns.refuse(self._ending())
+                waiting.refuse(self._gate.ending())
+            self._turns.refuse(self._gate.ending())
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
@@ -244,8 +243,16 @@ class AxisService:
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
+    def permit(self, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
+        """Return permission for a command that was admitted just now; a stop makes it void."""
+        return self._gate.permit(verb, right)
+
     async def execute(
-        self, verb: Verb, request: AxisCommand[CommandReply], command_id: str | None = None
+        self,
+        verb: Verb,
+        request: AxisCommand[CommandReply],
+        command_id: str | None = None,
+        permit: Permit | None = None,
     ) -> CommandReply:
         """Carry out a command in its turn; returns once the drive has acknowledged it.
 
@@ -253,6 +260,7 @@ class AxisService:
             verb: what to do.
             request: with which values.
             command_id: names the command; one is made when it is missing.
+            permit: as made when it was admitted; a caller inside the daemon needs none.
 
         Raises:
             RequestRefused: it cannot be done; nothing was sent.
@@ -266,9 +274,8 @@ class AxisService:
             raise NotSupported(
                 f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
             )
-        if self._closed:
-            raise self._ending()
-        turn = self._turn(command_id, verb)
+        turn = Turn(command_id, verb, permit or self.permit(verb))
+        turn.permit.ask()
         if not self._turns.free:
             return await self._turns.wait(turn, request)
         try:
@@ -278,21 +285,24 @@ class AxisService:
             if not math.isinf(self._commands.deadline_s):
                 self._turns.wake()  # for the steps of what has begun
 
-    async def in_turn(self, mode: BufferMode, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
+    async def in_turn(self, move: Move, permit: Permit, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
+
+        An aborting move that would be refused halts nothing.
 
         Raises:
             StopLatched: a stop, or a later aborting move, came first.
-            LdcndError: as the move itself.
+            LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
-        if mode is BufferMode.ABORTING and self.tracker.command:
-            await self.bring_to_rest(StopMode.SMOOTH)
-        still_wanted = self._turn("", Verb.HALT).still_wanted
+        if move.buffer_mode is BufferMode.ABORTING and self.tracker.command:
+            permit.ask_to_move()
+            self._commands.check(move)
+            await self.bring_to_rest(StopMode.SMOOTH, by=permit)
         async with self._successors:  # those who wait are served in the order in which they came
             while self.tracker.command:
                 self._changed.clear()
                 await self._changed.wait()
-                still_wanted()
+                permit.ask()
             return await execute()
 
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PlanReply:
@@ -312,13 +322,19 @@ class AxisService:
         log.info("stop", axis=self.config.name, mode=mode.value)
         return await self.bring_to_rest(mode, Verb.STOP)
 
-    async def bring_to_rest(self, mode: StopMode, verb: Verb = Verb.HALT) -> bool:
-        """Stop at once, before anything that waits; return whether the drive confirmed it."""
+    async def bring_to_rest(self, mode: StopMode, verb: Verb = Verb.HALT, by: Permit | None = None) -> bool:
+        """Stop at once, before anything that waits; return whether the drive confirmed it.
+
+        Args:
+            mode: how.
+            verb: what is asked, for the events.
+            by: whose command goes on afterwards; all others are void.
+        """
         if not self.stoppable:
             return False
-        self._epoch += 1
+        self._gate.overtake(by)
         self._changed.set()
-        overtaken = self._overtaken("a queued command")
+        overtaken = self._gate.overtaken("a queued command")
         self._turns.refuse(overtaken)
         self._bus.withdraw(self.driver.spec.address, overtaken)
         if not self.tracker.energised:
@@ -344,19 +360,8 @@ class AxisService:
             return True
         return False
 
-    def _turn(self, command_id: str, verb: Verb) -> Turn:
-        epoch = self._epoch
-
-        def still_wanted() -> None:
-            if self._closed:
-                raise self._ending()
-            if epoch != self._epoch:
-                raise self._overtaken(verb)
-
-        return Turn(command_id, verb, still_wanted)
-
     async def _obey(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
-        turn.still_wanted()
+        turn.permit.ask()
         if turn.verb in TRACE_VERBS:
             return await self.traces.carry_out(turn.command_id, turn.verb, request)
         if self._parameters and Parameters.takes(turn.verb):
@@ -375,14 +380,6 @@ class AxisService:
         if not self._commands.step_due and self._clock.now_s() < self._commands.deadline_s:
             return
         try:
-            await self._commands.step(self._turn(self._next_command_id(), Verb.HALT))
+            await self._commands.step()
         except LdcndError as error:
             log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
-
-    def _ending(self) -> ShuttingDown:
-        return ShuttingDown(f"axis {self.config.name}: the daemon is stopping", axis=self.config.name)
-
-    def _overtaken(self, what: str) -> StopLatched:
-        return StopLatched(
-            f"axis {self.config.name}: {what} was overtaken by a stop", axis=self.config.name, remedy="send reset"
-        )

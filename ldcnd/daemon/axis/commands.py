@@ -17,6 +17,7 @@ from ldcnd.model.commands import (
     CommandReply,
     Halt,
     Home,
+    Move,
     MoveAbsolute,
     MoveAnalog,
     MoveRelative,
@@ -62,7 +63,6 @@ class AxisCommands:
             DriveFault: the drive's condition forbids it.
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
-        turn.still_wanted()
         if procedure := self._procedure_for(turn, request):
             return await self._undertake(procedure)
         match request:
@@ -126,7 +126,7 @@ class AxisCommands:
         elif self._tracker.concerns(timing) and procedure.calls_for_step(reading):
             self.step_due = True
 
-    async def step(self, turn: Turn) -> CommandReply:
+    async def step(self) -> None:
         """Let the procedure take the step that is due.
 
         Raises:
@@ -135,15 +135,15 @@ class AxisCommands:
         """
         procedure, self.step_due = self._procedure, False
         if procedure is None:
-            return self._motion.reply(turn)
+            return
         if procedure.outlived(self._tracker):
             self._drop_procedure()
-            return self._motion.reply(turn)
+            return
         delay_s = STEP_RETRY_S if self._tracker.link is LinkState.UP else BLIND_RETRY_S
         due_s, retry_s = procedure.deadline_s, self._motion.clock.now_s() + delay_s
         procedure.deadline_s = retry_s
         try:
-            goes_on = await self._take_step(procedure, turn)
+            goes_on = await self._take_step(procedure)
         finally:
             self.step_due = False  # what was read during the step called for the one that is over
         if procedure is self._procedure and not goes_on:
@@ -151,18 +151,22 @@ class AxisCommands:
         elif procedure.deadline_s == retry_s:
             procedure.deadline_s = due_s
         self._motion.publish_state()
-        return self._motion.reply(turn)
 
-    async def _take_step(self, procedure: Procedure, turn: Turn) -> bool:
+    async def _take_step(self, procedure: Procedure) -> bool:
         try:
-            return await procedure.step(turn)
+            return await procedure.step()
         except OutcomeUnknown:
             # what was started must not be started again: the readings tell how it goes
             return self._tracker.command is not None and self._tracker.command.completion is Completion.PROCEDURE
         except StopLatched:
             raise
         except (RequestRefused, DriveFault) as error:
-            self._tracker.finished(error.message)
+            if self._tracker.energised and not procedure.outlived(self._tracker):
+                await self._driver.stop(StopMode.SMOOTH)  # of the step before something may still run
+                self._motion.stopping(procedure.turn.command_id, procedure.turn.verb)
+                self._tracker.failing(error.message)
+            elif not procedure.outlived(self._tracker):
+                self._tracker.finished(error.message)
             return False
 
     def _drop_procedure(self) -> None:
@@ -195,7 +199,10 @@ class AxisCommands:
                 )
         else:
             guards.check_reachable(view)
-        await self._driver.power(on=on)
+        if on:
+            await turn.permit.power_on()
+        else:
+            await self._driver.stop(StopMode.OFF)
         self._drop_procedure()
         self._motion.target_counts = None
         self._tracker.powered(on=on, now_s=self._motion.clock.now_s())
@@ -228,33 +235,54 @@ class AxisCommands:
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
+    def check(self, request: Move) -> None:
+        """Refuse a move that could not follow what the axis is doing now; nothing is halted for it.
+
+        Raises:
+            RequestRefused: as the move itself would be, once the axis stands.
+        """
+        guards.check_may_follow(self._tracker.view())
+        match request:
+            case MoveAbsolute():
+                self._plan_absolute(request)
+            case MoveRelative():
+                self._plan_relative(request)
+            case MoveVelocity():
+                self._plan_velocity(request)
+
     async def _move_absolute(self, turn: Turn, request: MoveAbsolute) -> CommandReply:
-        view = self._tracker.view()
-        guards.check_may_move(view)
-        guards.check_referenced(view)
-        plan = self._motion.plan_to(request.position, request.velocity, request.acceleration)
-        return await self._move(turn, plan, AxisState.DISCRETE_MOTION)
+        guards.check_may_move(self._tracker.view())
+        return await self._move(turn, self._plan_absolute(request), AxisState.DISCRETE_MOTION)
 
     async def _move_relative(self, turn: Turn, request: MoveRelative) -> CommandReply:
-        motion = self._motion
         guards.check_may_move(self._tracker.view())
-        from_counts = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
-        position = motion.telemetry.position(from_counts) + request.distance
-        plan = motion.plan_to(position, request.velocity, request.acceleration)
-        return await self._move(turn, plan, AxisState.DISCRETE_MOTION)
+        return await self._move(turn, self._plan_relative(request), AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
+        guards.check_may_move(self._tracker.view())
+        velocity, bounded = self._plan_velocity(request)
+        reply = await self._move(turn, bounded, AxisState.CONTINUOUS_MOTION)
+        return reply.model_copy(update={"velocity": velocity})
+
+    def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
+        guards.check_referenced(self._tracker.view())
+        return self._motion.plan_to(request.position, request.velocity, request.acceleration)
+
+    def _plan_relative(self, request: MoveRelative) -> MotionPlan:
+        motion = self._motion
+        from_counts = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
+        position = motion.telemetry.position(from_counts) + request.distance
+        return motion.plan_to(position, request.velocity, request.acceleration)
+
+    def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan]:
+        """Return the velocity as the drive will have it, and a trapezoid that ends by itself even if this host dies."""
         view, planner = self._tracker.view(), self._motion.planner
-        guards.check_may_move(view)
         plan = planner.at_velocity(view, request.velocity, request.acceleration)
-        # bounded in the drive: a trapezoid ends by itself even if this host dies
         end = planner.limit_ahead(request.velocity) if view.referenced else None
         if end is None:
             here = self._motion.telemetry.position(self._motion.latest().position_counts)
             end = here + request.velocity * self._motion.config.jog_horizon_s
-        bounded = self._motion.plan_to(end, abs(request.velocity), request.acceleration)
-        reply = await self._move(turn, bounded, AxisState.CONTINUOUS_MOTION)
-        return reply.model_copy(update={"velocity": plan.velocity})
+        return plan.velocity, self._motion.plan_to(end, abs(request.velocity), request.acceleration)
 
     async def _move(
         self,
@@ -263,7 +291,7 @@ class AxisCommands:
         state: AxisState,
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
-        await self._driver.load(plan.motion)
+        await turn.permit.load(plan.motion)
         await self._motion.start(turn, state, completion, plan=plan)
         self._motion.target_counts = plan.motion.target_counts
         return self._motion.reply(turn).model_copy(
@@ -300,7 +328,7 @@ class AxisCommands:
         changed = Gains(**{name: asked.get(name, getattr(gains, name)) for name in Gains.__slots__})
         if changed.sr != gains.sr:
             guards.check_stands(view)
-        await self._driver.set_gains(changed)
+        await turn.permit.set_gains(changed)
         self._gains = changed
         return self._motion.reply(turn)
 

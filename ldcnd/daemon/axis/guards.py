@@ -69,10 +69,15 @@ def check_may_power_on(axis: AxisView) -> None:
     check_not_in_error(axis)
 
 
-def check_may_move(axis: AxisView) -> None:
-    """Refuse a motion unless the axis is powered and stands still."""
+def check_may_follow(axis: AxisView) -> None:
+    """Refuse a motion unless the axis is powered; it may still move."""
     check_may_power_on(axis)
     check_enabled(axis)
+
+
+def check_may_move(axis: AxisView) -> None:
+    """Refuse a motion unless the axis is powered and stands still."""
+    check_may_follow(axis)
     check_stands(axis)
 
 

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.guards import AxisView, check_acceleration, check_position, check_velocity
+from ldcnd.daemon.axis.permit import QuietDrive
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
-from ldcnd.drivers.driver import AxisDriver, AxisReading, Motion
+from ldcnd.drivers.driver import AxisReading, Motion
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, MalformedRequest, OutcomeUnknown, RequestRefused, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import error_reply
@@ -48,7 +49,7 @@ class MotionPlan:
 class MotionPlanner:
     """Plans the motions of one axis."""
 
-    def __init__(self, config: AxisConfig, driver: AxisDriver, scale: Scale) -> None:
+    def __init__(self, config: AxisConfig, driver: QuietDrive, scale: Scale) -> None:
         self._config = config
         self._driver = driver
         self._scale = scale
@@ -148,7 +149,7 @@ class AxisMotion:
     def __init__(
         self,
         config: AxisConfig,
-        driver: AxisDriver,
+        driver: QuietDrive,
         scale: Scale,
         tracker: AxisTracker,
         telemetry: AxisTelemetry,
@@ -221,11 +222,11 @@ class AxisMotion:
         opens_loop: bool = False,
         plan: MotionPlan | None = None,
     ) -> None:
-        """Start what was loaded, unless a stop has come meanwhile; the state says so before the drive does."""
-        turn.still_wanted()
+        """Start what was loaded, if that is still permitted; the state says so before the drive does."""
+        turn.permit.ask_to_move()
         self.begin(turn.command_id, turn.verb, state, completion, opens_loop=opens_loop, plan=plan)
         try:
-            await self.driver.start()
+            await turn.permit.start()
         except OutcomeUnknown:
             self.tracker.started(self.clock.now_s())  # the next readings tell
             raise

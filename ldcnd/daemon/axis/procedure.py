@@ -1,9 +1,9 @@
 """The contract of what goes on after its command was accepted: a homing, a timed duty, a stream of set-points."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 
+from ldcnd.daemon.axis.permit import Permit
 from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.model.commands import CommandReply, Verb
@@ -13,17 +13,21 @@ NEVER_S = float("inf")
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One command whose turn has come, or one more step of it.
+    """One command whose turn has come, with all its steps.
 
     Attributes:
         command_id: names it everywhere.
         verb: what is asked.
-        still_wanted: raises `StopLatched` when a stop has overtaken the command; asked before anything that moves.
+        permit: the only way to what can move the drive.
     """
 
     command_id: str
     verb: Verb
-    still_wanted: Callable[[], None]
+    permit: Permit
+
+    def still_wanted(self) -> None:
+        """Raise when a stop has overtaken the command; see `Permit`."""
+        self.permit.still_wanted()
 
 
 class Procedure(ABC):
@@ -51,11 +55,12 @@ class Procedure(ABC):
         """Tell whether the next step is due; the reading was asked for after the latest step took effect."""
 
     @abstractmethod
-    async def step(self, turn: Turn) -> bool:
-        """Take the next step and tell whether more of them are to come; a step that failed is taken again.
+    async def step(self) -> bool:
+        """Take the next step and tell whether more of them are to come; a step whose packets were lost is taken again.
 
         Raises:
             StopLatched: a stop has overtaken it.
+            RequestRefused: its sender has lost the right to it; the axis is brought to rest.
             BusError: the line failed.
         """
 

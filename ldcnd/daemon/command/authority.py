@@ -57,6 +57,7 @@ class Authority:
         self._axes = frozenset(axes)
         self._leases: dict[str, Lease] = {}
         self._ended: deque[str] = deque(maxlen=REMEMBERED)
+        self._successors: dict[str, str] = {}  # of leases that their own holder has replaced, by token
 
     def holder(self, axis: str) -> Lease | None:
         """Return the lease on an axis."""
@@ -93,6 +94,7 @@ class Authority:
             self._end(lease)
         lease = Lease(self._next_token(), client, wanted, duration_s, now_s + duration_s)
         self._leases[lease.token] = lease
+        self._successors.update((old.token, lease.token) for old in displaced if old.client == client)
         return lease, displaced
 
     def renew(self, token: str, now_s: float) -> Lease:
@@ -151,6 +153,29 @@ class Authority:
             self._leases[token] = replace(lease, sequence=sequence)
         return lease.client
 
+    def check_held(self, axis: str, token: str | None, now_s: float) -> None:
+        """Refuse a motion whose sender has lost the right to the axis since it was admitted.
+
+        A lease that its holder has replaced by another one that covers the axis still holds.
+
+        Raises:
+            LeaseExpired: the lease has ended, was taken away, or does not cover the axis any more.
+            LeaseHeld, LeaseRequired: the command came without a lease, and now one is needed.
+        """
+        if token is None:
+            self._admit_without(axis, now_s)
+            return
+        while token in self._successors:
+            token = self._successors[token]
+        lease = self._leases.get(token)
+        if lease is None or lease.ends_at_s <= now_s or axis not in lease.axes:
+            raise LeaseExpired(
+                f"axis {axis}: the lease of this command has ended before its motion began",
+                axis=axis,
+                value=token,
+                remedy="acquire a new one",
+            )
+
     def _admit_without(self, axis: str, now_s: float) -> None:
         holder = self.holder(axis)
         if holder and holder.ends_at_s > now_s:
@@ -175,4 +200,6 @@ class Authority:
 
     def _end(self, lease: Lease) -> None:
         del self._leases[lease.token]
+        if len(self._ended) == REMEMBERED:
+            self._successors.pop(self._ended[0], None)
         self._ended.append(lease.token)

@@ -5,6 +5,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
 from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
 from ldcnd.daemon.clock import Clock
@@ -101,10 +102,11 @@ class CommandDesk:
                 return await self._answer_again(entry)
             command_id = self._next_command_id()
         client = self._admit(axis_name, verb, request) or request.client
+        permit = axis.permit(verb, UNCONDITIONAL if verb in FREE else self._right(axis_name, verb, request))
         self._ledger.open(Entry(command_id, axis_name, verb, request, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
-            return await self._execute(axis, verb, request, command_id)
+            return await self._execute(axis, verb, request, command_id, permit)
         except LdcndError as error:
             self._ledger.answered(command_id, error, _status(error))
             raise
@@ -116,16 +118,19 @@ class CommandDesk:
             over.set()
 
     async def _execute(
-        self, axis: AxisService, verb: Verb, request: AxisCommand[CommandReply], command_id: str
+        self, axis: AxisService, verb: Verb, request: AxisCommand[CommandReply], command_id: str, permit: Permit
     ) -> CommandReply:
+        def start() -> Awaitable[CommandReply]:
+            return self._start(axis, verb, request, command_id, permit)
+
         if isinstance(request, Move) and request.buffer_mode is not BufferMode.REFUSE:
-            return await axis.in_turn(request.buffer_mode, lambda: self._start(axis, verb, request, command_id))
-        return await self._start(axis, verb, request, command_id)
+            return await axis.in_turn(request, permit, start)
+        return await start()
 
     async def _start(
-        self, axis: AxisService, verb: Verb, request: AxisCommand[CommandReply], command_id: str
+        self, axis: AxisService, verb: Verb, request: AxisCommand[CommandReply], command_id: str, permit: Permit
     ) -> CommandReply:
-        reply = await axis.execute(verb, request, command_id)
+        reply = await axis.execute(verb, request, command_id, permit)
         moving = axis.tracker.command is not None and axis.tracker.command.command_id == command_id
         status = CommandStatus.DONE if verb in AT_ONCE or not moving else CommandStatus.EXECUTING
         self._ledger.answered(command_id, reply, status)
@@ -180,15 +185,27 @@ class CommandDesk:
                 limit=self._instance,
                 remedy="look where the axis is, then send a new command to this run",
             )
+        self._refuse_late(axis, verb, request)
+        return self._authority.admit(axis, request.lease, request.sequence, self._clock.now_s())
+
+    def _right(self, axis: str, verb: Verb, request: AxisCommand[CommandReply]) -> Right:
+        """Return what must still hold of the sender when a motion of its command begins."""
+
+        def holds() -> None:
+            self._refuse_rival(axis)
+            self._authority.check_held(axis, request.lease, self._clock.now_s())
+
+        return Right(holds, lambda: self._refuse_late(axis, verb, request))
+
+    def _refuse_late(self, axis: str, verb: Verb, request: AxisCommand[CommandReply]) -> None:
         if request.not_after is not None and self._clock.now_ns() > request.not_after:
             late_s = (self._clock.now_ns() - request.not_after) / 1e9
             raise CommandExpired(
-                f"axis {axis}: {verb} came {late_s:.3f} s after its sender had stopped waiting for it",
+                f"axis {axis}: {verb} is {late_s:.3f} s later than its sender allows",
                 axis=axis,
                 value=request.not_after,
                 remedy="send it again if it is still wanted",
             )
-        return self._authority.admit(axis, request.lease, request.sequence, self._clock.now_s())
 
     def _refuse_rival(self, axis: str) -> None:
         if self.rival:

@@ -31,7 +31,7 @@ class AnalogMove(Procedure):
         self._check_target()
         speed = motion.config.velocity if request.velocity is None else request.velocity
         plan = motion.planner.at_velocity(view, speed, request.acceleration)
-        await motion.driver.load(
+        await self.turn.permit.load(
             AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
         )
         await motion.start(self.turn, AxisState.DISCRETE_MOTION, Completion.PROFILE)
@@ -48,10 +48,10 @@ class AnalogMove(Procedure):
         low, high = limits.position_min, limits.position_max
         return (low is not None and position < low) or (high is not None and position > high)
 
-    async def step(self, turn: Turn) -> bool:
+    async def step(self) -> bool:
         """See `Procedure`: stop."""
         await self._motion.driver.stop(StopMode.SMOOTH)
-        turn.still_wanted()
+        self.turn.still_wanted()
         self._motion.stopping(self.turn.command_id, self.turn.verb)
         self._motion.tracker.failing("stopped beyond a software limit")
         return False

@@ -8,6 +8,7 @@ import asyncio
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
+from ldcnd.daemon.axis.permit import start_together
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading
@@ -80,7 +81,8 @@ class Meeting:
     async def _start(self) -> None:
         motions = {name: member.plan.motion for name, member in self._members.items()}
         try:
-            await self._network.start_group(motions, self._about_to_start)
+            permits = [member.turn.permit for member in self._members.values()]
+            await start_together(self._network, motions, permits, self._about_to_start)
         except LdcndError as error:
             self.fail(error)
         except asyncio.CancelledError:
@@ -91,11 +93,9 @@ class Meeting:
                 self._started.set_result(None)
 
     def _about_to_start(self) -> None:
-        """Ask every member whether it is still wanted, and only then say that all of them move."""
+        """Say that all of them move, unless one has left."""
         if self._started.done():
             raise WrongState("a member of the group has left, so no axis was started")
-        for member in self._members.values():
-            member.turn.still_wanted()
         for member in self._members.values():
             member.announce()
 
@@ -149,7 +149,7 @@ class GroupMember(Procedure):
         """See `Procedure`: there are no further steps."""
         return False
 
-    async def step(self, turn: Turn) -> bool:  # noqa: ARG002 - part of the contract
+    async def step(self) -> bool:
         """See `Procedure`."""
         return False
 

@@ -10,9 +10,10 @@ from enum import Enum
 from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import LARGEST_COUNT, AxisMotion, MotionPlan
+from ldcnd.daemon.axis.permit import QuietDrive
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import AxisDriver, AxisReading, HomeCapture, StopMode
+from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.log import get_logger
@@ -59,7 +60,7 @@ class HomeSearch:
         return self.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
 
 
-def plan_search(config: AxisConfig, driver: AxisDriver, request: Home) -> HomeSearch:
+def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSearch:
     """Complete a request from the axis's configuration.
 
     Raises:
@@ -148,9 +149,9 @@ class HomeSequence(Procedure):
             return resting
         return not reading.homing or resting
 
-    async def step(self, turn: Turn) -> bool:
+    async def step(self) -> bool:
         """See `Procedure`."""
-        turn = replace(turn, command_id=self.turn.command_id, verb=self.turn.verb)
+        turn = self.turn
         reading = self._motion.latest()
         match self._leg:
             case Leg.CLEAR if self._motion.clock.now_s() >= self.deadline_s:
@@ -185,7 +186,7 @@ class HomeSequence(Procedure):
             target_counts=self._end_of_leg(plan),
             velocity_counts_per_s=abs(plan.motion.velocity_counts_per_s),
         )
-        await motion.driver.load(leg_motion, home=capture)
+        await turn.permit.load(leg_motion, home=capture)
         self._leg = leg
         motion.tracker.referenced = False
         opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
@@ -229,7 +230,7 @@ class HomeSequence(Procedure):
         turn.still_wanted()
         closed = search.stop is not StopMode.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:
-            await driver.power(on=True)
+            await turn.permit.power_on()
             turn.still_wanted()
         tracker.switched(on=closed, now_s=motion.clock.now_s())
         motion.telemetry.origin_counts = captured - motion.scale.to_counts(search.position)
@@ -250,7 +251,7 @@ class HomeSequence(Procedure):
         if move_to is None or not motion.tracker.at_rest:
             return await self._give_up(turn, f"not at rest within {self._search.timeout_s:g} s")
         plan = motion.plan_to(move_to, None, None)
-        await motion.driver.load(plan.motion)
+        await turn.permit.load(plan.motion)
         await motion.start(turn, AxisState.HOMING, Completion.PROFILE)
         motion.target_counts = plan.motion.target_counts
         return False

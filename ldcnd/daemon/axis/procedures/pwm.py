@@ -38,7 +38,7 @@ class PwmRun(Procedure):
         counts_per_unit = motion.scale.counts_per_unit
         acceleration = motion.driver.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
         duty = -request.duty if motion.scale.reverse else request.duty
-        await motion.driver.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
+        await self.turn.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
         self.deadline_s = motion.clock.now_s() + request.duration_s
         await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
         return motion.reply(self.turn).model_copy(
@@ -49,7 +49,7 @@ class PwmRun(Procedure):
         """See `Procedure`: an axis that lost its command while it was out of sight may still be running."""
         return self._motion.tracker.command is None
 
-    async def step(self, turn: Turn) -> bool:  # noqa: ARG002 - a stop needs nobody's leave
+    async def step(self) -> bool:
         """See `Procedure`: the time is over. An axis that has meanwhile failed is switched off instead."""
         ours = self._motion.tracker.command is not None
         await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)

@@ -46,12 +46,13 @@ class SetPoint(Procedure):
         self._check_rate(before, bounds)
         target = motion.counts_of(position)
         self._check_step(target, bounds)
+        self.turn.permit.ask_to_move()
         if tracker.command and tracker.command.verb is Verb.TRACK:
             tracker.finished()  # the stream goes on under the new command's name
         motion.begin(self.turn.command_id, self.turn.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
         try:
-            await motion.driver.track(target)
+            await self.turn.permit.track(target)
         except OutcomeUnknown:
             motion.target_counts = target  # if it was not executed the next set-point is still near enough
             tracker.started(motion.clock.now_s())
@@ -68,7 +69,7 @@ class SetPoint(Procedure):
         """See `Procedure`."""
         return False
 
-    async def step(self, turn: Turn) -> bool:  # noqa: ARG002 - nothing is sent
+    async def step(self) -> bool:
         """See `Procedure`: nothing came any more; the axis holds the last set-point."""
         self._motion.tracker.finished()
         self._motion.publish_state()

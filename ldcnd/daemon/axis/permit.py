@@ -1,0 +1,223 @@
+"""Permission to move one axis: the gate before every packet that can move its drive, and the only way to them.
+
+A `Permit` is made when a command is admitted and travels with it. The rest of the daemon holds a `QuietDrive`, which
+has no call that can move; those are methods of the permit, and each of them asks for permission directly before its
+first packet. So a move that waited - for its turn, for the motion ahead of it, for the other members of its group, for
+a step of a homing - finds what is true when it would start, not what was true when it came.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.state import AxisTracker
+from ldcnd.drivers.driver import (
+    AnalogMotion,
+    AxisDriver,
+    AxisSpec,
+    Gains,
+    HomeCapture,
+    Motion,
+    PwmOutput,
+    StopMode,
+)
+from ldcnd.drivers.network import Network
+from ldcnd.errors import LdcndError, ShuttingDown, StopLatched
+from ldcnd.exchange import Exchange
+from ldcnd.model.commands import HomeMethod, PinMode
+
+Condition = Callable[[], None]
+"""Raises what forbids a motion; returns when nothing does."""
+
+
+def always() -> None:
+    """Forbid nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Right:
+    """What must hold of the sender of a command, beside the state of the axis.
+
+    Attributes:
+        holds: asked before every motion of the command: its lease, no other daemon.
+        in_time: asked until its first motion has begun: its `not_after`.
+    """
+
+    holds: Condition = always
+    in_time: Condition = always
+
+
+UNCONDITIONAL = Right()
+"""Of what brings an axis to rest, and of callers inside the daemon."""
+
+
+class QuietDrive(Protocol):
+    """What may be done to a drive without permission: nothing here can make it move."""
+
+    spec: AxisSpec
+    adc_full_scale: int | None
+    home_methods: frozenset[HomeMethod]
+
+    def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `AxisDriver`, as all of these
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    async def stop(self, mode: StopMode) -> None: ...  # noqa: D102
+    async def captured_home(self) -> int: ...  # noqa: D102
+    async def reset(self) -> None: ...  # noqa: D102
+    async def clear_warnings(self) -> None: ...  # noqa: D102
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None: ...  # noqa: D102
+
+
+class Permit:
+    """What one command may do to the drive of its axis; made by `Gate`."""
+
+    def __init__(self, gate: "Gate", right: Right, what: str) -> None:
+        self._gate = gate
+        self._right = right
+        self._what = what
+        self._epoch = gate.epoch
+        self._begun = False
+
+    def still_wanted(self) -> None:
+        """Raise when the command was overtaken.
+
+        Raises:
+            StopLatched: a stop has come since.
+            ShuttingDown: the daemon ends.
+        """
+        if self._gate.closed:
+            raise self._gate.ending()
+        if self._epoch != self._gate.epoch:
+            raise self._gate.overtaken(self._what)
+
+    def renew(self) -> None:
+        """Go on after a stop that this very command has asked for."""
+        self._epoch = self._gate.epoch
+
+    def begun(self) -> None:
+        """Take note that the first motion has begun: from now on the command is not late any more."""
+        self._begun = True
+
+    def ask(self) -> None:
+        """Raise when the command must not be carried out any more.
+
+        Raises:
+            StopLatched, ShuttingDown: see `still_wanted`.
+            RequestRefused: its sender has lost the right to it, or it comes too late.
+        """
+        self.still_wanted()
+        self._right.holds()
+        if not self._begun:
+            self._right.in_time()
+
+    def ask_to_move(self) -> None:
+        """Raise when nothing of this command may move the axis now.
+
+        Raises:
+            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop.
+        """
+        self.ask()
+        guards.check_may_power_on(self._gate.tracker.view())
+
+    # -- what can move -----------------------------------------------------------------------------------------------
+
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """Prepare a motion; see `AxisDriver.load`. Part of it may start the drive's profile generator."""
+        self.ask_to_move()
+        await self._gate.driver.load(motion, home=home)
+
+    async def start(self) -> None:
+        """Start what was loaded; see `AxisDriver.start`."""
+        self.ask_to_move()
+        self.begun()
+        await self._gate.driver.start()
+
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once; see `AxisDriver.track`."""
+        self.ask_to_move()
+        self.begun()
+        await self._gate.driver.track(position_counts)
+
+    async def power_on(self) -> None:
+        """Close the loop; see `AxisDriver.power`. It takes several packets: a stop among them leaves it open."""
+        self.ask_to_move()
+        self.begun()
+        await self._gate.driver.power(on=True)
+        try:
+            self.still_wanted()
+        except LdcndError:
+            await self._gate.driver.stop(StopMode.OFF)
+            raise
+
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the registers of the loop, which act at once; see `AxisDriver.set_gains`."""
+        self.ask()
+        await self._gate.driver.set_gains(gains)
+
+
+class Gate:
+    """The gate of one axis: makes permits, and makes them void.
+
+    Attributes:
+        driver: of the drive; nothing but permits and the axis's stops uses it.
+        tracker: of its state.
+        epoch: number of stops so far; a permit of an earlier epoch is void.
+        closed: the daemon ends; no permit holds.
+    """
+
+    def __init__(self, driver: AxisDriver, tracker: AxisTracker) -> None:
+        self.driver = driver
+        self.tracker = tracker
+        self.epoch = 0
+        self.closed = False
+
+    def permit(self, what: str, right: Right = UNCONDITIONAL) -> Permit:
+        """Return the permit of a command, valid until the next stop; `what` names the command in refusals."""
+        return Permit(self, right, what)
+
+    def overtake(self, by: Permit | None = None) -> None:
+        """Make all permits void, but the one that asks for it."""
+        self.epoch += 1
+        if by is not None:
+            by.renew()
+
+    def close(self) -> None:
+        """Make all permits void for good."""
+        self.closed = True
+
+    def ending(self) -> ShuttingDown:
+        """Return the refusal of a daemon that ends."""
+        name = self.tracker.name
+        return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
+
+    def overtaken(self, what: str) -> StopLatched:
+        """Return the refusal of what a stop has overtaken."""
+        name = self.tracker.name
+        return StopLatched(f"axis {name}: {what} was overtaken by a stop", axis=name, remedy="send reset")
+
+
+async def start_together(
+    network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
+) -> None:
+    """Start axes in the same servo cycle; every member's permission is asked directly before the packet that starts.
+
+    Args:
+        network: of their line.
+        motions: by axis name.
+        permits: of all members.
+        announce: called between the last question and the first packet.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.
+    """
+
+    def about_to_start() -> None:
+        for permit in permits:
+            permit.ask_to_move()
+        for permit in permits:
+            permit.begun()
+        announce()
+
+    for permit in permits:
+        permit.ask_to_move()
+    await network.start_group(motions, about_to_start)

@@ -1,0 +1,261 @@
+"""Permission is asked when a motion begins, not when its command arrives; on the jumping clock."""
+
+import ast
+import asyncio
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+import ldcnd.daemon
+from ldcnd.client.lease import Control, control
+from ldcnd.config.axis import LossConfig, LossPolicy
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.errors import (
+    CommandExpired,
+    DuplicateDaemon,
+    LeaseExpired,
+    LeaseHeld,
+    PositionLimit,
+    StopLatched,
+    ValueOutOfRange,
+)
+from ldcnd.model.commands import BufferMode, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop, Track, Verb
+from ldcnd.model.samples import AxisState
+from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
+
+FIRST_TARGET = 20.0
+
+
+def config(policy: LossPolicy = LossPolicy.RUN_TO_TARGET, authority: str = "leased") -> RigConfig:
+    rig = load_config(SIMULATED)
+    bus = rig.bus[0]
+    axes = tuple(axis.model_copy(update={"loss": LossConfig(client=policy)}) for axis in bus.axis)
+    return rig.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),), "authority": authority})
+
+
+def now_ns() -> int:
+    return EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
+
+
+@asynccontextmanager
+async def moving_to_first_target(rig: RunningRig, lease_s: float = 60.0):
+    """Hold x, on the way to its first target, for four seconds or so."""
+    await rig.until("x", lambda state: state.link == "up")
+    async with control(rig.client, "ann", "x", lease_s=lease_s) as held:
+        await held.command("x", Verb.POWER, Power(on=True))
+        await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
+        yield held
+
+
+def buffered(rig: RunningRig, held: Control, **fields: object) -> "asyncio.Task[object]":
+    """Send a move that waits for the one under way."""
+    request = MoveAbsolute(position=60.0, buffer_mode=BufferMode.BUFFERED, **fields)
+    return asyncio.create_task(held.command("x", Verb.MOVE_ABSOLUTE, request, 30.0), name="buffered")
+
+
+async def stays_at_first_target(rig: RunningRig) -> None:
+    await asyncio.sleep(8.0)
+    position = await rig.client.last("x", "position")
+    assert position.value == pytest.approx(FIRST_TARGET, abs=0.05)
+
+
+async def test_a_buffered_move_that_has_become_too_late_is_refused():
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        waiting = buffered(rig, held, not_after=now_ns() + 500_000_000)
+        with pytest.raises(CommandExpired, match="later than its sender allows"):
+            await waiting
+        await stays_at_first_target(rig)
+
+
+async def test_a_buffered_move_of_a_lease_that_was_released_is_refused():
+    async with running_rig(config()) as rig:
+        async with moving_to_first_target(rig) as held:
+            waiting = buffered(rig, held)
+            await asyncio.sleep(0.5)
+        async with control(rig.client, "bob", "x", lease_s=60.0):
+            with pytest.raises(LeaseExpired):
+                await waiting
+            await stays_at_first_target(rig)
+
+
+async def test_a_buffered_move_of_a_lease_that_was_taken_by_force_is_refused():
+    async with running_rig(config()) as rig:
+        async with moving_to_first_target(rig) as held:
+            waiting = buffered(rig, held)
+            await asyncio.sleep(0.5)
+            async with control(rig.client, "bob", "x", lease_s=60.0, force=True):
+                with pytest.raises(LeaseExpired):
+                    await waiting
+                await stays_at_first_target(rig)
+
+
+async def test_a_buffered_move_of_a_client_that_died_is_refused_although_its_axis_runs_to_its_target():
+    async with running_rig(config()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x", lease_s=1.0) as held:
+            await held.command("x", Verb.POWER, Power(on=True))
+            await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
+            waiting = buffered(rig, held)
+            await asyncio.sleep(0.5)
+            rig.daemon._control.authority.expire(float("inf"))  # nothing was renewed
+            with pytest.raises(LeaseExpired):
+                await waiting
+        await stays_at_first_target(rig)
+
+
+async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        waiting = buffered(rig, held)
+        await asyncio.sleep(0.5)
+        rig.daemon._control.commands.rival = "other"
+        with pytest.raises(DuplicateDaemon):
+            await waiting
+        rig.daemon._control.commands.rival = None
+        await stays_at_first_target(rig)
+
+
+async def test_a_buffered_move_without_a_lease_is_refused_once_its_axis_is_held():
+    async with running_rig(config(authority="open")) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
+        request = MoveAbsolute(position=60.0, buffer_mode=BufferMode.BUFFERED)
+        waiting = asyncio.create_task(rig.client.command("x", Verb.MOVE_ABSOLUTE, request, 30.0))
+        await asyncio.sleep(0.5)
+        async with control(rig.client, "bob", "x", lease_s=60.0):
+            with pytest.raises(LeaseHeld):
+                await waiting
+            await stays_at_first_target(rig)
+
+
+async def test_a_buffered_move_goes_on_under_a_lease_that_its_holder_has_widened():
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        waiting = buffered(rig, held)
+        await asyncio.sleep(0.5)
+        async with control(rig.client, "ann", "x", "y", lease_s=60.0):
+            reply = await waiting
+            await rig.client.wait_for_end("x", reply.command_id)
+        assert (await rig.client.last("x", "position")).value == pytest.approx(60.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("verb", "request_"),
+    [
+        (Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1e6, buffer_mode=BufferMode.ABORTING)),
+        (Verb.MOVE_RELATIVE, MoveRelative(distance=1e6, buffer_mode=BufferMode.ABORTING)),
+        (
+            Verb.MOVE_VELOCITY,
+            MoveVelocity(velocity=1.0, acceleration=0.00001, buffer_mode=BufferMode.ABORTING),
+        ),
+    ],
+)
+async def test_an_aborting_move_that_is_refused_halts_nothing(verb, request_):
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        before = (await rig.client.state("x")).command.command_id
+        with pytest.raises((ValueOutOfRange, PositionLimit)):
+            await held.command("x", verb, request_)
+        state = await rig.client.state("x")
+        assert (state.state, state.command.command_id) == (AxisState.DISCRETE_MOTION, before)
+        await stays_at_first_target(rig)
+
+
+async def test_an_aborting_move_halts_and_then_moves():
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        request = MoveAbsolute(position=3.0, buffer_mode=BufferMode.ABORTING)
+        reply = await held.command("x", Verb.MOVE_ABSOLUTE, request, 30.0)
+        await rig.client.wait_for_end("x", reply.command_id)
+        assert (await rig.client.last("x", "position")).value == pytest.approx(3.0, abs=0.05)
+
+
+async def test_a_stop_between_the_halt_and_the_start_of_an_aborting_move_wins():
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        request = MoveAbsolute(position=3.0, buffer_mode=BufferMode.ABORTING)
+        aborting = asyncio.create_task(held.command("x", Verb.MOVE_ABSOLUTE, request, 30.0))
+        await rig.until("x", lambda state: state.state is AxisState.STOPPING)
+        await rig.client.stop("x")
+        with pytest.raises(StopLatched):
+            await aborting
+        state = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        assert state.stop_latched
+
+
+async def test_a_homing_whose_lease_was_lost_begins_no_further_leg():
+    """The axis stands on its switch: the first leg moves off it; the search would be the second one."""
+    async with running_rig(config()) as rig:
+        await rig.until("y", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "y", lease_s=60.0) as held:
+            await held.command("y", Verb.POWER, Power(on=True))
+            reply = await held.command("y", Verb.HOME, Home())
+            await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
+            reply = await held.command("y", Verb.HOME, Home())
+            rig.daemon._control.authority.expire(float("inf"))
+            state = await rig.client.wait_for_end("y", reply.command_id)
+            assert "lease" in (state.last_error or ""), state
+            assert not state.referenced
+
+
+async def test_a_stream_of_set_points_ends_with_its_lease():
+    rig_config = config()
+    bus = rig_config.bus[0]
+    axes = tuple(
+        axis.model_validate(axis.model_dump() | {"tracking": {"step": 0.4, "rate": 50.0}}) if axis.name == "z" else axis
+        for axis in bus.axis
+    )
+    rig_config = rig_config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+    async with running_rig(rig_config) as rig:
+        await rig.until("z", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "z", lease_s=60.0) as held:
+            await held.command("z", Verb.POWER, Power(on=True))
+            await held.command("z", Verb.TRACK, Track(position=0.1))
+            rig.daemon._control.authority.expire(float("inf"))
+            with pytest.raises(LeaseExpired):
+                await held.command("z", Verb.TRACK, Track(position=0.2))
+
+
+async def test_a_stop_that_comes_while_the_loop_is_being_closed_leaves_it_open():
+    async with running_rig(config(authority="open")) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        axis = rig.daemon.rig.axis("x")
+        power_of, stops = axis.driver.power, []
+
+        async def power(*, on: bool) -> None:
+            stops.append(asyncio.ensure_future(axis.execute(Verb.STOP, Stop())))
+            await asyncio.sleep(0)
+            await asyncio.gather(*stops)
+            await power_of(on=on)
+
+        axis.driver.power = power
+        with pytest.raises(StopLatched):
+            await rig.client.command("x", Verb.POWER, Power(on=True))
+        state = await rig.until("x", lambda state: state.stop_latched)
+        await asyncio.sleep(1.0)
+        assert not (await rig.client.state("x")).enabled, state
+
+
+async def test_limits_are_those_of_the_plan_at_the_start():
+    async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
+        with pytest.raises(PositionLimit):
+            await held.command(
+                "x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1e6, buffer_mode=BufferMode.BUFFERED), 30.0
+            )
+
+
+MOVES = {"load", "start", "track", "power", "set_gains", "start_group"}
+"""Calls of a driver or a network that can move a motor."""
+MAY_CALL = "permit.py"
+
+
+def test_nothing_in_the_daemon_but_a_permit_calls_what_can_move_a_drive():
+    folder = Path(ldcnd.daemon.__file__).parent
+    found = []
+    for path in folder.rglob("*.py"):
+        if path.name == MAY_CALL:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MOVES):
+                continue
+            owner = ast.unparse(node.func.value)
+            if owner.split(".")[-1] in {"driver", "_driver", "network", "_network", "drive", "_drive"}:
+                found.append(f"{path.name}: {ast.unparse(node.func)}")
+    assert not found
