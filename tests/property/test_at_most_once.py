@@ -14,6 +14,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.received import PlainCommand
 from ldcnd.errors import LdcndError, RequestRefused
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import MoveRelative, Power, Verb
@@ -62,7 +63,7 @@ class Motions:
         execute = drive.execute
 
         def counted(packet):
-            self.started += packet.command is Command.START_MOTION
+            self.started += packet == PlainCommand(Command.START_MOTION)
             execute(packet)
 
         drive.execute = counted
