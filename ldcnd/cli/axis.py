@@ -7,7 +7,6 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import NotSupported
 from ldcnd.model.commands import (
     AxisCommand,
     BufferMode,
@@ -20,15 +19,11 @@ from ldcnd.model.commands import (
     MoveVelocity,
     Power,
     Reset,
-    Verb,
 )
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.parameters import (
-    AlarmReport,
     ClearCounter,
     CounterName,
-    CounterReply,
-    DriveProfile,
     ReadAlarms,
     ReadProfile,
 )
@@ -91,7 +86,7 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
 @with_target
 def power(target: Target, axis: str, switch: str) -> None:
     """Close (on) or open (off) the position loop of AXIS; nothing moves."""
-    _send(target, axis, Verb.POWER, Power(on=switch == "on"))
+    _send(target, axis, Power(on=switch == "on"))
 
 
 @command.command(context_settings={"ignore_unknown_options": True})
@@ -128,14 +123,12 @@ def move(
     if at_velocity:
         if velocity is not None:
             raise click.UsageError("with --at-velocity, VALUE is the velocity; leave --velocity out")
-        verb, request = Verb.MOVE_VELOCITY, MoveVelocity(velocity=value, acceleration=acceleration)
+        request = MoveVelocity(velocity=value, acceleration=acceleration)
     elif relative:
-        verb = Verb.MOVE_RELATIVE
         request = MoveRelative(distance=value, velocity=velocity, acceleration=acceleration)
     else:
-        verb = Verb.MOVE_ABSOLUTE
         request = MoveAbsolute(position=value, velocity=velocity, acceleration=acceleration)
-    _send(target, axis, verb, request.model_copy(update={"buffer_mode": BufferMode(buffer_mode)}), wait=wait)
+    _send(target, axis, request.model_copy(update={"buffer_mode": BufferMode(buffer_mode)}), wait=wait)
 
 
 @command.command()
@@ -150,7 +143,7 @@ def home(
 ) -> None:
     """Search the reference position of AXIS, as configured unless said otherwise."""
     request = Home(method=HomeMethod(method) if method else None, velocity=velocity, position=position)
-    _send(target, axis, Verb.HOME, request, wait=wait)
+    _send(target, axis, request, wait=wait)
 
 
 @command.command()
@@ -171,7 +164,7 @@ def stop(target: Target, axis: str | None) -> None:
 @with_target
 def halt(target: Target, axis: str) -> None:
     """Bring AXIS to rest; another command may follow."""
-    _send(target, axis, Verb.HALT, Halt())
+    _send(target, axis, Halt())
 
 
 @command.command()
@@ -179,7 +172,7 @@ def halt(target: Target, axis: str) -> None:
 @with_target
 def reset(target: Target, axis: str) -> None:
     """Clear the stop latch and the faults of AXIS; nothing moves."""
-    _send(target, axis, Verb.RESET, Reset())
+    _send(target, axis, Reset())
 
 
 @command.command()
@@ -187,9 +180,7 @@ def reset(target: Target, axis: str) -> None:
 @with_target
 def profile(target: Target, axis: str) -> None:
     """Show how the drive of AXIS is taken to behave, assumptions with their verification."""
-    reply = target.run(lambda client: client.command(axis, Verb.READ_PROFILE, ReadProfile()))
-    if not isinstance(reply, DriveProfile):
-        raise NotSupported(f"axis {axis} has no profile", axis=axis)
+    reply = target.run(lambda client: client.command(axis, ReadProfile()))
     hearing = ", HEARS ITSELF: nothing is written" if reply.self_hearing else ""
     target.show(reply, f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}")
     if target.as_json:
@@ -214,9 +205,7 @@ def monitors(target: Target, axis: str) -> None:
 @with_target
 def alarms(target: Target, axis: str) -> None:
     """Show the present alarm of AXIS and the history that its drive keeps."""
-    reply = target.run(lambda client: client.command(axis, Verb.READ_ALARMS, ReadAlarms(), timeout_s=30.0))
-    if not isinstance(reply, AlarmReport):
-        raise NotSupported(f"axis {axis} keeps no alarms", axis=axis)
+    reply = target.run(lambda client: client.command(axis, ReadAlarms()))
     past = "".join(f"\n  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
     target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}{past}")
 
@@ -228,17 +217,15 @@ def alarms(target: Target, axis: str) -> None:
 def clear_counter(target: Target, axis: str, counter: str) -> None:
     """Set a pulse counter of AXIS to 0; command pulses must be stopped, and the motor must stand."""
     request = ClearCounter(counter=CounterName(counter))
-    reply = target.run(lambda client: client.command(axis, Verb.CLEAR_COUNTER, request, timeout_s=30.0))
-    if not isinstance(reply, CounterReply):
-        raise NotSupported(f"axis {axis} has no pulse counters", axis=axis)
+    reply = target.run(lambda client: client.command(axis, request))
     remarks = "".join(f"; {remark}" for remark in reply.remarks)
     target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
 
 
-def _send(target: Target, axis: str, verb: Verb, request: AxisCommand[CommandReply], *, wait: bool = False) -> None:
+def _send(target: Target, axis: str, command: AxisCommand[CommandReply], *, wait: bool = False) -> None:
     async def work(client: RigClient) -> tuple[CommandReply, StateSample | None]:
-        reply = await client.command(axis, verb, request)
-        target.show(reply, f"{axis}: {verb} accepted{_values(reply)}")
+        reply = await client.command(axis, command)
+        target.show(reply, f"{axis}: {command.verb} accepted{_values(reply)}")
         return reply, await _follow(client, reply) if wait else None
 
     async def _follow(client: RigClient, reply: CommandReply) -> StateSample:

@@ -9,8 +9,8 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import WrongState
-from ldcnd.model.commands import MoveVelocity, Power, Verb
-from ldcnd.model.rig_commands import Acquire, LeaseReply, RehearsalReply, Rehearse
+from ldcnd.model.commands import MoveVelocity, Power
+from ldcnd.model.rig_commands import Acquire, Rehearse
 from ldcnd.model.samples import AxisState, StateSample, TelemetryItem
 
 RUN_UP_S = 0.5
@@ -43,10 +43,10 @@ def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> N
 
     async def work(client: RigClient) -> dict[str, float]:
         request = Acquire(client="drill", axes=(axis,), lease_s=lease_s)
-        lease = await client.rig_command("acquire", request, LeaseReply)
+        lease = await client.ask(request)
         began_s = asyncio.get_running_loop().time()
-        await client.command(axis, Verb.POWER, Power(on=True, lease=lease.lease))
-        await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=velocity, lease=lease.lease))
+        await client.command(axis, Power(on=True, lease=lease.lease))
+        await client.command(axis, MoveVelocity(velocity=velocity, lease=lease.lease))
         reacted_s, stands_s = await _watch(client, axis)
         return {
             "lease_s": lease_s,
@@ -74,14 +74,12 @@ def bus_loss(target: Target, axis: str, velocity: float) -> None:
 
 
 async def _rehearse(client: RigClient, axis: str, velocity: float, kind: str) -> dict[str, float]:
-    await client.command(axis, Verb.POWER, Power(on=True))
-    await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=velocity))
+    await client.command(axis, Power(on=True))
+    await client.command(axis, MoveVelocity(velocity=velocity))
     await asyncio.sleep(RUN_UP_S)
     loop = asyncio.get_running_loop()
     began_s = loop.time()
-    await client.rig_command(
-        "rehearse", Rehearse.model_validate({"kind": kind, "axis": axis}), RehearsalReply, PATIENCE_S
-    )
+    await client.ask(Rehearse.model_validate({"kind": kind, "axis": axis}), timeout_s=PATIENCE_S)
     answered_s = loop.time()
     reacted_s, stands_s = await _watch(client, axis)
     return {

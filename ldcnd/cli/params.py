@@ -9,13 +9,12 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError, InternalError, LdcndError
-from ldcnd.model.commands import AxisCommand, CommandReply, Verb
+from ldcnd.errors import ConfigError, LdcndError
+from ldcnd.model.commands import CommandReply
 from ldcnd.model.parameters import (
     ListParameters,
     Memory,
     ParameterDump,
-    ParameterList,
     ParameterReply,
     ParameterValue,
     ReadAllParameters,
@@ -52,7 +51,7 @@ def command() -> None:
 def list_parameters(target: Target, axis: str) -> None:
     """Show what is known of the parameters of AXIS; ranges are hints, the drive decides."""
     request = ListParameters()
-    reply = target.run(lambda client: _ask(client, axis, Verb.LIST_PARAMETERS, request, ParameterList))
+    reply = target.run(lambda client: client.command(axis, request))
     for each in reply.parameters:
         limits = "-" if each.lowest is None else f"{each.lowest} to {each.highest}"
         hint = f" [{each.confidence}]" if each.confidence else ""
@@ -68,7 +67,7 @@ def list_parameters(target: Target, axis: str) -> None:
 def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
     """Show PARAMETER (Pn100, or its name) of AXIS in both memories."""
     request = ReadParameter(parameter=parameter, unlisted=unlisted)
-    reply = target.run(lambda client: _ask(client, axis, Verb.READ_PARAMETER, request, ParameterReply))
+    reply = target.run(lambda client: client.command(axis, request))
     target.show(reply, _line(reply.value))
 
 
@@ -184,22 +183,12 @@ def load_values(file: Path) -> dict[str, int]:
     return values
 
 
-async def _ask(
-    client: RigClient, axis: str, verb: Verb, request: AxisCommand[CommandReply], model: type[ReplyT]
-) -> ReplyT:
-    """Send a command whose reply is of this model."""
-    reply = await client.command(axis, verb, request, PATIENCE_S)
-    if not isinstance(reply, model):
-        raise InternalError(f"{verb} was answered with {type(reply).__name__}")
-    return reply
-
-
 async def _read_all(client: RigClient, axis: str) -> ParameterDump:
-    return await _ask(client, axis, Verb.READ_ALL_PARAMETERS, ReadAllParameters(), ParameterDump)
+    return await client.command(axis, ReadAllParameters())
 
 
 async def _write(client: RigClient, axis: str, request: WriteParameter) -> ParameterReply:
-    return await _ask(client, axis, Verb.WRITE_PARAMETER, request, ParameterReply)
+    return await client.command(axis, request)
 
 
 def _line(value: ParameterValue) -> str:

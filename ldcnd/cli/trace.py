@@ -12,7 +12,6 @@ from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
-from ldcnd.model.commands import Verb
 from ldcnd.model.traces import (
     LONGEST_WAIT_S,
     MOST_SAMPLES,
@@ -125,7 +124,7 @@ def last(target: Target, axis: str, out: Path | None) -> None:
 @with_target
 def abort(target: Target, axis: str) -> None:
     """End the trace of AXIS that is under way, or one that was left armed in its drive."""
-    reply = target.run(lambda client: client.command(axis, Verb.TRACE_ABORT, AbortTrace(), ENDING_S))
+    reply = target.run(lambda client: client.command(axis, AbortTrace(), ENDING_S))
     target.show(reply, f"{axis}: trace ended")
 
 

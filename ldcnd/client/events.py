@@ -11,7 +11,6 @@ from contextlib import asynccontextmanager
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import OutcomeUnknown, SessionError
 from ldcnd.model.events import CommandEvent, EventList, ReadEvents
-from ldcnd.model.verbs import EVENTS
 
 LOOK_PERIOD_S = 2.0
 """So often the daemon is asked whether the last event was missed, while none comes."""
@@ -79,7 +78,7 @@ class Events:
         """Ask for the next page from where this reader is; try again for as long as nobody answers."""
         while True:
             try:
-                page = await self._client.rig_command(EVENTS, ReadEvents(from_number=self._next), EventList)
+                page = await self._client.ask(ReadEvents(from_number=self._next))
             except (OutcomeUnknown, SessionError):
                 await asyncio.sleep(RETRY_S)
                 continue
@@ -113,7 +112,7 @@ async def follow_events(client: RigClient, axis: str | None = None, *, history: 
         SessionError: nobody serves this rig, or this login may not ask for events.
     """
     request = ReadEvents(from_number=0, count=1) if history else ReadEvents(count=1)
-    page = await client.rig_command(EVENTS, request, EventList)
+    page = await client.ask(request)
     at = page if history else page.model_copy(update={"first_number": page.end_number})
     events = Events(client, axis, at)
     async with client.command_events(events.take):
@@ -131,13 +130,13 @@ async def latest_events(client: RigClient, count: int, axis: str | None = None) 
     Raises:
         LdcndError: as the daemon refused it, of the same class.
     """
-    page = await client.rig_command(EVENTS, ReadEvents(axis=axis, count=count), EventList)
+    page = await client.ask(ReadEvents(axis=axis, count=count))
     if len(page.events) >= count or page.first_number == 0:
         return list(page.events)
     run, end, events = page.run, page.end_number, list[CommandEvent]()
     at = 0 if axis else max(0, end - count)
     while at < end:
-        page = await client.rig_command(EVENTS, ReadEvents(axis=axis, count=count, from_number=at), EventList)
+        page = await client.ask(ReadEvents(axis=axis, count=count, from_number=at))
         if page.run != run:
             break
         events += page.events

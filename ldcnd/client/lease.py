@@ -8,9 +8,10 @@ from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError
-from ldcnd.model.commands import AxisCommand, CommandReply, Verb
-from ldcnd.model.rig_commands import Acquire, LeaseReply, LeaseRequest
+from ldcnd.model.commands import AxisCommand, CommandReply
+from ldcnd.model.rig_commands import Acquire, LeaseReply, Release, Renew
 
+ReplyT = TypeVar("ReplyT", bound=CommandReply)
 RequestT = TypeVar("RequestT", bound=AxisCommand[CommandReply])
 
 RENEWALS_PER_LEASE = 4
@@ -31,16 +32,14 @@ class Control:
         self._client = client
         self._sequence = count(1)
 
-    async def command(
-        self, axis: str, verb: Verb, request: AxisCommand[CommandReply], timeout_s: float = 5.0
-    ) -> CommandReply:
+    async def command(self, axis: str, command: AxisCommand[ReplyT], timeout_s: float | None = None) -> ReplyT:
         """Send one command under the lease; see `RigClient.command`.
 
         Raises:
             LeaseExpired: the lease was lost.
             LdcndError: as the daemon refused it.
         """
-        return await self._client.command(axis, verb, self.stamped(request, axis), timeout_s)
+        return await self._client.command(axis, self.stamped(command, axis), timeout_s)
 
     def stamped(self, request: RequestT, axis: str) -> RequestT:
         """Return a request for an axis under the lease, with the next sequence number.
@@ -60,7 +59,7 @@ class Control:
             await asyncio.sleep(lease_s / RENEWALS_PER_LEASE)
             asked_at_s = loop.time()
             try:
-                await self._client.rig_command("renew", LeaseRequest(lease=self.lease.lease), LeaseReply, lease_s)
+                await self._client.ask(Renew(lease=self.lease.lease), timeout_s=lease_s)
             except (LeaseExpired, LeaseUnknown) as error:
                 self.lost = error
             except LdcndError as error:
@@ -72,7 +71,7 @@ class Control:
     async def release(self) -> None:
         """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told."""
         with contextlib.suppress(LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError):
-            await self._client.rig_command("release", LeaseRequest(lease=self.lease.lease), LeaseReply)
+            await self._client.ask(Release(lease=self.lease.lease))
 
 
 @contextlib.asynccontextmanager
@@ -92,7 +91,7 @@ async def control(
         LeaseHeld: somebody else controls one of the axes.
     """
     request = Acquire(client=name, axes=axes, lease_s=lease_s, force=force)
-    held = Control(client, await client.rig_command("acquire", request, LeaseReply))
+    held = Control(client, await client.ask(request))
     try:
         async with asyncio.TaskGroup() as group:
             keeper = group.create_task(held.keep(), name=f"lease of {name}")

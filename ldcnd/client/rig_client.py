@@ -10,24 +10,12 @@ from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionErro
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Answer, Declaration, Sample, SampleKind, Session
-from ldcnd.model.commands import (
-    LONGEST_NAME,
-    AxisCommand,
-    CommandReply,
-    PlanReply,
-    Preview,
-    Stop,
-    StopReply,
-    Verb,
-    Why,
-    WhyReply,
-)
+from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, PlanReply, Preview, Stop, StopReply, Why, WhyReply
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import REPLY_MODELS
 from ldcnd.model.samples import (
     SAMPLE_MODELS,
     FaultSample,
@@ -39,9 +27,9 @@ from ldcnd.model.samples import (
 )
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
-from ldcnd.model.verbs import PLAN, WHY
 
 ModelT = TypeVar("ModelT", bound=Frozen)
+ReplyT = TypeVar("ReplyT", bound=Frozen)
 
 NO_QUESTION = Why()
 ITEMS = frozenset(item.value for item in TelemetryItem)
@@ -186,10 +174,13 @@ class RigClient:
         sample = await self.last(axis, TelemetryItem.STATE)
         return sample if isinstance(sample, StateSample) else None
 
-    async def command(
-        self, axis: str, verb: Verb, request: AxisCommand[CommandReply], timeout_s: float = 5.0
-    ) -> CommandReply:
+    async def command(self, axis: str, command: AxisCommand[ReplyT], timeout_s: float | None = None) -> ReplyT:
         """Send one command; returns once the drive has acknowledged it.
+
+        Args:
+            axis: which axis.
+            command: what to do.
+            timeout_s: longest wait for the reply; what such a command may take, when missing.
 
         Raises:
             LdcndError: as the daemon refused it, of the same class.
@@ -199,48 +190,38 @@ class RigClient:
         """
         if self._instance is None:
             self._instance = (await self.daemon()).instance
-        meant = request if request.instance else request.model_copy(update={"instance": self._instance})
-        payload, encoding = encode(meant, Encoding.MSGPACK)
-        answers = await self._session.query(
-            self._keys.command(axis, verb), payload, encoding=encoding, timeout_s=timeout_s
-        )
-        if not answers:
-            raise await self._unanswered(f"axis {axis}: {verb}")
+        meant = command if command.instance else command.model_copy(update={"instance": self._instance})
         try:
-            return self._one(answers, REPLY_MODELS.get(verb, CommandReply))
+            return await self._answer(axis, meant, timeout_s)
         except CommandExpired:
             self._instance = None  # the daemon was restarted: this command is lost, the next one may be new
             raise
 
-    async def rig_command(self, verb: str, request: Frozen, reply: type[ModelT], timeout_s: float = 5.0) -> ModelT:
-        """Ask the rig as a whole; see `RigDesk` for the verbs.
+    async def ask(self, command: Command[ReplyT], axis: str = RIG_ITSELF, timeout_s: float | None = None) -> ReplyT:
+        """Send what is no command of an axis: to the rig as a whole, or a question about an axis.
 
         Raises:
             LdcndError: as the daemon refused it, of the same class.
         """
-        payload, encoding = encode(request, Encoding.MSGPACK)
-        key = self._keys.command(RIG_ITSELF, verb)
-        answers = await self._session.query(key, payload, encoding=encoding, timeout_s=timeout_s)
-        if not answers:
-            raise await self._unanswered(verb)
-        return self._one(answers, reply)
+        return await self._answer(axis, command, timeout_s)
 
-    async def axis_question(self, axis: str, verb: str, request: Frozen, reply: type[ModelT]) -> ModelT:
-        """Ask about an axis what has no effect.
-
-        Raises:
-            LdcndError: as the daemon refused it, of the same class.
-        """
-        payload, encoding = encode(request, Encoding.MSGPACK)
-        return self._one(await self._session.query(self._keys.command(axis, verb), payload, encoding=encoding), reply)
-
-    async def why(self, axis: str, request: Why = NO_QUESTION) -> WhyReply:
+    async def why(self, axis: str, question: Why = NO_QUESTION) -> WhyReply:
         """Ask why a motion of an axis would be refused now, and what would clear that."""
-        return await self.axis_question(axis, WHY, request, WhyReply)
+        return await self.ask(question, axis)
 
-    async def plan(self, axis: str, request: Preview) -> PlanReply:
+    async def plan(self, axis: str, question: Preview) -> PlanReply:
         """Ask what a motion would do; no effect."""
-        return await self.axis_question(axis, PLAN, request, PlanReply)
+        return await self.ask(question, axis)
+
+    async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
+        payload, encoding = encode(command, Encoding.MSGPACK)
+        key = self._keys.command(axis, command.verb)
+        longest_s = command.answer_s if timeout_s is None else timeout_s
+        answers = await self._session.query(key, payload, encoding=encoding, timeout_s=longest_s)
+        if not answers:
+            whose = "" if axis == RIG_ITSELF else f"axis {axis}: "
+            raise await self._unanswered(f"{whose}{command.verb}")
+        return self._one(answers, command.reply_model())
 
     async def stop(self, axis: str | None = None, timeout_s: float = 5.0, client: str | None = None) -> StopReply:
         """Stop one axis, or the whole rig; the events tell the first 64 characters of `client` as who it was."""

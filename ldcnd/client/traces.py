@@ -6,8 +6,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import DriveFault, InternalError, LdcndError, OutcomeUnknown, WrongState
-from ldcnd.model.commands import Verb
+from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, WrongState
 from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 LOOK_S = 0.1
@@ -55,10 +54,7 @@ async def take_trace(client: RigClient, axis: str, request: TakeTrace, within_s:
 
 async def arm_trace(client: RigClient, axis: str, request: TakeTrace) -> TraceReply:
     """Arm a trace and return what it will be."""
-    reply = await client.command(axis, Verb.TRACE, request, ARMING_S)
-    if not isinstance(reply, TraceReply):
-        raise InternalError(f"trace was answered with {type(reply).__name__}")
-    return reply
+    return await client.command(axis, request)
 
 
 @asynccontextmanager
@@ -81,7 +77,7 @@ async def _end(client: RigClient, axis: str, trace_id: str) -> None:
     """End a trace, unless it has ended or given way to another one."""
     header = await client.trace_header(axis)
     if header and header.trace_id == trace_id and header.phase in UNDER_WAY:
-        await client.command(axis, Verb.TRACE_ABORT, AbortTrace(), ENDING_S)
+        await client.command(axis, AbortTrace(), ENDING_S)
 
 
 async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: float) -> TraceHeader:

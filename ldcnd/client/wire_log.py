@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
-from ldcnd.model.verbs import WIRE_LOG
+from ldcnd.model.rig_commands import ReadWireLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +37,14 @@ async def fetch_wire_log(client: RigClient, bus: str, seconds: float) -> Fetched
     Raises:
         LdcndError: as the daemon refused it, of the same class.
     """
-    page = await client.rig_command(WIRE_LOG, ReadWireLog(bus=bus, seconds=seconds), WireLogReply)
+    page = await client.ask(ReadWireLog(bus=bus, seconds=seconds))
     first, end = page, page.end_record
     lines = list(page.lines)
     lost = 0
     while page.next_record < end:
         wanted = page.next_record
         request = ReadWireLog(bus=bus, seconds=seconds, from_record=wanted)
-        page = await client.rig_command(WIRE_LOG, request, WireLogReply)
+        page = await client.ask(request)
         lost += min(page.first_record, end) - wanted
         lines += page.lines[: max(0, end - page.first_record)]
     return FetchedWireLog(

@@ -2,9 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -19,27 +17,13 @@ from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
 from ldcnd.errors import LdcndError, UnknownVerb
 from ldcnd.messaging.codec import Encoding, decode, error_reply
-from ldcnd.model.commands import ErrorReply, StopReply, Verb, Why
+from ldcnd.model.catalogue import BY_VERB
+from ldcnd.model.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.requests import REQUEST_MODELS
-from ldcnd.model.rig_commands import AxisMove, MoveTogether
-from ldcnd.model.verbs import ACQUIRE, AXIS_QUESTIONS, RELEASE, RENEW, RIG_VERBS
+from ldcnd.model.rig_commands import Acquire, AxisMove, MoveTogether, Release, Renew
 
-ANSWER_TIME_S = 5.0
-SLOW_VERBS_S: Mapping[str, float] = MappingProxyType(
-    {
-        Verb.TRACE: 30.0,
-        Verb.TRACE_ABORT: 10.0,
-        Verb.READ_PARAMETER: 60.0,
-        Verb.READ_ALL_PARAMETERS: 60.0,
-        Verb.WRITE_PARAMETER: 60.0,
-        Verb.CLEAR_COUNTER: 60.0,
-        Verb.READ_ALARMS: 60.0,
-    }
-)
-"""What takes many words with a slow drive."""
 STOP_TIME_S = 3.0
-LEASE_VERBS = frozenset({ACQUIRE, RENEW, RELEASE})
+LEASE_COMMANDS: frozenset[type[Command[Frozen]]] = frozenset({Acquire, Renew, Release})
 """A lease that no open page renews would let axes move unwatched; pages take control by `/api/rigs/RIG/control`."""
 
 
@@ -88,36 +72,33 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         client = rigs.client(rig)
         body = await body_of(request)
         page = page_of(request, pages) if PAGE_HEADER in request.headers else None
-        if verb in AXIS_QUESTIONS:
-            asked = decode(AXIS_QUESTIONS[verb].request, body, Encoding.JSON)
+        kind = _class_of(About.AXIS, verb)
+        if not issubclass(kind, AxisCommand):
+            asked = decode(kind, body, Encoding.JSON)
             if isinstance(asked, Why) and page:
                 asked = asked.model_copy(update={"lease": page.lease(rig, axis)})
-            return json_reply(await client.axis_question(axis, verb, asked, AXIS_QUESTIONS[verb].reply))
-        if verb not in set(Verb):
-            raise _unknown(verb)
-        model = REQUEST_MODELS[Verb(verb)]
+            return json_reply(await client.ask(asked, axis))
         envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
-        meant = decode(model, envelope.around(body, model), Encoding.JSON)
-        timeout_s = SLOW_VERBS_S.get(verb, ANSWER_TIME_S)
+        meant = decode(kind, envelope.around(body, kind), Encoding.JSON)
         if page:
-            return json_reply(await page.command(rig, axis, Verb(verb), meant, timeout_s))
-        refuse_unwatched(axis, Verb(verb))
-        return json_reply(await client.command(axis, Verb(verb), meant, timeout_s))
+            return json_reply(await page.command(rig, axis, meant))
+        refuse_unwatched(axis, meant)
+        return json_reply(await client.command(axis, meant))
 
     async def rig_command(request: Request) -> Response:
         rig, verb = (request.path_params[name] for name in ("rig", "verb"))
         client = rigs.client(rig)
-        if verb not in RIG_VERBS or verb in LEASE_VERBS:
+        kind = _class_of(About.RIG, verb)
+        if kind in LEASE_COMMANDS:
             raise _unknown(verb)
-        models = RIG_VERBS[verb]
         page = page_of(request, pages) if PAGE_HEADER in request.headers else None
         envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
-        asked = decode(models.request, envelope.around(await body_of(request), models.request), Encoding.JSON)
+        asked = decode(kind, envelope.around(await body_of(request), kind), Encoding.JSON)
         if isinstance(asked, MoveTogether):
             if page is None:
                 raise control_needed(asked.moves[0].axis)
             return json_reply(await page.move_together(rig, asked))
-        return json_reply(await client.rig_command(verb, asked, models.reply))
+        return json_reply(await client.ask(asked))
 
     async def stop(request: Request) -> Response:
         client = rigs.client(request.path_params["rig"])
@@ -144,6 +125,12 @@ async def _stopped(client: RigClient, who: str) -> StopReply | ErrorReply:
         return await client.stop(timeout_s=STOP_TIME_S, client=who)
     except LdcndError as error:
         return error_reply(error)
+
+
+def _class_of(about: About, verb: str) -> type[Command[Frozen]]:
+    if command := BY_VERB[about].get(verb):
+        return command
+    raise _unknown(verb)
 
 
 def _unknown(verb: str) -> UnknownVerb:

@@ -17,11 +17,10 @@ from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor
 from ldcnd.errors import LdcndError, LeaseExpired, LeaseRequired, NotSupported, TooManyRequests, UnknownAxis
 from ldcnd.log import get_logger
-from ldcnd.model.commands import AxisCommand, CommandReply, Halt, Verb
+from ldcnd.model.commands import AxisCommand, CommandReply, Effect, Halt
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.rig_commands import Acquire, LeaseReply, MoveTogether, MoveTogetherReply
+from ldcnd.model.rig_commands import Acquire, MoveTogether, MoveTogetherReply
 from ldcnd.model.samples import Moving
-from ldcnd.model.verbs import ACQUIRE, MOVE_TOGETHER
 
 log = get_logger("console")
 
@@ -34,17 +33,6 @@ its configuration decides."""
 LOOK_EACH_S = 0.05
 MOST_PAGES = 64
 TOKEN_BYTES = 16
-MOTIONS = frozenset(
-    {
-        Verb.MOVE_ABSOLUTE,
-        Verb.MOVE_RELATIVE,
-        Verb.MOVE_VELOCITY,
-        Verb.MOVE_ANALOG,
-        Verb.SET_PWM,
-        Verb.TRACK,
-        Verb.HOME,
-    }
-)
 
 
 class Lost(Frozen):
@@ -127,7 +115,7 @@ class PageControl:
         if axis not in self._rigs.axes(rig):
             raise UnknownAxis(f"rig {rig} has no axis {axis[:64]!r}", axis=axis[:64], value=axis[:64])
         request = Acquire(client=self.client, axes=(axis,), lease_s=LEASE_S, force=force)
-        control = Control(client, await client.rig_command(ACQUIRE, request, LeaseReply))
+        control = Control(client, await client.ask(request))
         if self._gone:
             await control.release()
             raise _page_gone()
@@ -141,9 +129,7 @@ class PageControl:
         if hold := self._held.pop((rig, axis), None):
             await _give_up(hold, self.client)
 
-    async def command(
-        self, rig: str, axis: str, verb: Verb, request: AxisCommand[CommandReply], timeout_s: float
-    ) -> CommandReply:
+    async def command(self, rig: str, axis: str, command: AxisCommand[CommandReply]) -> CommandReply:
         """Send one command, under the page's lease where it has one.
 
         Raises:
@@ -152,10 +138,10 @@ class PageControl:
         """
         hold = self._held.get((rig, axis))
         if hold is None:
-            refuse_unwatched(axis, verb)
-            return await self._rigs.client(rig).command(axis, verb, request, timeout_s)
-        with hold.in_flight(moves=verb in MOTIONS):
-            return await hold.control.command(axis, verb, request, timeout_s)
+            refuse_unwatched(axis, command)
+            return await self._rigs.client(rig).command(axis, command)
+        with hold.in_flight(moves=command.effect is Effect.MOTION):
+            return await hold.control.command(axis, command)
 
     async def move_together(self, rig: str, request: MoveTogether) -> MoveTogetherReply:
         """Start the moves of a group under the page's leases.
@@ -173,7 +159,7 @@ class PageControl:
                 sending.enter_context(hold.in_flight(moves=True))
                 moves.append(hold.control.stamped(move, move.axis))
             together = request.model_copy(update={"moves": tuple(moves)})
-            return await self._rigs.client(rig).rig_command(MOVE_TOGETHER, together, MoveTogetherReply)
+            return await self._rigs.client(rig).ask(together)
 
     def lease(self, rig: str, axis: str) -> str | None:
         """Return the lease of an axis, for questions."""
@@ -237,13 +223,13 @@ class Pages:
         return page
 
 
-def refuse_unwatched(axis: str, verb: Verb) -> None:
+def refuse_unwatched(axis: str, command: AxisCommand[CommandReply]) -> None:
     """Refuse a motion that no open page is responsible for.
 
     Raises:
         LeaseRequired: it is one.
     """
-    if verb in MOTIONS:
+    if command.effect is Effect.MOTION:
         raise control_needed(axis)
 
 
@@ -284,7 +270,7 @@ async def _bring_to_rest(hold: _Hold, client: str) -> None:
         if not hold.moved and await _stands(hold):
             return
         try:
-            await hold.client.command(hold.axis, Verb.HALT, Halt(client=client), HALT_TIME_S)
+            await hold.client.command(hold.axis, Halt(client=client), HALT_TIME_S)
         except NotSupported:
             return  # no command of ours moves it
         stands = False

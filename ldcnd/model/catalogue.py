@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from ldcnd.model import commands, parameters, rig_commands, traces
-from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, ErrorReply, StopReply, Verb
+from ldcnd.model.commands import About, AxisCommand, Capability, Command, CommandReply, ErrorReply, StopReply, Verb
 from ldcnd.model.events import CommandEvent
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigPlan
@@ -34,6 +34,10 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     *RIG_COMMANDS.values(),
 )
 """Every command, in the order in which they are documented."""
+BY_VERB: Mapping[About, Mapping[str, type[Command[Frozen]]]] = MappingProxyType(
+    {about: MappingProxyType({each.verb: each for each in COMMANDS if each.about is about}) for about in About}
+)
+"""What the last chunk of a command key stands for, in keys of axes and in those of the rig."""
 
 
 def verbs_for(*capabilities: Capability) -> frozenset[Verb]:
@@ -61,3 +65,6 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
     LeaseRequest,  # stands for both commands that carry it
 )
 """Everything that crosses the network but the configuration, which is no part of the vocabulary."""
+
+MODELS: Mapping[str, type[Frozen]] = MappingProxyType({schema_name(model): model for model in PUBLIC_MODELS})
+"""The same by the name of their schema."""

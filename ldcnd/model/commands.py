@@ -66,8 +66,10 @@ class Effect(StrEnum):
     """Changes nothing: it needs no lease and leaves no event."""
     REST = "rest"
     """Brings an axis to rest: it needs no lease, is never late, and is carried out as often as it is sent."""
+    MOTION = "motion"
+    """May make an axis move: it is carried out at most once for each command id."""
     CHANGE = "change"
-    """Anything else: it is carried out at most once for each command id."""
+    """Changes something else: it is carried out at most once for each command id."""
 
 
 class Ends(StrEnum):
@@ -264,6 +266,7 @@ class BufferMode(StrEnum):
 class Move(AxisCommand[CommandReply]):
     """What the moves have in common."""
 
+    effect = Effect.MOTION
     ends = Ends.BY_READING
 
     buffer_mode: BufferMode = BufferMode.REFUSE
@@ -360,6 +363,7 @@ class Home(AxisCommand[CommandReply]):
     """
 
     verb = Verb.HOME
+    effect = Effect.MOTION
     ends = Ends.BY_READING
 
     method: HomeMethod | None = None
@@ -424,6 +428,7 @@ class MoveAnalog(AxisCommand[CommandReply]):
     """Move until the analog position sensor reads a value; the drive finds the direction itself."""
 
     verb = Verb.MOVE_ANALOG
+    effect = Effect.MOTION
     ends = Ends.BY_READING
 
     target: int = Field(ge=0)
@@ -438,6 +443,7 @@ class SetPwm(AxisCommand[CommandReply]):
     """Put a raw duty on the motor, with the position loop open, for a limited time; then the axis stops and holds."""
 
     verb = Verb.SET_PWM
+    effect = Effect.MOTION
     ends = Ends.BY_READING
 
     duty: float = Field(ge=-1, le=1)
@@ -450,6 +456,7 @@ class Track(AxisCommand[CommandReply]):
     """Go to a position at once, without a profile: one set-point of a stream."""
 
     verb = Verb.TRACK
+    effect = Effect.MOTION
     ends = Ends.BY_READING
 
     position: float

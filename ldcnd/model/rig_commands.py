@@ -112,6 +112,7 @@ class MoveTogether(Command[MoveTogetherReply]):
     """Start absolute moves of the axes of one configured group in the same servo cycle, or none of them."""
 
     verb = "move_together"
+    effect = Effect.MOTION
     about = About.RIG
     needs_lease = True
     ends = Ends.BY_READING

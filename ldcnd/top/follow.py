@@ -4,7 +4,7 @@ import asyncio
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError
-from ldcnd.model.rig_commands import HolderList, ListHolders
+from ldcnd.model.rig_commands import ListHolders
 from ldcnd.top.rig_view import RigView, described
 
 LOOK_S = 1.0
@@ -23,7 +23,7 @@ async def follow(client: RigClient, view: RigView) -> None:
                     for sample in await client.last_published():
                         view.take(sample, loop.time())
                     instance = daemon.instance
-                holders = await client.rig_command("holders", ListHolders(), HolderList)
+                holders = await client.ask(ListHolders())
                 view.describe(described(daemon, await client.axes(), holders))
             except LdcndError:
                 pass  # the view tells since when nothing was heard of it

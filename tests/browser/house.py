@@ -14,7 +14,7 @@ from playwright.async_api import Browser, ConsoleMessage, Locator, Page, async_p
 
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.commands import Halt, Power, Reset, Verb
+from ldcnd.model.commands import Halt, Power, Reset
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
 from tests.support.process import ROOT, answering, client, free_port, process
 
@@ -90,10 +90,10 @@ class DaemonUnderTest:
         """Leave axes disabled, without a latch, a fault or a holder, whatever was done to them before."""
         async with control(self.rig, "the test", *axes, lease_s=60, force=True) as held:
             for axis in axes:
-                await held.command(axis, Verb.HALT, Halt())
+                await held.command(axis, Halt())
                 await self.until(axis, lambda state: state.moving == "no")
-                await held.command(axis, Verb.RESET, Reset())
-                await held.command(axis, Verb.POWER, Power(on=False))
+                await held.command(axis, Reset())
+                await held.command(axis, Power(on=False))
 
 
 @dataclass

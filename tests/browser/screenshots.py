@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.async_api import expect
 
-from ldcnd.model.commands import MoveAbsolute, Power, SetGains, Verb
+from ldcnd.model.commands import MoveAbsolute, Power, SetGains
 from tests.browser.house import Desk, House, open_house
 
 LARGEST_BYTES = 150_000
@@ -20,12 +20,12 @@ async def rig(house: House, desk: Desk) -> None:
     """Show one axis that runs, one that stands, one with a fault."""
     client = house.sim.rig
     for axis in ("x", "y", "z"):
-        await client.command(axis, Verb.POWER, Power(on=True))
-    await client.command("y", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=41.25))
-    await client.command("z", Verb.SET_GAINS, SetGains(el=5))
-    await client.command("z", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5))
+        await client.command(axis, Power(on=True))
+    await client.command("y", MoveAbsolute(position=41.25))
+    await client.command("z", SetGains(el=5))
+    await client.command("z", MoveAbsolute(position=5))
     await house.sim.reaches("y", 41.25, within=0.05)
-    await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=60, velocity=5))
+    await client.command("x", MoveAbsolute(position=60, velocity=5))
     await desk.open("rig")
     await expect(desk.page.get_by_text("position error").first).to_be_visible()
     await expect(desk.panel("Rig sim").get_by_role("row", name="x ls-182ap").get_by_text("moving")).to_be_visible()
@@ -45,7 +45,7 @@ async def scope(house: House, desk: Desk) -> None:
     """Show moves to and fro, with cursors on them."""
     await house.sim.quiet("x", "y", "z", "c")
     for name in ("x", "c"):
-        await house.sim.rig.command(name, Verb.POWER, Power(on=True))
+        await house.sim.rig.command(name, Power(on=True))
     await desk.open("scope")
     boxes = desk.page.get_by_role("group", name="sim · x")
     await desk.page.get_by_role("group", name="mixed · x").get_by_label("position", exact=True).uncheck()
@@ -54,7 +54,7 @@ async def scope(house: House, desk: Desk) -> None:
         await boxes.get_by_label(label, exact=True).check()
     await expect(desk.page.get_by_text("redraws a second")).to_be_visible()
     for target in (20, -20, 15, 0):
-        await house.sim.rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=target))
+        await house.sim.rig.command("x", MoveAbsolute(position=target))
         await house.sim.reaches("x", target, within=0.05)
     await desk.button("Pause").click()
     await desk.page.get_by_label("Cursor A").fill("380")

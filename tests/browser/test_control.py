@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from ldcnd.model.rig_commands import HolderList, ListHolders
+from ldcnd.model.rig_commands import ListHolders
 from tests.browser.house import Desk, open_browser
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -19,7 +19,7 @@ LEASES_LONG = 7.0
 
 
 async def holder(house, axis):
-    told = await house.sim.rig.rig_command("holders", ListHolders(), HolderList)
+    told = await house.sim.rig.ask(ListHolders())
     return next(each.client for each in told.holders if each.axis == axis)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.cli.params import load_values
 from ldcnd.client.traces import fetch_trace
-from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains, Verb
+from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
 
@@ -69,13 +69,13 @@ async def test_a_trace_is_recorded_drawn_and_saved(house):
 
 async def test_the_scope_follows_a_motion_and_measures_between_cursors(house):
     await house.sim.quiet("x")
-    await house.sim.rig.command("x", Verb.POWER, Power(on=True))
+    await house.sim.rig.command("x", Power(on=True))
     async with house.desk() as desk:
         await desk.open("scope")
         await expect(desk.page.get_by_text("redraws a second")).to_be_visible()
         boxes = desk.page.get_by_role("group", name="sim · x")
         await boxes.get_by_label("velocity").check()
-        await house.sim.rig.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=-3))
+        await house.sim.rig.command("x", MoveVelocity(velocity=-3))
         values = desk.page.get_by_role("row", name="x velocity")
         await expect(values).to_contain_text(re.compile(f"{MINUS}[1-9]"))  # whole counts a servo tick, so not exactly 3
         await expect(desk.page.get_by_text("redraws a second")).to_be_visible()

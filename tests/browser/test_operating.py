@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from ldcnd.model.commands import MoveVelocity, Power, Verb
+from ldcnd.model.commands import MoveVelocity, Power
 from ldcnd.model.parameters import ReadParameter
-from ldcnd.model.rig_commands import Acquire, HolderList, LeaseReply, ListHolders
+from ldcnd.model.rig_commands import Acquire, ListHolders
 from ldcnd.model.samples import TelemetryItem
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -16,13 +16,13 @@ pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), 
 
 
 async def holder(daemon, axis):
-    told = await daemon.rig.rig_command("holders", ListHolders(), HolderList)
+    told = await daemon.rig.ask(ListHolders())
     return next(each.client for each in told.holders if each.axis == axis)
 
 
 async def running(daemon, axis, velocity):
-    await daemon.rig.command(axis, Verb.POWER, Power(on=True))
-    await daemon.rig.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=velocity))
+    await daemon.rig.command(axis, Power(on=True))
+    await daemon.rig.command(axis, MoveVelocity(velocity=velocity))
 
 
 async def test_an_axis_is_taken_enabled_and_moved_and_its_number_arrives(house):
@@ -151,7 +151,7 @@ async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
         await expect(desk.panel("Control")).to_contain_text("Held by this page")
 
         taken = Acquire(client="another operator", axes=("c",), lease_s=60, force=True)
-        lease = await house.sim.rig.rig_command("acquire", taken, LeaseReply)
+        lease = await house.sim.rig.ask(taken)
 
         await expect(desk.page.get_by_text("Control of c is lost")).to_be_visible()
         await expect(desk.page).to_have_title(re.compile("^Control lost . Axis c"))
@@ -202,5 +202,5 @@ async def test_parameters_are_read_compared_and_written(house, tmp_path):
 
         await expect(desk.panel("Restore from the file")).to_contain_text("1 of 1 written.")
         request = ReadParameter(parameter="Pn100")
-        reading = await house.mixed.rig.command("feed", Verb.READ_PARAMETER, request, 60)
+        reading = await house.mixed.rig.command("feed", request, 60)
         assert (reading.value.active, reading.value.stored) == (90, 80)

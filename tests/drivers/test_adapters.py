@@ -6,7 +6,7 @@ import contextlib
 import pytest
 
 from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, SetPosition, Verb
+from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, SetPosition
 from ldcnd.model.samples import AxisState, FaultSample, LinkState, Moving, PositionSample, Quality, TelemetryItem
 from ldcnd.model.traces import TakeTrace
 from tests.support.chain_rig import drive, simulated_config
@@ -19,13 +19,13 @@ REST_S = 2.0
 
 async def powered(line: Plugged, *axes: str) -> None:
     for axis in axes:
-        await line.rig.client.command(axis, Verb.POWER, Power(on=True))
+        await line.rig.client.command(axis, Power(on=True))
 
 
 async def moving(line: Plugged, axis: str, position: float, velocity: float) -> None:
     await powered(line, axis)
     request = MoveAbsolute(position=position, velocity=velocity)
-    await line.rig.client.command(axis, Verb.MOVE_ABSOLUTE, request)
+    await line.rig.client.command(axis, request)
     await asyncio.sleep(0.7)
 
 
@@ -48,7 +48,7 @@ async def test_a_line_works_whatever_its_adapter_keeps_back(holding, baud):
         statistics = line.rig.line.bus.statistics
         unanswered = statistics.timeouts  # whoever comes behind the last drive was asked, and is not there
         await powered(line, "x")
-        reply = await line.rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
+        reply = await line.rig.client.command("x", MoveAbsolute(position=5.0))
         ended = await line.rig.client.wait_for_end("x", reply.command_id)
         before = statistics.exchanges
         await asyncio.sleep(4.0)
@@ -143,7 +143,7 @@ async def test_a_stop_that_is_cut_off_by_the_plug_is_carried_out_when_it_is_back
 async def test_a_homing_that_is_cut_off_leaves_the_axis_at_rest_without_a_reference():
     async with plugged() as line:
         await powered(line, "y")
-        reply = await line.rig.client.command("y", Verb.HOME, Home())
+        reply = await line.rig.client.command("y", Home())
         await asyncio.sleep(1.0)
         await line.outage(0.5)
         ended = await line.rig.client.wait_for_end("y", reply.command_id)
@@ -157,8 +157,8 @@ async def test_a_homing_that_is_cut_off_leaves_the_axis_at_rest_without_a_refere
 async def test_a_halt_and_a_trace_that_are_cut_off_end_and_the_axis_stands():
     async with plugged() as line:
         await moving(line, "x", 95.0, 10.0)
-        await line.rig.client.command("x", Verb.TRACE, TakeTrace(channels=("position",), interval_s=0.02, samples=200))
-        halting = asyncio.ensure_future(line.rig.client.command("x", Verb.HALT, Halt()))
+        await line.rig.client.command("x", TakeTrace(channels=("position",), interval_s=0.02, samples=200))
+        halting = asyncio.ensure_future(line.rig.client.command("x", Halt()))
         await asyncio.sleep(0.001)
         line.plug.pull()
         await asyncio.wait([halting])
@@ -175,9 +175,9 @@ async def test_a_halt_and_a_trace_that_are_cut_off_end_and_the_axis_stands():
 async def test_a_fault_is_called_the_same_before_and_after_the_plug_was_pulled():
     async with plugged() as line:
         await powered(line, "x")
-        await line.rig.client.command("x", Verb.SET_POSITION, SetPosition(position=-90.0))
+        await line.rig.client.command("x", SetPosition(position=-90.0))
         drive(line.chain, X).shaft.stalled = True
-        await line.rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0, velocity=40.0))
+        await line.rig.client.command("x", MoveAbsolute(position=90.0, velocity=40.0))
         await line.rig.until("x", lambda state: state.state is AxisState.ERROR_STOP)
         before = await line.rig.client.last("x", TelemetryItem.FAULT)
         await line.outage(1.0)
@@ -260,7 +260,7 @@ async def test_a_line_is_not_looked_for_at_rates_that_the_adapter_does_not_have(
 async def test_a_velocity_move_without_end_is_halted_after_the_plug_was_pulled():
     async with plugged() as line:
         await powered(line, "x")
-        await line.rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=3.0))
+        await line.rig.client.command("x", MoveVelocity(velocity=3.0))
         await asyncio.sleep(0.5)
         await line.outage(0.5)
         await asyncio.sleep(REST_S)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition, Verb
+from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
 from ldcnd.model.samples import AxisState, LinkState, PositionSample, Quality, TelemetryItem
 from tests.support.chain_rig import drive
 from tests.support.plugged_rig import Plugged, X, Y, plugged, slow_config
@@ -65,9 +65,9 @@ class Judge:
 async def ready(line: Plugged, judge: Judge, axis: str) -> None:
     """Clear what the last round left, and give the axis a reference in the middle of its travel."""
     client = line.rig.client
-    await client.command(axis, Verb.RESET, Reset())
-    await client.command(axis, Verb.POWER, Power(on=True))
-    await client.command(axis, Verb.SET_POSITION, SetPosition(position=0.0))
+    await client.command(axis, Reset())
+    await client.command(axis, Power(on=True))
+    await client.command(axis, SetPosition(position=0.0))
     judge.set_zero(axis)
 
 
@@ -78,16 +78,16 @@ async def act(line: Plugged, judge: Judge, axis: str, dice: random.Random) -> No
     match dice.choice(["move", "velocity", "home", "halt", "rest"]):
         case "move":
             target = dice.choice([-60.0, 60.0])
-            await client.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsolute(position=target, velocity=velocity))
+            await client.command(axis, MoveAbsolute(position=target, velocity=velocity))
         case "velocity":
-            await client.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=min(velocity, 5.0)))
+            await client.command(axis, MoveVelocity(velocity=min(velocity, 5.0)))
         case "home":
             judge.zero.pop(axis)  # the reference is another one from now on, or none
-            await client.command(axis, Verb.HOME, Home())
+            await client.command(axis, Home())
         case "halt":
-            await client.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsolute(position=60.0, velocity=velocity))
+            await client.command(axis, MoveAbsolute(position=60.0, velocity=velocity))
             await asyncio.sleep(dice.uniform(0.0, 0.4))
-            await client.command(axis, Verb.HALT, Halt())
+            await client.command(axis, Halt())
 
 
 async def stop(line: Plugged, after_s: float) -> None:

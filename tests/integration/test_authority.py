@@ -21,8 +21,8 @@ from ldcnd.errors import (
     UnknownAxis,
 )
 from ldcnd.model.commands import MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb
-from ldcnd.model.events import CommandOutcome, CommandStatus, EventList, ReadEvents, ReadOutcome
-from ldcnd.model.rig_commands import SHORTEST_LEASE_S, Acquire, HolderList, LeaseReply, ListHolders
+from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.model.rig_commands import SHORTEST_LEASE_S, Acquire, ListHolders
 from ldcnd.model.samples import AxisState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
@@ -37,22 +37,22 @@ def leased():
 
 async def powered(rig: RunningRig, axis: str = "x") -> None:
     await rig.until(axis, lambda state: state.link == "up")
-    await rig.client.command(axis, Verb.POWER, Power(on=True))
+    await rig.client.command(axis, Power(on=True))
 
 
 async def test_a_leased_rig_moves_under_a_lease_only():
     async with running_rig(leased()) as rig:
         await rig.until("x", lambda state: state.link == "up")
         with pytest.raises(LeaseRequired):
-            await rig.client.command("x", Verb.POWER, Power(on=True))
+            await rig.client.command("x", Power(on=True))
 
         async with control(rig.client, "ann", "x") as held:
-            await held.command("x", Verb.POWER, Power(on=True))
-            reply = await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=30.0))
+            await held.command("x", Power(on=True))
+            reply = await held.command("x", MoveAbsolute(position=30.0))
             state = await rig.client.wait_for_end("x", reply.command_id)
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
-        holders = await rig.client.rig_command("holders", ListHolders(), HolderList)
+        holders = await rig.client.ask(ListHolders())
         assert {holder.client for holder in holders.holders} == {None}
 
 
@@ -60,8 +60,8 @@ async def test_stop_and_halt_never_need_a_lease():
     async with running_rig(leased()) as rig:
         await rig.until("x", lambda state: state.link == "up")
         async with control(rig.client, "ann", "x") as held:
-            await held.command("x", Verb.POWER, Power(on=True))
-            await held.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=10.0))
+            await held.command("x", Power(on=True))
+            await held.command("x", MoveVelocity(velocity=10.0))
 
             reply = await rig.client.stop("x")
 
@@ -73,12 +73,12 @@ async def test_stop_and_halt_never_need_a_lease():
 async def test_an_axis_halts_when_its_client_disappears(lease_s):
     async with running_rig(leased()) as rig:
         await rig.until("x", lambda state: state.link == "up")
-        lease = await rig.client.rig_command("acquire", Acquire(client="ann", axes=("x",), lease_s=lease_s), LeaseReply)
+        lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=lease_s))
         loop = asyncio.get_running_loop()
         acquired_s = loop.time()
         under = {"lease": lease.lease}
-        await rig.client.command("x", Verb.POWER, Power(on=True, **under))
-        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=10.0, **under))
+        await rig.client.command("x", Power(on=True, **under))
+        await rig.client.command("x", MoveVelocity(velocity=10.0, **under))
 
         await rig.until("x", lambda state: state.state is AxisState.STOPPING)
         assert lease_s <= loop.time() - acquired_s <= lease_s + ACTED_WITHIN_S
@@ -87,7 +87,7 @@ async def test_an_axis_halts_when_its_client_disappears(lease_s):
         assert not state.stop_latched
         for stale in (MoveVelocity(velocity=10.0, **under), MoveVelocity(velocity=-10.0, **under)):
             with pytest.raises(LeaseExpired):
-                await rig.client.command("x", Verb.MOVE_VELOCITY, stale)
+                await rig.client.command("x", stale)
 
 
 async def test_somebody_else_is_refused_and_may_take_over_by_force():
@@ -96,15 +96,15 @@ async def test_somebody_else_is_refused_and_may_take_over_by_force():
         bob = RigClient(rig.session, "sim")
         async with control(rig.client, "ann", "x") as held:
             with pytest.raises(LeaseHeld, match="ann"):
-                await bob.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+                await bob.command("x", MoveAbsolute(position=1.0))
             with pytest.raises(LeaseHeld):
                 async with control(bob, "bob", "x"):
                     pass
 
             async with control(bob, "bob", "x", force=True) as taken:
-                await taken.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+                await taken.command("x", MoveAbsolute(position=1.0))
                 with pytest.raises(LeaseExpired):
-                    await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=2.0))
+                    await held.command("x", MoveAbsolute(position=2.0))
 
 
 async def test_a_lease_on_a_group_covers_its_members():
@@ -112,7 +112,7 @@ async def test_a_lease_on_a_group_covers_its_members():
     group = GroupConfig(name="gantry", axes=("x", "y"))
     bus = config.bus[0].model_copy(update={"group": (group,)})
     async with running_rig(config.model_copy(update={"bus": (bus,)})) as rig:
-        lease = await rig.client.rig_command("acquire", Acquire(client="ann", axes=("gantry", "z")), LeaseReply)
+        lease = await rig.client.ask(Acquire(client="ann", axes=("gantry", "z")))
 
         assert lease.axes == ("x", "y", "z")
 
@@ -122,10 +122,10 @@ async def test_commands_under_a_lease_never_go_backwards():
         await powered(rig)
         async with control(rig.client, "ann", "x") as held:
             lease = held.lease.lease
-            await rig.client.command("x", Verb.RESET, Reset(lease=lease, sequence=9))
+            await rig.client.command("x", Reset(lease=lease, sequence=9))
 
             with pytest.raises(StaleSequence):
-                await rig.client.command("x", Verb.RESET, Reset(lease=lease, sequence=9))
+                await rig.client.command("x", Reset(lease=lease, sequence=9))
 
 
 async def test_a_repeated_id_moves_once_and_is_answered_alike():
@@ -134,28 +134,28 @@ async def test_a_repeated_id_moves_once_and_is_answered_alike():
         step = MoveRelative(distance=2.0, command_id="step-1")
 
         async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(rig.client.command("x", Verb.MOVE_RELATIVE, step)) for _ in range(5)]
+            tasks = [group.create_task(rig.client.command("x", step)) for _ in range(5)]
         await rig.client.wait_for_end("x", "step-1")
-        again = await rig.client.command("x", Verb.MOVE_RELATIVE, step)
+        again = await rig.client.command("x", step)
 
         assert {task.result() for task in tasks} == {again}
-        outcome = await rig.client.rig_command("outcome", ReadOutcome(command_id="step-1"), CommandOutcome)
+        outcome = await rig.client.ask(ReadOutcome(command_id="step-1"))
         assert outcome.status is CommandStatus.DONE
         assert again.position == pytest.approx(2.0)
         with pytest.raises(CommandIdReused):
-            await rig.client.command("x", Verb.MOVE_RELATIVE, MoveRelative(distance=3.0, command_id="step-1"))
+            await rig.client.command("x", MoveRelative(distance=3.0, command_id="step-1"))
 
 
 async def test_a_repeated_stop_stops_again():
     async with running_rig() as rig:
         await powered(rig)
         stop = QuickStop(command_id="stop-1")
-        await rig.client.command("x", Verb.QUICK_STOP, stop)
+        await rig.client.command("x", stop)
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-        await rig.client.command("x", Verb.RESET, Reset())
-        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=10.0))
+        await rig.client.command("x", Reset())
+        await rig.client.command("x", MoveVelocity(velocity=10.0))
 
-        await rig.client.command("x", Verb.QUICK_STOP, stop)
+        await rig.client.command("x", stop)
 
         state = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
         assert state.stop_latched
@@ -168,7 +168,7 @@ async def test_a_repeated_refusal_stays_a_refusal():
 
         for _ in range(2):
             with pytest.raises(PositionLimit):
-                await rig.client.command("x", Verb.MOVE_ABSOLUTE, far)
+                await rig.client.command("x", far)
 
 
 async def test_a_command_that_comes_too_late_is_not_carried_out():
@@ -178,10 +178,10 @@ async def test_a_command_that_comes_too_late_is_not_carried_out():
 
         late = MoveAbsolute(position=5.0, not_after=now_ns - 1)
         with pytest.raises(CommandExpired):
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, late)
+            await rig.client.command("x", late)
         foreign = MoveAbsolute(position=5.0, instance="another")
         with pytest.raises(CommandExpired, match="another run"):
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, foreign)
+            await rig.client.command("x", foreign)
 
         assert (await rig.client.state("x")).state is AxisState.STANDSTILL
 
@@ -190,12 +190,12 @@ async def test_the_events_tell_who_did_what_with_which_result():
     async with running_rig() as rig:
         await powered(rig)
         async with control(rig.client, "ann", "x") as held:
-            reply = await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0))
+            reply = await held.command("x", MoveAbsolute(position=90.0))
             await asyncio.sleep(0.5)
             await rig.client.stop("x")
             await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
 
-        events = await rig.client.rig_command("events", ReadEvents(axis="x"), EventList)
+        events = await rig.client.ask(ReadEvents(axis="x"))
         story = [(event.status, event.client) for event in events.events if event.command_id == reply.command_id]
         assert story == [
             (CommandStatus.ACCEPTED, "ann"),
@@ -257,12 +257,12 @@ async def test_two_daemons_on_one_rig_refuse_motion():
         other = await rig.session.declare_token("ldcn/sim/alive/second")
 
         with pytest.raises(DuplicateDaemon, match="second"):
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+            await rig.client.command("x", MoveAbsolute(position=1.0))
         assert (await rig.client.stop("x")).confirmed == ("x",)
 
         await other.close()
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-        await rig.client.command("x", Verb.RESET, Reset())
+        await rig.client.command("x", Reset())
 
 
 async def test_why_lists_everything_that_is_in_the_way():
@@ -293,7 +293,7 @@ async def test_an_error_under_a_lease_is_raised_as_itself():
     async with running_rig() as rig:
         with pytest.raises(UnknownAxis):
             async with control(rig.client, "ann", "x") as held:
-                await held.command("nowhere", Verb.POWER, Power(on=True))
+                await held.command("nowhere", Power(on=True))
 
         async with control(rig.client, "bob", "x"):
             pass  # ann's lease was given back all the same

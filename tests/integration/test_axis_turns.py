@@ -13,7 +13,7 @@ from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
-from ldcnd.model.commands import CommandReply, Halt, MoveVelocity, Power, Verb
+from ldcnd.model.commands import CommandReply, Halt, MoveVelocity, Power
 from ldcnd.model.events import CommandEvent, CommandStatus
 from ldcnd.model.samples import AxisState, LinkState
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
@@ -22,7 +22,7 @@ from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 async def at_once(rig: RunningRig, count: int) -> list[CommandReply | BaseException]:
     """Ask to close the loop so many times without waiting for answers; that takes several exchanges each time."""
     await rig.until("x", lambda state: state.link is LinkState.UP)
-    asked = [rig.client.command("x", Verb.POWER, Power(on=True, command_id=f"c{n}")) for n in range(count)]
+    asked = [rig.client.command("x", Power(on=True, command_id=f"c{n}")) for n in range(count)]
     return await asyncio.gather(*asked, return_exceptions=True)
 
 
@@ -65,7 +65,7 @@ async def test_an_event_can_be_asked_for_at_once_and_is_published_a_moment_later
         await rig.until("x", lambda state: state.link is LinkState.UP)
         loop = asyncio.get_running_loop()
         asked_ns = EPOCH_NS + round(loop.time() * 1e9)
-        reply = await rig.client.command("x", Verb.POWER, Power(on=False))
+        reply = await rig.client.command("x", Power(on=False))
         replied_ns = EPOCH_NS + round(loop.time() * 1e9)
         listed = await latest_events(rig.client, 2)
         told = [await anext(events) for _ in range(2)]
@@ -87,7 +87,7 @@ async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
         client = RigClient(client_session, "sim")
         while not (state := await client.state("x")) or state.link is not LinkState.UP:
             await asyncio.sleep(0.05)
-        await client.command("x", Verb.HALT, Halt())
+        await client.command("x", Halt())
         assert told == []
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
@@ -100,7 +100,7 @@ async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
 async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_the_wire(monkeypatch):
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
         axis = rig.daemon.rig.axis("x")
         bus = rig.daemon.rig.buses[0].bus
@@ -119,7 +119,7 @@ async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_t
 
         monkeypatch.setattr(axis.tracker, "begin", note_begin)
         monkeypatch.setattr(axis.telemetry, "state", note_state)
-        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=1.0))
+        await rig.client.command("x", MoveVelocity(velocity=1.0))
 
     assert sent_when_told[0] == sent_when_begun[0] + 1
 
@@ -128,7 +128,7 @@ async def test_who_has_the_answer_finds_the_state_that_came_of_the_command():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
         for on in (True, False, True):
-            await rig.client.command("x", Verb.POWER, Power(on=on))
+            await rig.client.command("x", Power(on=on))
             state = await rig.client.state("x")
 
             assert state is not None

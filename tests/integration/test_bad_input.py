@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
-from ldcnd.model.commands import Power, Verb
+from ldcnd.model.commands import Power
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
@@ -99,7 +99,7 @@ async def ask(rig: RunningRig, key: str, payload: bytes, encoding: str) -> dict[
 async def test_bad_input_gets_one_typed_error_and_nothing_reaches_the_wire(key, payload, encoding, code, words):
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
         before = sent_commands(rig)
 
         error = await ask(rig, key, payload, encoding)
@@ -114,7 +114,7 @@ async def test_bad_input_gets_one_typed_error_and_nothing_reaches_the_wire(key, 
 async def test_a_refusal_names_the_nearest_value():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
 
         error = await ask(rig, f"{X}/move_absolute", b'{"position": 250}', "application/json")
 

@@ -17,7 +17,7 @@ from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import LeaseHeld, SessionError, UnknownAxis
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.rig import SIMULATED
 from tests.support.session_pair import free_endpoint
@@ -58,12 +58,12 @@ async def test_a_program_without_a_loop_does_what_one_with_a_loop_does():
             assert [axis.axis for axis in rig.axes()] == ["x", "y", "z", "c"]
             assert isinstance(rig.last("x", TelemetryItem.POSITION), PositionSample)
             with pytest.raises(UnknownAxis):
-                rig.command("nowhere", Verb.POWER, Power(on=True))
+                rig.command("nowhere", Power(on=True))
             with rig.events() as events, rig.control("ann", "x", lease_s=0.5) as held:
                 with pytest.raises(LeaseHeld), rig.control("bob", "x"):
                     pass
-                held.command("x", Verb.POWER, Power(on=True))
-                move = held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=3.0, velocity=2.0))
+                held.command("x", Power(on=True))
+                move = held.command("x", MoveAbsolute(position=3.0, velocity=2.0))
                 with rig.follow(move) as motion:
                     steps = list(motion)
                 end = rig.wait_for_end("x", move.command_id)

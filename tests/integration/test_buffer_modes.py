@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.errors import StopLatched, WrongState
-from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power, Verb
+from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
 from ldcnd.model.events import CommandOutcome, CommandStatus, ReadOutcome
 from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.rig import RunningRig, running_rig
@@ -14,19 +14,19 @@ from tests.support.rig import RunningRig, running_rig
 async def moving(rig: RunningRig, target: float = 40.0) -> str:
     """Have axis x move, and return the command's id."""
     await rig.until("x", lambda state: state.link is LinkState.UP)
-    await rig.client.command("x", Verb.POWER, Power(on=True))
-    reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=target))
+    await rig.client.command("x", Power(on=True))
+    reply = await rig.client.command("x", MoveAbsolute(position=target))
     await asyncio.sleep(0.5)
     return reply.command_id
 
 
 async def outcome(rig: RunningRig, command_id: str) -> CommandOutcome:
-    return await rig.client.rig_command("outcome", ReadOutcome(command_id=command_id), CommandOutcome)
+    return await rig.client.ask(ReadOutcome(command_id=command_id))
 
 
 async def move(rig: RunningRig, position: float, mode: BufferMode) -> str:
     request = MoveAbsolute(position=position, buffer_mode=mode)
-    return (await rig.client.command("x", Verb.MOVE_ABSOLUTE, request, timeout_s=30.0)).command_id
+    return (await rig.client.command("x", request, timeout_s=30.0)).command_id
 
 
 async def position_of(rig: RunningRig) -> float:
@@ -92,10 +92,10 @@ async def test_a_stop_also_ends_what_waits():
 async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
 
         request = MoveVelocity(velocity=5.0, buffer_mode=BufferMode.ABORTING)
-        await rig.client.command("x", Verb.MOVE_VELOCITY, request)
+        await rig.client.command("x", request)
 
         assert (await rig.client.state("x")).state is AxisState.CONTINUOUS_MOTION
 

@@ -7,7 +7,7 @@ import pytest
 from ldcnd.client.events import latest_events
 from ldcnd.client.traces import arm_trace, fetch_trace, wait_for_trace
 from ldcnd.console import reading
-from ldcnd.model.events import EventList, ReadEvents
+from ldcnd.model.events import ReadEvents
 from ldcnd.model.samples import AxisState
 from ldcnd.model.traces import TakeTrace
 from tests.support.console_rig import open_page, running_console
@@ -48,7 +48,7 @@ async def test_questions_about_an_axis_are_answered(console):
 async def test_commands_go_under_the_visitor_s_name_whatever_they_say(console):
     await console.browser.post(f"{X}/power", {"on": True, "client": "another"})
 
-    events = (await console.rig.client.rig_command("events", ReadEvents(), EventList)).events
+    events = (await console.rig.client.ask(ReadEvents())).events
     assert {event.client for event in events} == {"console-1"}
 
 
@@ -59,7 +59,7 @@ async def test_moves_together_go_under_the_page_s_name_and_leases(console):
         await page.take("sim", "x", "y")
         answer = await page.post(f"{RIG}/move_together", {"moves": moves})
 
-        events = (await console.rig.client.rig_command("events", ReadEvents(), EventList)).events
+        events = (await console.rig.client.ask(ReadEvents())).events
     assert answer.document["code"] == "wrong_state"  # as the daemon says: nothing is enabled
     assert {event.axis for event in events} == {"x", "y"}
     assert {event.client for event in events} == {page.client}

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.model.rig_commands import Acquire, HolderList, LeaseReply, ListHolders
+from ldcnd.model.rig_commands import Acquire, ListHolders
 from ldcnd.model.samples import AxisState, Moving
 from tests.support.console_rig import open_page, running_console
 
@@ -19,7 +19,7 @@ async def console():
 
 
 async def holder(console, axis):
-    told = await console.rig.client.rig_command("holders", ListHolders(), HolderList)
+    told = await console.rig.client.ask(ListHolders())
     return next(each.client for each in told.holders if each.axis == axis)
 
 
@@ -107,7 +107,7 @@ async def test_a_page_is_told_when_its_control_is_lost(console):
     async with open_page(console.app, console.browser) as page:
         await page.take("sim", "x")
         force = Acquire(client="another", axes=("x",), lease_s=60, force=True)
-        await console.rig.client.rig_command("acquire", force, LeaseReply)
+        await console.rig.client.ask(force)
 
         told = await page.told()
         refused = await page.post(f"{X}/move_absolute", {"position": 1.0})

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.model.commands import Home, MoveAbsolute, MoveVelocity, Power, Reset, Verb
+from ldcnd.model.commands import Home, MoveAbsolute, MoveVelocity, Power, Reset
 from ldcnd.model.samples import AdcSample, AxisState, PositionSample, TelemetryItem, VelocitySample
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
@@ -45,7 +45,7 @@ async def a_working_day(dialect: Dialect) -> None:
         assert (await rig.until(lambda state: state.enabled)).state is AxisState.STANDSTILL
 
         # a move, and every item read back
-        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=-3.0))
+        state = await rig.done(MoveAbsolute(position=-3.0))
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
         await asyncio.sleep(1.0)  # virtual
         assert rig.position_mm == pytest.approx(-3.0, abs=0.0021)
@@ -58,31 +58,31 @@ async def a_working_day(dialect: Dialect) -> None:
         assert adc.full_scale == full_scale
 
         # home
-        state = await rig.done(Verb.HOME, Home(method="index", velocity=1.0, position=0.0))
+        state = await rig.done(Home(method="index", velocity=1.0, position=0.0))
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
 
         # stop in mid-move, forward velocities being positive
-        await rig.send(Verb.MOVE_VELOCITY, MoveVelocity(velocity=10.0))
+        await rig.send(MoveVelocity(velocity=10.0))
         await asyncio.sleep(0.5)
         velocity = await next_sample(rig, TelemetryItem.VELOCITY)
         assert isinstance(velocity, VelocitySample)
         assert velocity.value == pytest.approx(10.0, abs=2.1)
         assert (await rig.rig.client.stop(AXIS)).confirmed == (AXIS,)
         assert (await rig.until(lambda state: state.state is AxisState.STANDSTILL)).stop_latched
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
 
         # a fault, its recovery, and on with the work
-        await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0, velocity=2.0))
+        await rig.send(MoveAbsolute(position=0.0, velocity=2.0))
         condition = Condition.OVERHEAT if dialect in (LS_173AP, LS_182AP, LS_182AP_22) else Condition.MOTOR_POWER_OFF
         rig.condition(condition)
         faults = await rig.until_fault(lambda sample: sample.active)
         assert faults.first.code == ("overheat" if condition is Condition.OVERHEAT else "power_lost")
         await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
         rig.condition(condition, present=False)
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
         await rig.until(lambda state: state.state is AxisState.DISABLED)
-        await rig.send(Verb.POWER, Power(on=True))
-        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+        await rig.send(Power(on=True))
+        state = await rig.done(MoveAbsolute(position=1.0))
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
 
 

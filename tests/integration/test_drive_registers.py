@@ -9,7 +9,7 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.commands import MoveAbsolute, SetGains, SetOutputs, Verb
+from ldcnd.model.commands import MoveAbsolute, SetGains, SetOutputs
 from ldcnd.model.meta import Provenance
 from tests.support.dialect_rig import (
     AXIS,
@@ -24,13 +24,13 @@ async def test_limit_pins_become_outputs_one_by_one_and_inputs_again():
     async with dialect_rig(V4) as rig:
         await rig.until(lambda state: state.link == "up")
 
-        await rig.send(Verb.SET_OUTPUTS, SetOutputs(limit1="high"))
+        await rig.send(SetOutputs(limit1="high"))
         assert rig.drive._pins == LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT
 
-        await rig.send(Verb.SET_OUTPUTS, SetOutputs(limit2="low"))
+        await rig.send(SetOutputs(limit2="low"))
         assert rig.drive._pins == LimitPins.LIMIT1_HIGH
 
-        await rig.send(Verb.SET_OUTPUTS, SetOutputs(limit1="input", limit2="input"))
+        await rig.send(SetOutputs(limit1="input", limit2="input"))
         assert rig.drive._pins == LimitPins.LIMIT1_INPUT | LimitPins.LIMIT2_INPUT
 
 
@@ -38,10 +38,10 @@ async def test_a_new_servo_rate_divisor_keeps_velocities_what_they_are():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
 
-        await rig.send(Verb.SET_GAINS, SetGains(sr=2))
+        await rig.send(SetGains(sr=2))
         loop = asyncio.get_running_loop()
         began_s = loop.time()
-        reply = await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=10.0, velocity=10.0))
+        reply = await rig.send(MoveAbsolute(position=10.0, velocity=10.0))
         await rig.rig.client.wait_for_end(AXIS, reply.command_id)
 
         assert rig.drive.loop.gains.sr == 2
@@ -53,11 +53,11 @@ async def test_a_new_servo_rate_divisor_keeps_velocities_what_they_are():
 async def test_the_servo_rate_divisor_is_not_changed_in_motion():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=15.0, velocity=2.0))
+        await rig.send(MoveAbsolute(position=15.0, velocity=2.0))
 
         with pytest.raises(WrongState):
-            await rig.send(Verb.SET_GAINS, SetGains(sr=2))
-        await rig.send(Verb.SET_GAINS, SetGains(ki=300))
+            await rig.send(SetGains(sr=2))
+        await rig.send(SetGains(ki=300))
 
         assert (rig.drive.loop.gains.sr, rig.drive.loop.gains.ki) == (1, 300)
 
@@ -67,13 +67,13 @@ async def test_a_drive_without_current_limit_refuses_one():
         await rig.power_on()
 
         with pytest.raises(ValueOutOfRange, match="reserved on this drive"):
-            await rig.send(Verb.SET_GAINS, SetGains(cl=101))
+            await rig.send(SetGains(cl=101))
 
 
 async def test_gains_that_were_changed_survive_switching_off_and_on():
     async with dialect_rig(V4) as rig:
         await rig.until(lambda state: state.link == "up")
-        await rig.send(Verb.SET_GAINS, SetGains(kp=200, deadband=4, cl=131))
+        await rig.send(SetGains(kp=200, deadband=4, cl=131))
 
         await rig.power_on()
 
@@ -86,9 +86,9 @@ async def test_registers_say_where_their_values_come_from():
         await rig.until(lambda state: state.link == "up")
         (before,) = await rig.rig.client.axes()
         await rig.power_on()
-        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+        await rig.done(MoveAbsolute(position=1.0))
         (moved,) = await rig.rig.client.axes()
-        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+        await rig.done(MoveAbsolute(position=0.0))
         await rig.rig.client.stop(AXIS)
         (stopped,) = await rig.rig.client.axes()
 

@@ -6,8 +6,8 @@ from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.daemon.command.events import KEPT_EVENTS
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
-from ldcnd.model.commands import Halt, Power, Verb
-from ldcnd.model.events import CommandStatus, EventList, ReadEvents
+from ldcnd.model.commands import Halt, Power
+from ldcnd.model.events import CommandStatus, ReadEvents
 from ldcnd.model.samples import LinkState
 from tests.support.rig import RunningRig, running_rig
 
@@ -17,7 +17,7 @@ async def commands(rig: RunningRig, count: int, axis: str = "x", first: int = 0)
     await rig.until(axis, lambda state: state.link is LinkState.UP)
     ids = [f"c{number}" for number in range(first, first + count)]
     for command_id in ids:
-        await rig.client.command(axis, Verb.POWER, Power(on=False, command_id=command_id))
+        await rig.client.command(axis, Power(on=False, command_id=command_id))
     return ids
 
 
@@ -107,7 +107,7 @@ async def test_a_list_of_events_fits_into_one_reply_and_all_of_them_are_fetched_
     async with running_rig() as rig:
         ids = await commands(rig, 100)
         request = ReadEvents(count=1000)
-        page = await rig.client.rig_command("events", request, EventList)
+        page = await rig.client.ask(request)
 
         fetched = await latest_events(rig.client, 150)
         of_x = await latest_events(rig.client, 1000, "x")
@@ -138,7 +138,7 @@ async def test_nobody_is_asked_while_events_come_in_order():
 async def test_a_halt_of_an_axis_at_rest_is_an_event_as_well():
     async with running_rig() as rig, follow_events(rig.client) as events:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.HALT, Halt(client="ann", command_id="h"))
+        await rig.client.command("x", Halt(client="ann", command_id="h"))
         event = await anext(events)
 
     assert (event.verb, event.client) == ("halt", "ann")
@@ -147,7 +147,7 @@ async def test_a_halt_of_an_axis_at_rest_is_an_event_as_well():
 async def test_an_event_tells_over_whose_link_its_command_came():
     async with running_rig() as rig, rig.broker.session("ada") as session, follow_events(rig.client) as events:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await RigClient(session, "sim").command("x", Verb.POWER, Power(on=False, client="bob"))
+        await RigClient(session, "sim").command("x", Power(on=False, client="bob"))
         event = await anext(events)
 
     assert (event.client, event.login) == ("bob", "ada")

@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.drivers.ldcn.faults import FaultCode
 from ldcnd.errors import NotReferenced, WrongState
-from ldcnd.model.commands import MoveAbsolute, Power, Reset, SetPosition, Stop, Verb
+from ldcnd.model.commands import MoveAbsolute, Power, Reset, SetPosition, Stop
 from ldcnd.model.samples import AxisState, LinkState, Moving
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
@@ -26,7 +26,7 @@ logosol = pytest.mark.parametrize("dialect", [LS_173AP, LS_182AP], ids=lambda di
 async def trip(rig: DialectRig, condition: Condition) -> None:
     """Let something switch the moving motor off; it is over again when the drive has noticed."""
     await rig.power_on()
-    await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+    await rig.send(FAR)
     await asyncio.sleep(0.3)
     rig.condition(condition)
     await rig.until_fault(lambda faults: faults.active)
@@ -46,7 +46,7 @@ async def test_a_stop_of_a_tripped_drive_leaves_the_fault_its_name(dialect, cond
     async with dialect_rig(dialect) as rig:
         await trip(rig, condition)
 
-        await rig.send(Verb.STOP, Stop())
+        await rig.send(Stop())
 
         assert await codes_later(rig) == [LATCHED[condition]]
 
@@ -56,7 +56,7 @@ async def test_power_off_of_a_tripped_drive_leaves_the_fault_its_name(condition)
     async with dialect_rig(LS_182AP) as rig:
         await trip(rig, condition)
 
-        await rig.send(Verb.POWER, Power(on=False))
+        await rig.send(Power(on=False))
 
         assert await codes_later(rig) == [LATCHED[condition]]
 
@@ -66,27 +66,27 @@ async def test_a_stop_after_a_position_error_leaves_the_fault_its_name(dialect):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
         await trip(rig, Condition.STALLED)
 
-        await rig.send(Verb.STOP, Stop())
+        await rig.send(Stop())
 
         assert await codes_later(rig) == ["position_error"]
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
         assert await codes_later(rig) == []
 
 
 async def test_a_position_that_was_lost_stays_lost_after_a_stop():
     async with dialect_rig(LS_182AP) as rig:
         await trip(rig, Condition.ENCODER_LOSS)
-        await rig.send(Verb.STOP, Stop())
+        await rig.send(Stop())
         await asyncio.sleep(0.5)
 
         with pytest.raises(WrongState, match="its position is lost"):
-            await rig.send(Verb.SET_POSITION, SetPosition(position=3.0))
+            await rig.send(SetPosition(position=3.0))
 
-        await rig.send(Verb.RESET, Reset())
-        await rig.send(Verb.POWER, Power(on=True))
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
         with pytest.raises(NotReferenced):
-            await rig.send(Verb.MOVE_ABSOLUTE, FAR)
-        await rig.send(Verb.SET_POSITION, SetPosition(position=3.0))
+            await rig.send(FAR)
+        await rig.send(SetPosition(position=3.0))
         assert (await rig.rig.client.state(AXIS)).referenced
 
 
@@ -112,10 +112,10 @@ async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(co
         await later.until(lambda state: state.state is AxisState.ERROR_STOP)
         assert await codes_later(later) == ["latched_fault"]
 
-        await later.send(Verb.STOP, Stop())
+        await later.send(Stop())
         assert await codes_later(later) == ["latched_fault"]
 
-        await later.send(Verb.RESET, Reset())
+        await later.send(Reset())
         assert await codes_later(later) == []
 
 
@@ -146,8 +146,8 @@ async def test_motor_power_that_is_off_while_the_axis_is_disabled_stops_nothing(
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert [(fault.code, fault.stops) for fault in sample.active] == [("power_lost", False)]
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
         assert (await rig.rig.client.state(AXIS)).state is AxisState.DISABLED
         rig.condition(Condition.MOTOR_POWER_OFF, present=False)
-        await rig.send(Verb.POWER, Power(on=True))
-        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).last_error is None
+        await rig.send(Power(on=True))
+        assert (await rig.done(FAR)).last_error is None

@@ -18,7 +18,6 @@ from ldcnd.model.commands import (
     SetGains,
     SetPosition,
     SetPwm,
-    Verb,
 )
 from ldcnd.model.samples import AxisState
 from ldcnd.sim.ldcn.power import Condition
@@ -67,7 +66,7 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
     lost = code is FaultCode.ENCODER_OR_HALL
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
-        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await rig.send(FAR)
         await asyncio.sleep(0.5)
 
         rig.condition(condition)
@@ -82,18 +81,18 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
             f"move_absolute: the drive reports a fault{'; its position is lost' * lost}",
         )
         with pytest.raises(WrongState) as refusal:
-            await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+            await rig.send(FAR)
         assert code.remedy in refusal.value.message
 
         rig.condition(condition, present=False)
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
         recovered = await rig.until(lambda state: state.state is AxisState.DISABLED)
         assert (await rig.until_fault(lambda faults: not faults.active)).first is None
         assert not recovered.enabled
-        await rig.send(Verb.POWER, Power(on=True))
+        await rig.send(Power(on=True))
         if lost:
             return
-        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
 
 
 # -- Pic_ae = 0: what is wrong at present ------------------------------------------------------------------------------
@@ -117,10 +116,10 @@ async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, conditi
 
         assert (codes(sample), sample.first.text) == ([code], code.remedy)
         with pytest.raises(DriveFault) as refusal:
-            await rig.send(Verb.RESET, Reset())
+            await rig.send(Reset())
         assert code.remedy in refusal.value.message
         rig.condition(condition, present=False)
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
         assert (await rig.until(lambda state: state.state is AxisState.DISABLED)).state is AxisState.DISABLED
 
 
@@ -131,7 +130,7 @@ async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, conditi
 async def test_a_jam_ends_in_a_position_error(dialect):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
         await rig.power_on()
-        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await rig.send(FAR)
         await asyncio.sleep(0.5)
 
         rig.condition(Condition.STALLED)
@@ -140,16 +139,16 @@ async def test_a_jam_ends_in_a_position_error(dialect):
         assert (codes(sample), sample.first.text) == (["position_error"], FaultCode.POSITION_ERROR.remedy)
         assert (await rig.until(lambda state: state.state is AxisState.ERROR_STOP)).enabled is False
         rig.condition(Condition.STALLED, present=False)
-        await rig.send(Verb.RESET, Reset())
-        await rig.send(Verb.POWER, Power(on=True))
-        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
+        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
 
 
 @named(LOGOSOL)
 async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
-        await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=200, velocity=2.0))
+        await rig.send(MoveAnalog(target=200, velocity=2.0))
         await asyncio.sleep(0.5)
 
         rig.condition(Condition.SENSOR_LOST)
@@ -158,9 +157,9 @@ async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
         assert (codes(sample), sample.first.text) == (["sensor_fault"], FaultCode.SENSOR_FAULT.remedy)
         await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
         rig.condition(Condition.SENSOR_LOST, present=False)
-        await rig.send(Verb.RESET, Reset())
-        await rig.send(Verb.POWER, Power(on=True))
-        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
+        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
 
 
 @named(LOGOSOL)
@@ -169,7 +168,7 @@ async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
         await rig.power_on()
         rig.condition(Condition.SENSOR_LOST)
 
-        state = await rig.done(Verb.MOVE_ABSOLUTE, FAR)
+        state = await rig.done(FAR)
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
 
@@ -182,24 +181,24 @@ async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_ax
     async with dialect_rig(dialect, replace(PLANT, index_width_counts=40)) as rig:
         await rig.power_on()
         assert (await rig.rig.client.state(AXIS)).referenced
-        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await rig.send(FAR)
         await asyncio.sleep(0.5)
 
         rig.condition(Condition.ENCODER_LOSS)
         state = await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
         with pytest.raises(WrongState, match="its position is lost") as refusal:
-            await rig.send(Verb.SET_POSITION, SetPosition(position=3.0))
+            await rig.send(SetPosition(position=3.0))
         rig.condition(Condition.ENCODER_LOSS, present=False)
-        await rig.send(Verb.RESET, Reset())
-        await rig.send(Verb.POWER, Power(on=True))
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
         with pytest.raises(NotReferenced):
-            await rig.send(Verb.MOVE_ABSOLUTE, FAR)
-        homed = await rig.done(Verb.HOME, Home(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
+            await rig.send(FAR)
+        homed = await rig.done(Home(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
 
         assert not state.referenced
         assert refusal.value.remedy == "send reset first"
         assert (homed.referenced, homed.last_error) == (True, None)
-        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
 
 
 @named((V1, LS_182AP))
@@ -207,19 +206,19 @@ async def test_a_counter_that_wrapped_means_nothing_before_a_new_reference(diale
     async with dialect_rig(dialect, pwm={"duty": 0.1}, acceleration=2000) as rig:
         await rig.power_on()
         rig.drive.loop.renumber((1 << 31) - 500)
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there
+        await rig.send(SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there
         await rig.until_fault(lambda faults: faults.active)
         await rig.until(lambda state: state.command is None)
-        await rig.send(Verb.POWER, Power(on=True))
+        await rig.send(Power(on=True))
 
         with pytest.raises(NotReferenced):
-            await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+            await rig.send(MoveAbsolute(position=0.0))
         with pytest.raises(WrongState, match="its position is lost"):
-            await rig.send(Verb.SET_POSITION, SetPosition(position=3.0))
-        await rig.send(Verb.RESET, Reset())
-        await rig.send(Verb.SET_POSITION, SetPosition(position=3.0))
+            await rig.send(SetPosition(position=3.0))
+        await rig.send(Reset())
+        await rig.send(SetPosition(position=3.0))
         where = rig.position_mm
-        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=4.0))
+        state = await rig.done(MoveAbsolute(position=4.0))
 
         assert (state.state, state.referenced) == (AxisState.STANDSTILL, True)
         assert rig.position_mm == pytest.approx(where + 1.0, abs=0.1)  # it was still settling
@@ -231,12 +230,12 @@ async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dia
     async with dialect_rig(dialect, far_index, pwm={"duty": 0.1}, acceleration=2000) as rig:
         await rig.power_on()
         rig.drive.loop.renumber((1 << 31) - 500)
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.1, duration_s=0.3))
+        await rig.send(SetPwm(duty=0.1, duration_s=0.3))
         await rig.until_fault(lambda faults: faults.active)
         await rig.until(lambda state: state.command is None)
-        await rig.send(Verb.POWER, Power(on=True))
+        await rig.send(Power(on=True))
 
-        homed = await rig.done(Verb.HOME, Home(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
+        homed = await rig.done(Home(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
 
         assert (homed.referenced, homed.last_error) == (True, None)
         assert not (await rig.until_fault(lambda faults: not faults.active)).active
@@ -249,7 +248,7 @@ async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dia
 async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
-        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await rig.send(FAR)
         await asyncio.sleep(0.5)
 
         rig.condition(Condition.MOTOR_POWER_OFF)
@@ -262,9 +261,9 @@ async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dia
 
         assert rig.position_mm == pytest.approx(where, abs=0.01)
         assert (await rig.rig.client.state(AXIS)).state is AxisState.ERROR_STOP
-        await rig.send(Verb.RESET, Reset())
-        await rig.send(Verb.POWER, Power(on=True))
-        assert (await rig.done(Verb.MOVE_ABSOLUTE, FAR)).state is AxisState.STANDSTILL
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
+        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
 
 
 @named((V1, V4, SC))
@@ -273,13 +272,13 @@ async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_clo
     async with dialect_rig(dialect, hard_stop, gains=GAINS | {"cl": 101, "el": 16_000}) as rig:
         await rig.power_on()
 
-        await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=3.0, velocity=5.0))
+        await rig.send(MoveAbsolute(position=3.0, velocity=5.0))
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert (codes(sample), sample.first.stops) == (["current_limit"], False)
         assert (await rig.until(lambda state: state.command is None)).state is AxisState.STANDSTILL
-        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
-        await rig.send(Verb.RESET, Reset())
+        await rig.done(MoveAbsolute(position=0.0))
+        await rig.send(Reset())
         assert (await rig.until_fault(lambda faults: not faults.active)).first is None
         assert rig.drive.loop.servo_on
 
@@ -293,7 +292,7 @@ async def test_a_counter_that_wraps_is_a_warning(dialect):
         await rig.power_on()
         rig.drive.loop.renumber((1 << 31) - 500)
 
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there
+        await rig.send(SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert (codes(sample), sample.first.stops) == (["position_wrap"], False)
@@ -313,7 +312,7 @@ async def test_a_late_servo_cycle_is_a_warning_that_reset_clears(dialect):
 
         assert (codes(sample), sample.first.stops) == (["servo_overrun"], False)
         assert (await rig.rig.client.state(AXIS)).state is AxisState.STANDSTILL
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
         assert (await rig.until_fault(lambda faults: not faults.active)).first is None
         assert rig.drive.loop.servo_on
 
@@ -325,7 +324,7 @@ async def test_the_first_cause_is_kept_while_others_come_and_go():
         await rig.until_fault(lambda faults: faults.active)
 
         with pytest.raises(DriveFault):
-            await rig.send(Verb.RESET, Reset())
+            await rig.send(Reset())
         rig.condition(Condition.STOP_INPUT)
         rig.condition(Condition.OVERHEAT, present=False)
         sample = await rig.until_fault(lambda faults: codes(faults) == ["stop_input"])
@@ -353,7 +352,7 @@ async def test_reset_follows_the_printed_order_and_closes_nothing():
         await rig.until_fault(lambda faults: faults.active)
         rig.condition(Condition.OVERCURRENT, present=False)
 
-        await rig.send(Verb.RESET, Reset())
+        await rig.send(Reset())
 
         assert (rig.drive.stage.enabled, rig.drive.stage.latched, rig.drive.loop.servo_on) == (False, None, False)
 
@@ -364,7 +363,7 @@ async def test_closing_the_loop_over_a_standing_cause_is_refused_with_its_name()
         rig.condition(Condition.ENCODER_LOSS)  # not shown while the power driver is off
 
         with pytest.raises(DriveFault, match="encoder or Hall signals are lost"):
-            await rig.send(Verb.POWER, Power(on=True))
+            await rig.send(Power(on=True))
 
         sample = await rig.until_fault(lambda faults: faults.active)
         assert codes(sample) == ["encoder_or_hall"]
@@ -384,9 +383,9 @@ async def test_a_loop_that_opens_without_a_reason_is_a_fault_of_its_own():
 async def test_a_position_error_limit_of_0_says_so_at_power_on():
     async with dialect_rig(V4) as rig:
         await rig.until(lambda state: state.link == "up")
-        await rig.send(Verb.SET_GAINS, SetGains(el=0))
-        await rig.send(Verb.POWER, Power(on=True))
-        await rig.send(Verb.MOVE_ABSOLUTE, FAR)
+        await rig.send(SetGains(el=0))
+        await rig.send(Power(on=True))
+        await rig.send(FAR)
 
         sample = await rig.until_fault(lambda faults: faults.active)
 

@@ -29,7 +29,7 @@ from ldcnd.errors import LeaseExpired, OutcomeUnknown, SessionError
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset, Verb
+from ldcnd.model.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState, PositionSample, StateSample
 from ldcnd.pki.access import Role
@@ -182,8 +182,8 @@ async def insist(ask: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
 
 async def ready(client: RigClient) -> float:
     """Clear the latch of x, close its loop, and return where it stands."""
-    await insist(lambda: client.command("x", Verb.RESET, Reset()))
-    await insist(lambda: client.command("x", Verb.POWER, Power(on=True)))
+    await insist(lambda: client.command("x", Reset()))
+    await insist(lambda: client.command("x", Power(on=True)))
     async with asyncio.timeout(WITHIN_S), client.samples("x", "*") as samples:
         standing = False
         async for _, sample in samples:
@@ -239,7 +239,7 @@ async def test_roles_hold_across_routers(site: SiteNetwork) -> None:
         opened = await client.state("x")
         stopped, told = await at_the_desk(site, "vic", "axis", "stop", "x", "--rig", "mill")
         latched = await client.state("x")
-        await client.command("x", Verb.RESET, Reset())  # the tests that follow find the fleet well
+        await client.command("x", Reset())  # the tests that follow find the fleet well
 
     assert untouched
     assert opened
@@ -258,7 +258,7 @@ async def test_a_cut_link_ends_a_lease_and_what_happened_meanwhile_is_told_after
         async with follow_events(client, "x") as events:
             async with control(client, "console", "x", lease_s=1.0) as held:
                 jog = MoveVelocity(velocity=2.0, command_id="jog")
-                await held.command("x", Verb.MOVE_VELOCITY, jog)
+                await held.command("x", jog)
                 site.network.cut("gate1", "gate2")
                 try:
                     await well(session, site, "lathe")
@@ -267,7 +267,7 @@ async def test_a_cut_link_ends_a_lease_and_what_happened_meanwhile_is_told_after
                 await well(session, site, "mill", "lathe")
                 again = MoveVelocity(velocity=2.0)
                 with pytest.raises(LeaseExpired):
-                    await insist(lambda: held.command("x", Verb.MOVE_VELOCITY, again))
+                    await insist(lambda: held.command("x", again))
             state = await client.state("x")
             told = await events_of(events, "jog", CommandStatus.ABORTED)
 
@@ -296,7 +296,7 @@ async def test_a_router_killed_under_load_costs_no_event_and_repeats_no_move(sit
 
         async def moved(number: int) -> CommandReply:
             request = MoveRelative(distance=STEP, command_id=f"{run}-load-{number}", instance=run)
-            reply = await insist(lambda: client.command("x", Verb.MOVE_RELATIVE, request, timeout_s=0.5))
+            reply = await insist(lambda: client.command("x", request, timeout_s=0.5))
             await insist(lambda: client.wait_for_end("x", reply.command_id))
             return reply
 

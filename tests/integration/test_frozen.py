@@ -12,8 +12,8 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import OutcomeUnknown, StopLatched
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
-from ldcnd.model.events import CommandStatus, EventList, ReadEvents
+from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.model.events import CommandStatus, ReadEvents
 from ldcnd.model.samples import AxisState, PositionSample, StateSample, TelemetryItem
 from tests.support.process import ROOT, answering, client, daemon, free_port, process
 
@@ -37,14 +37,14 @@ from ldcnd.model.commands import MoveVelocity, Power, Verb
 async def main():
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:
         async with control(RigClient(session, "sim"), "jogger", "x", lease_s=float(sys.argv[2])) as held:
-            await held.command("x", Verb.POWER, Power(on=True))
-            await held.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=5.0))
+            await held.command("x", Power(on=True))
+            await held.command("x", MoveVelocity(velocity=5.0))
             print("jogging", flush=True)
             await asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline)
             code = "outcome_unknown"  # while the link that the freeze has cost is made again
             while code in ("outcome_unknown", "session_failed"):
                 try:
-                    await held.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=-5.0))
+                    await held.command("x", MoveVelocity(velocity=-5.0))
                     code = "accepted"
                 except LdcndError as error:
                     code = error.code
@@ -91,12 +91,12 @@ async def test_a_frozen_daemon_does_not_carry_out_what_its_client_gave_up():
         async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
             rig = RigClient(session, "sim")
             async with control(rig, "ann", "x", lease_s=LEASE_S) as held:
-                await held.command("x", Verb.POWER, Power(on=True))
+                await held.command("x", Power(on=True))
 
                 running.send_signal(signal.SIGSTOP)
                 move = MoveAbsolute(position=50.0, command_id="given-up")
                 with pytest.raises(OutcomeUnknown):
-                    await held.command("x", Verb.MOVE_ABSOLUTE, move, timeout_s=0.5)
+                    await held.command("x", move, timeout_s=0.5)
                 await asyncio.sleep(LEASE_S)
                 running.send_signal(signal.SIGCONT)
 
@@ -116,8 +116,8 @@ async def test_the_events_of_a_refused_move_reach_those_who_ask_later():
         await rig.stop("x")
 
         with pytest.raises(StopLatched):
-            await rig.command("x", Verb.POWER, Power(on=True))
+            await rig.command("x", Power(on=True))
 
-        events = (await rig.rig_command("events", ReadEvents(axis="x"), EventList)).events
+        events = (await rig.ask(ReadEvents(axis="x"))).events
         assert events[-1].status is CommandStatus.REFUSED
         assert events[-1].code == "stop_latched"

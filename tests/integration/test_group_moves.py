@@ -7,8 +7,8 @@ import pytest
 from ldcnd.daemon.command.dispatch import move_together
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import MalformedRequest, NotSupported, PositionLimit, StopLatched, UnknownAxis
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
-from ldcnd.model.rig_commands import AxisMove, MoveTogether, MoveTogetherReply
+from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.model.rig_commands import AxisMove, MoveTogether
 from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
@@ -24,14 +24,14 @@ def chain_of():
 async def powered(rig, *names):
     for name in names:
         await rig.until(name, lambda state: state.link is LinkState.UP)
-        await rig.client.command(name, Verb.POWER, Power(on=True))
+        await rig.client.command(name, Power(on=True))
 
 
 async def together(rig, **targets):
     """Ask for a group move."""
     axes = rig.daemon.rig.axes
     moves = {name: MoveAbsolute(position=target) for name, target in targets.items()}
-    return await move_together(rig.daemon.rig, moves, lambda name, verb, share: axes[name].execute(verb, share))
+    return await move_together(rig.daemon.rig, moves, lambda name, share: axes[name].execute(share))
 
 
 def starts(rig):
@@ -111,7 +111,7 @@ async def test_a_query_of_the_rig_starts_a_group_once():
         await powered(rig, "x", "y")
         request = MoveTogether(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="y", position=6.0)))
 
-        reply = await rig.client.rig_command("move_together", request, MoveTogetherReply)
+        reply = await rig.client.ask(request)
 
     assert [part.axis for part in reply.replies] == ["x", "y"]
     assert [packet.address for packet in starts(rig)] == [0x81]
@@ -124,6 +124,6 @@ async def test_an_axis_named_twice_is_refused():
         request = MoveTogether(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="x", position=6.0)))
 
         with pytest.raises(MalformedRequest):
-            await rig.client.rig_command("move_together", request, MoveTogetherReply)
+            await rig.client.ask(request)
 
     assert starts(rig) == []

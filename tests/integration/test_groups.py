@@ -10,7 +10,7 @@ from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.line import GroupSpec, LineSpec, StartPolicy
 from ldcnd.errors import ConfigError, DriveFault, NotSupported, OutcomeUnknown, StopLatched, ValueOutOfRange, WrongState
-from ldcnd.model.commands import HomeMethod, MoveAbsolute, Power, Verb
+from ldcnd.model.commands import HomeMethod, MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -219,9 +219,9 @@ async def test_the_stop_of_a_rig_begins_with_one_packet_for_all_its_drives():
     async with rig_on(chain, simulated_config()) as rig:
         for name in ("x", "y", "z", "c"):
             await rig.until(name, lambda state: state.link is LinkState.UP)
-            await rig.client.command(name, Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))
-        await rig.client.command("c", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=500.0))
+            await rig.client.command(name, Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=50.0))
+        await rig.client.command("c", MoveAbsolute(position=500.0))
         await asyncio.sleep(0.5)
         before = len(rig.sent)
 
@@ -240,7 +240,7 @@ async def test_the_stop_of_a_rig_closes_no_open_loop():
     async with rig_on(chain, simulated_config()) as rig:
         for name in ("x", "z"):
             await rig.until(name, lambda state: state.link is LinkState.UP)
-            await rig.client.command(name, Verb.POWER, Power(on=True))
+            await rig.client.command(name, Power(on=True))
 
         before = len(rig.sent)
         await rig.client.stop()

@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.drivers.ldcn.controls import HomingControl
 from ldcnd.errors import BusError, MalformedRequest, NotSupported, PositionLimit
-from ldcnd.model.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs, Verb
+from ldcnd.model.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from tests.support.dialect_rig import (
@@ -57,7 +57,7 @@ async def test_a_limit_switch_marks_the_reference(dialect, method, velocity):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method=method, velocity=velocity, position=100.0))
+        state = await rig.done(Home(method=method, velocity=velocity, position=100.0))
 
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
         switch_mm = 20.0 if velocity > 0 else -20.0
@@ -69,7 +69,7 @@ async def test_the_index_marks_the_reference(dialect):
     async with dialect_rig(dialect, WIDE_INDEX) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="index", velocity=1.0, position=7.0))
+        state = await rig.done(Home(method="index", velocity=1.0, position=7.0))
 
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
         assert await offset(rig) == pytest.approx(7.0 - 0.7, abs=0.005)
@@ -80,7 +80,7 @@ async def test_an_excess_position_error_at_a_hard_stop_marks_the_reference(diale
     async with dialect_rig(dialect, HARD_STOP, gains=GAINS | {"el": 800, "ol": 120}) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="position_error", velocity=5.0, position=50.0))
+        state = await rig.done(Home(method="position_error", velocity=5.0, position=50.0))
 
         assert (state.state, state.referenced, state.enabled, state.last_error) == (
             AxisState.STANDSTILL,
@@ -97,9 +97,7 @@ async def test_current_limiting_at_a_hard_stop_marks_the_reference(dialect):
     async with dialect_rig(dialect, HARD_STOP, gains=GAINS | {"cl": 101, "el": 16_000}) as rig:
         await rig.power_on()
 
-        state = await rig.done(
-            Verb.HOME, Home(method="current", velocity=5.0, acceleration=50.0, position=50.0, stop="abrupt")
-        )
+        state = await rig.done(Home(method="current", velocity=5.0, acceleration=50.0, position=50.0, stop="abrupt"))
 
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
         assert await offset(rig) == pytest.approx(50.0 - 20.5, abs=0.1)
@@ -111,7 +109,7 @@ async def test_a_drive_without_limit_capture_refuses_it(dialect):
         await rig.power_on()
 
         with pytest.raises(NotSupported, match="it can on index, position_error"):
-            await rig.send(Verb.HOME, Home(method="forward_limit", velocity=5.0))
+            await rig.send(Home(method="forward_limit", velocity=5.0))
 
 
 @named((V1, V2, V3, LS_182AP))
@@ -120,7 +118,7 @@ async def test_the_motor_stops_and_holds_at_home(dialect, stop):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="forward_limit", velocity=10.0, stop=stop))
+        state = await rig.done(Home(method="forward_limit", velocity=10.0, stop=stop))
 
         assert (state.state, state.enabled) == (AxisState.STANDSTILL, True)
         assert rig.drive.loop.servo_on
@@ -131,7 +129,7 @@ async def test_the_loop_can_be_opened_at_home(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="forward_limit", velocity=10.0, stop="off", position=3.0))
+        state = await rig.done(Home(method="forward_limit", velocity=10.0, stop="off", position=3.0))
 
         assert (state.state, state.enabled, state.referenced, state.last_error) == (
             AxisState.DISABLED,
@@ -149,7 +147,7 @@ async def test_an_axis_that_stands_on_its_switch_moves_off_it_first(dialect):
         await rig.power_on()
         assert rig.drive.shaft.on_reverse_limit
 
-        state = await rig.done(Verb.HOME, Home(method="reverse_limit", velocity=-5.0, position=0.0))
+        state = await rig.done(Home(method="reverse_limit", velocity=-5.0, position=0.0))
 
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
         assert await offset(rig) == pytest.approx(20.0, abs=0.02)
@@ -160,7 +158,7 @@ async def test_moving_off_a_switch_that_never_releases_is_bounded():
     async with dialect_rig(V4, stuck) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="reverse_limit", velocity=-5.0, distance=4.0))
+        state = await rig.done(Home(method="reverse_limit", velocity=-5.0, distance=4.0))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, "home: no reverse_limit within 4 mm")
         await asyncio.sleep(1.0)  # virtual
@@ -172,7 +170,7 @@ async def test_a_switch_that_is_active_low_is_recognised():
     async with dialect_rig(V4, home=home) as rig:  # the input is low all over the travel: "on the switch" everywhere
         await rig.power_on()
 
-        await rig.send(Verb.HOME, Home(timeout_s=2.0))
+        await rig.send(Home(timeout_s=2.0))
         await asyncio.sleep(0.5)
 
         assert rig.position_mm > 0.5  # it moves off, not on
@@ -182,7 +180,7 @@ async def test_home_can_move_on_to_a_position():
     async with dialect_rig(LS_182AP_22) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="forward_limit", velocity=5.0, position=20.0, move_to=12.5))
+        state = await rig.done(Home(method="forward_limit", velocity=5.0, position=20.0, move_to=12.5))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
         await asyncio.sleep(1.0)  # virtual
@@ -194,7 +192,7 @@ async def test_the_axis_is_homing_from_the_first_leg_to_the_last():
     async with dialect_rig(LS_182AP, start_counts=-20_500.0) as rig:
         await rig.power_on()
         async with rig.rig.client.samples(AXIS, TelemetryItem.STATE) as states:
-            await rig.done(Verb.HOME, Home(method="reverse_limit", velocity=-5.0, position=0.0, move_to=5.0))
+            await rig.done(Home(method="reverse_limit", velocity=-5.0, position=0.0, move_to=5.0))
             async with asyncio.timeout(60):
                 while not seen or seen[-1] is not AxisState.STANDSTILL or AxisState.HOMING not in seen:
                     seen.append((await anext(states))[1].state)
@@ -206,7 +204,7 @@ async def test_a_search_ends_at_its_distance():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="forward_limit", velocity=5.0, distance=3.0))
+        state = await rig.done(Home(method="forward_limit", velocity=5.0, distance=3.0))
 
         assert (state.state, state.referenced) == (AxisState.STANDSTILL, False)
         assert state.last_error == "home: no forward_limit within 3 mm"
@@ -221,7 +219,7 @@ async def test_a_search_ends_at_its_time_out(dialect):
         loop = asyncio.get_running_loop()
         began_s = loop.time()
 
-        state = await rig.done(Verb.HOME, Home(method="forward_limit", velocity=1.0, timeout_s=3.0))
+        state = await rig.done(Home(method="forward_limit", velocity=1.0, timeout_s=3.0))
 
         assert state.last_error == "home: no forward_limit within 3 s"
         assert 3.0 < loop.time() - began_s < 3.5
@@ -231,11 +229,11 @@ async def test_a_search_ends_at_its_time_out(dialect):
 async def test_halt_cancels_a_search_and_disarms_the_drive(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
-        reply = await rig.send(Verb.HOME, Home(method="forward_limit", velocity=5.0))
+        reply = await rig.send(Home(method="forward_limit", velocity=5.0))
         await asyncio.sleep(1.0)
         assert rig.drive.loop.search is not None
 
-        state = await rig.done(Verb.HALT, Halt())
+        state = await rig.done(Halt())
 
         assert state.state is AxisState.STANDSTILL
         assert state.last_error == "home: aborted by halt"
@@ -247,7 +245,7 @@ async def test_halt_cancels_a_search_and_disarms_the_drive(dialect):
 async def test_a_stop_ends_a_search_for_good():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        await rig.send(Verb.HOME, Home(method="forward_limit", velocity=5.0, move_to=0.0))
+        await rig.send(Home(method="forward_limit", velocity=5.0, move_to=0.0))
         await asyncio.sleep(1.0)
 
         await rig.rig.client.stop(AXIS)
@@ -265,7 +263,7 @@ async def test_polls_between_the_packets_of_a_command_do_not_disturb_it(rate):
     async with dialect_rig(V2, start_counts=-20_500.0, rates=rates) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.HOME, Home(method="reverse_limit", velocity=-5.0, move_to=1.0))
+        state = await rig.done(Home(method="reverse_limit", velocity=-5.0, move_to=1.0))
 
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
         assert await offset(rig) == pytest.approx(20.0, abs=0.02)
@@ -281,7 +279,7 @@ async def test_on_a_bad_line_a_search_ends_with_the_right_reference_or_with_a_re
         await asyncio.sleep(5.0 - asyncio.get_running_loop().time())
 
         with contextlib.suppress(BusError):
-            await rig.send(Verb.HOME, Home(method="reverse_limit", velocity=-5.0, timeout_s=10, move_to=1.0))
+            await rig.send(Home(method="reverse_limit", velocity=-5.0, timeout_s=10, move_to=1.0))
         await asyncio.sleep(0.1)
         state = await rig.until(lambda state: state.command is None and state.state is not AxisState.DISCRETE_MOTION)
 
@@ -297,7 +295,7 @@ async def test_every_search_ends_in_the_drive_even_without_a_host():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
 
-        await rig.send(Verb.HOME, Home(method="index", velocity=1.0, timeout_s=5.0))
+        await rig.send(Home(method="index", velocity=1.0, timeout_s=5.0))
 
         assert rig.drive.loop.trajectory.mode == "trapezoidal"
 
@@ -306,7 +304,7 @@ async def test_the_stop_is_left_to_the_drive_wherever_it_can():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
 
-        await rig.send(Verb.HOME, Home(method="forward_limit", velocity=5.0, stop="abrupt"))
+        await rig.send(Home(method="forward_limit", velocity=5.0, stop="abrupt"))
 
         assert rig.drive.loop.search.control == HomingControl.LIMIT2 | HomingControl.STOP_ABRUPT
 
@@ -314,10 +312,10 @@ async def test_the_stop_is_left_to_the_drive_wherever_it_can():
 async def test_the_lock_after_homing_on_a_limit_is_lifted_by_the_next_move():
     async with dialect_rig(LS_182AP_22) as rig:
         await rig.power_on()
-        await rig.done(Verb.HOME, Home(method="forward_limit", velocity=5.0, position=20.0))
+        await rig.done(Home(method="forward_limit", velocity=5.0, position=20.0))
         assert rig.drive._locked
 
-        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=10.0))
+        await rig.done(MoveAbsolute(position=10.0))
 
         await asyncio.sleep(1.0)  # virtual
         assert rig.position_mm == pytest.approx(10.0, abs=0.02)
@@ -326,10 +324,10 @@ async def test_the_lock_after_homing_on_a_limit_is_lifted_by_the_next_move():
 async def test_homing_on_a_pin_that_is_an_output_is_refused():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_OUTPUTS, SetOutputs(limit2="high"))
+        await rig.send(SetOutputs(limit2="high"))
 
         with pytest.raises(Exception, match="the forward_limit pin is an output"):
-            await rig.send(Verb.HOME, Home(method="forward_limit", velocity=5.0))
+            await rig.send(Home(method="forward_limit", velocity=5.0))
 
         assert rig.drive.loop.search is None
 
@@ -339,7 +337,7 @@ async def test_opening_the_loop_and_moving_on_exclude_each_other():
         await rig.power_on()
 
         with pytest.raises(MalformedRequest, match="both open the loop and move"):
-            await rig.send(Verb.HOME, Home(method="index", velocity=1.0, stop="off", move_to=1.0))
+            await rig.send(Home(method="index", velocity=1.0, stop="off", move_to=1.0))
 
 
 async def test_moving_on_beyond_a_software_limit_is_refused_before_the_search():
@@ -347,6 +345,6 @@ async def test_moving_on_beyond_a_software_limit_is_refused_before_the_search():
         await rig.power_on()
 
         with pytest.raises(PositionLimit):
-            await rig.send(Verb.HOME, Home(method="index", velocity=1.0, move_to=11.0))
+            await rig.send(Home(method="index", velocity=1.0, move_to=11.0))
 
         assert rig.position_mm == pytest.approx(0.0, abs=0.02)

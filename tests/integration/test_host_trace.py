@@ -9,7 +9,7 @@ import pytest
 from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, wait_for_trace
 from ldcnd.config.rig import load_config
 from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
@@ -19,7 +19,7 @@ from tests.support.rig import SIMULATED, running_rig
 
 async def ready(rig):
     await rig.until("x", lambda state: state.link == "up")
-    await rig.client.command("x", Verb.POWER, Power(on=True))
+    await rig.client.command("x", Power(on=True))
 
 
 def rising(level, channel="velocity"):
@@ -34,7 +34,7 @@ async def test_fastest_trace_follows_a_move_with_a_true_time_for_every_sample():
             channels=("position", "velocity", "following_error"), samples=400, pre_trigger=50, trigger=rising(2.0)
         )
         reply = await arm_trace(rig.client, "x", request)
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
+        await rig.client.command("x", MoveAbsolute(position=5.0))
         await wait_for_trace(rig.client, "x", reply.trace_id, 60)
         trace = await fetch_trace(rig.client, "x", reply.trace_id)
 
@@ -144,12 +144,12 @@ async def test_second_trace_is_refused_until_the_first_is_aborted():
 
         with pytest.raises(BusyTracing, match=first.trace_id):
             await arm_trace(rig.client, "x", request)
-        aborted = await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
+        aborted = await rig.client.command("x", AbortTrace())
         header = await rig.client.trace_header("x")
         again = await arm_trace(rig.client, "x", request)
-        await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
+        await rig.client.command("x", AbortTrace())
         with pytest.raises(WrongState, match="no trace is under way"):
-            await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
+            await rig.client.command("x", AbortTrace())
 
     assert (aborted.trace_id, header.phase) == (first.trace_id, TracePhase.ABORTED)
     assert again.trace_id != first.trace_id
@@ -164,7 +164,7 @@ async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
         async def wait() -> None:
             async with armed_trace(rig.client, "x", request):
                 if replaced:
-                    await rig.client.command("x", Verb.TRACE_ABORT, AbortTrace())
+                    await rig.client.command("x", AbortTrace())
                     await arm_trace(rig.client, "x", request)
                 await asyncio.Event().wait()
 

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, START_TIME_S, _all_axes_answer, client, free_port, process, simulated_terminal
 
@@ -42,8 +42,8 @@ async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
         async with killable_daemon(config) as (running, endpoint):
             async with client(endpoint) as rig:
                 (first,) = await rig.buses()
-                await rig.command("x", Verb.POWER, Power(on=True))
-                await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0, velocity=5.0))
+                await rig.command("x", Power(on=True))
+                await rig.command("x", MoveAbsolute(position=90.0, velocity=5.0))
                 await asyncio.sleep(0.5)
                 before = await counts_of(rig, "x")
                 with contextlib.suppress(ProcessLookupError):

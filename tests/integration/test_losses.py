@@ -7,8 +7,8 @@ import pytest
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.errors import NotReferenced, WrongState
-from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power, Reset, Verb
-from ldcnd.model.rig_commands import Rehearsal, RehearsalReply, Rehearse
+from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power, Reset
+from ldcnd.model.rig_commands import Rehearsal, Rehearse
 from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -35,8 +35,8 @@ def with_loss(**loss: LossPolicy) -> RigConfig:
 async def jogging(rig: RunningRig) -> None:
     """Have axis x jog, slowly enough for what follows to happen before the software limit."""
     await rig.until("x", lambda state: state.link is LinkState.UP)
-    await rig.client.command("x", Verb.POWER, Power(on=True))
-    await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=10.0))
+    await rig.client.command("x", Power(on=True))
+    await rig.client.command("x", MoveVelocity(velocity=10.0))
     await asyncio.sleep(0.5)
 
 
@@ -92,11 +92,11 @@ async def test_after_a_lost_line_nothing_resumes_and_nothing_is_believed():
         assert (state.state, state.referenced, state.enabled) == (AxisState.ERROR_STOP, False, True)
         assert state.last_error.startswith("move_velocity: the drive does not answer")
         with pytest.raises(WrongState, match="error_stop"):
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
-        await rig.client.command("x", Verb.RESET, Reset())
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+            await rig.client.command("x", MoveAbsolute(position=0.0))
+        await rig.client.command("x", Reset())
+        await rig.client.command("x", Power(on=True))
         with pytest.raises(NotReferenced):
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+            await rig.client.command("x", MoveAbsolute(position=0.0))
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ async def test_a_rehearsed_loss_does_what_the_policy_says(kind):
         await jogging(rig)
 
         request = Rehearse(kind=kind, axis="x")
-        reply = await rig.client.rig_command("rehearse", request, RehearsalReply, 30.0)
+        reply = await rig.client.ask(request, timeout_s=30.0)
         await asyncio.sleep(2.0)
         before = await position_of(rig)
         await asyncio.sleep(1.0)

@@ -11,7 +11,7 @@ from ldcnd.bus.queue import Lane
 from ldcnd.config.rig import load_config
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
-from ldcnd.model.commands import MoveVelocity, Power, Reset, Verb
+from ldcnd.model.commands import MoveVelocity, Power, Reset
 from ldcnd.model.parameters import (
     AlarmReport,
     ClearCounter,
@@ -103,7 +103,7 @@ async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
         units[0].drive.provoke(0x0070, loop.time())
         stopped = await rig.until("feed", lambda state: state.state is AxisState.ERROR_STOP)
         fault = await rig.client.last("feed", TelemetryItem.FAULT)
-        report = await rig.client.command("feed", Verb.READ_ALARMS, ReadAlarms())
+        report = await rig.client.command("feed", ReadAlarms())
         units[0].drive.press_reset(loop.time())
         again = await rig.until("feed", lambda state: state.state is not AxisState.ERROR_STOP)
         cleared = await rig.client.last("feed", TelemetryItem.FAULT)
@@ -117,21 +117,21 @@ async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("verb", "request_"),
+    "command",
     [
-        (Verb.POWER, Power(on=True)),
-        (Verb.MOVE_VELOCITY, MoveVelocity(velocity=1.0)),
-        (Verb.RESET, Reset()),
+        Power(on=True),
+        MoveVelocity(velocity=1.0),
+        Reset(),
     ],
 )
-async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, verb, request_):
+async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, command):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         await rig.until("feed", lambda state: state.enabled)
         with pytest.raises(NotSupported):
-            await rig.client.command("feed", verb, request_)
+            await rig.client.command("feed", command)
         infos = {axis.axis: axis for axis in await rig.client.axes()}
 
-    assert verb.value not in infos["feed"].capabilities
+    assert command.verb not in infos["feed"].capabilities
     assert "write_parameter" in infos["feed"].capabilities
     assert "write_parameter" not in infos["x"].capabilities
 
@@ -139,18 +139,16 @@ async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, ver
 async def test_parameters_are_refused_on_a_drive_without_them(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         with pytest.raises(NotSupported):
-            await rig.client.command("x", Verb.READ_PARAMETER, ReadParameter(parameter="Pn100"))
+            await rig.client.command("x", ReadParameter(parameter="Pn100"))
 
 
 async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:
-        listed = await rig.client.command("feed", Verb.LIST_PARAMETERS, ListParameters())
-        await rig.client.command("feed", Verb.WRITE_PARAMETER, WriteParameter(parameter="Pn100", value=120))
-        saved = await rig.client.command(
-            "feed", Verb.WRITE_PARAMETER, WriteParameter(parameter="Pn102", value=50, memory=Memory.EEPROM)
-        )
-        dump = await rig.client.command("feed", Verb.READ_ALL_PARAMETERS, ReadAllParameters(), timeout_s=60)
+        listed = await rig.client.command("feed", ListParameters())
+        await rig.client.command("feed", WriteParameter(parameter="Pn100", value=120))
+        saved = await rig.client.command("feed", WriteParameter(parameter="Pn102", value=50, memory=Memory.EEPROM))
+        dump = await rig.client.command("feed", ReadAllParameters(), timeout_s=60)
 
     assert isinstance(listed, ParameterList)
     assert len(listed.parameters) == 22
@@ -173,7 +171,7 @@ async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
 async def test_a_refused_write_comes_back_as_its_own_error(tmp_path, write, error):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         with pytest.raises(LdcndError) as refusal:
-            await rig.client.command("feed", Verb.WRITE_PARAMETER, write)
+            await rig.client.command("feed", write)
 
     assert type(refusal.value) is error
 
@@ -183,7 +181,7 @@ async def test_the_same_command_id_never_writes_eeprom_twice(tmp_path):
     async with mixed_rig(tmp_path, units) as rig:
         for value in (101, 101):
             request = WriteParameter(parameter="Pn100", value=value, memory=Memory.EEPROM, command_id="save-1")
-            await rig.client.command("feed", Verb.WRITE_PARAMETER, request)
+            await rig.client.command("feed", request)
 
     assert units[0].drive.memory.writes[PN100.number] == 1
 
@@ -192,9 +190,7 @@ async def test_the_budget_outlives_the_daemon(tmp_path):
     (tmp_path / "eeprom-writes.json").write_text('{"feed": {"Pn100": 9000}}')
     async with mixed_rig(tmp_path, two_drives()) as rig:
         with pytest.raises(EepromBudgetSpent):
-            await rig.client.command(
-                "feed", Verb.WRITE_PARAMETER, WriteParameter(parameter="Pn100", value=1, memory=Memory.EEPROM)
-            )
+            await rig.client.command("feed", WriteParameter(parameter="Pn100", value=1, memory=Memory.EEPROM))
 
 
 async def test_a_cleared_counter_is_the_new_position(tmp_path):
@@ -203,7 +199,7 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
         await rig.until("feed", lambda state: state.moving is Moving.YES)
         units[0].drive.set_pulse_rate(0.0, asyncio.get_running_loop().time())
         await rig.until("feed", lambda state: state.moving is Moving.NO)
-        reply = await rig.client.command("feed", Verb.CLEAR_COUNTER, ClearCounter(counter=CounterName.FEEDBACK))
+        reply = await rig.client.command("feed", ClearCounter(counter=CounterName.FEEDBACK))
         await asyncio.sleep(3.0)
         position = await rig.client.last("feed", TelemetryItem.POSITION)
 
@@ -214,7 +210,7 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
 
 async def test_the_profile_lists_its_assumptions(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
-        reply = await rig.client.command("feed", Verb.READ_PROFILE, ReadProfile())
+        reply = await rig.client.command("feed", ReadProfile())
 
     assert isinstance(reply, DriveProfile)
     assumptions = {assumption.key: assumption for assumption in reply.assumptions}
@@ -229,7 +225,7 @@ async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):
             async with asyncio.TaskGroup() as group:
                 if busy:
                     for axis in ("feed", "spool"):
-                        dump = rig.client.command(axis, Verb.READ_ALL_PARAMETERS, ReadAllParameters(), 60.0)
+                        dump = rig.client.command(axis, ReadAllParameters(), 60.0)
                         group.create_task(dump, name=f"dump {axis}")
                 for _ in range(20):
                     await asyncio.sleep(0.05)

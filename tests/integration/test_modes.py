@@ -61,7 +61,7 @@ async def test_an_analog_move_finds_its_direction_and_ends_at_the_value(dialect,
         full_scale = 1023 if dialect is not LS_173AP else 255
         target = round(share * full_scale)
 
-        reply = await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=target, velocity=5.0))
+        reply = await rig.send(MoveAnalog(target=target, velocity=5.0))
         assert (await rig.rig.client.state(AXIS)).state is AxisState.DISCRETE_MOTION
         state = await rig.rig.client.wait_for_end(AXIS, reply.command_id)
 
@@ -75,7 +75,7 @@ async def test_an_analog_move_needs_a_drive_that_knows_it(dialect):
         await rig.power_on()
 
         with pytest.raises(NotSupported, match="cannot move_analog"):
-            await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=100))
+            await rig.send(MoveAnalog(target=100))
 
 
 @pytest.mark.parametrize(("dialect", "target", "nearest"), [(LS_182AP, 7, 8), (LS_182AP, 1016, 1015), (LS_173AP, 1, 2)])
@@ -84,7 +84,7 @@ async def test_an_analog_target_where_the_sensor_counts_as_broken_is_refused(dia
         await rig.power_on()
 
         with pytest.raises(ValueOutOfRange, match="takes its sensor for broken") as refusal:
-            await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=target))
+            await rig.send(MoveAnalog(target=target))
 
         assert refusal.value.nearest == nearest
 
@@ -95,7 +95,7 @@ async def test_an_analog_move_is_refused_while_the_sensor_is_disconnected():
         rig.condition(Condition.SENSOR_LOST)
 
         with pytest.raises(DriveFault, match="the analog sensor reads 0"):
-            await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=500))
+            await rig.send(MoveAnalog(target=500))
 
         state = await rig.rig.client.state(AXIS)
         assert (state.state, rig.drive.loop.trajectory.velocity) == (AxisState.STANDSTILL, 0)
@@ -105,7 +105,7 @@ async def test_an_analog_move_stops_beyond_a_software_limit():
     async with dialect_rig(LS_182AP, limits={"position_max": 3}) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0))
+        state = await rig.done(MoveAnalog(target=900, velocity=5.0))
 
         assert (state.state, state.last_error) == (
             AxisState.STANDSTILL,
@@ -117,11 +117,11 @@ async def test_an_analog_move_stops_beyond_a_software_limit():
 async def test_a_plain_move_after_an_analog_one_ignores_the_sensor():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=600, velocity=5.0))
-        await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.5))
+        await rig.done(MoveAnalog(target=600, velocity=5.0))
+        await rig.done(MoveAbsolute(position=0.5))
         rig.condition(Condition.SENSOR_LOST)
 
-        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+        state = await rig.done(MoveAbsolute(position=1.0))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
 
@@ -135,7 +135,7 @@ async def test_a_duty_turns_the_motor_for_its_time_and_then_the_axis_holds(diale
     async with dialect_rig(dialect, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()
 
-        reply = await rig.send(Verb.SET_PWM, SetPwm(duty=duty, duration_s=0.1))
+        reply = await rig.send(SetPwm(duty=duty, duration_s=0.1))
         running = await rig.rig.client.state(AXIS)
         await asyncio.sleep(0.09)
         assert rig.drive.loop.pwm == round(duty * 255)
@@ -152,7 +152,7 @@ async def test_a_duty_on_a_reversed_axis_turns_the_other_way():
     async with dialect_rig(V4, pwm=PWM, direction="reverse", acceleration=2000) as rig:
         await rig.power_on()
 
-        await rig.done(Verb.SET_PWM, SetPwm(duty=0.1, duration_s=0.1))
+        await rig.done(SetPwm(duty=0.1, duration_s=0.1))
 
         assert rig.position_mm < 0
 
@@ -162,7 +162,7 @@ async def test_polls_between_the_packets_of_a_duty_do_not_end_it():
     async with dialect_rig(V4, pwm=PWM, acceleration=2000, rates=rates) as rig:
         await rig.power_on()
 
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.05, duration_s=0.2))
+        await rig.send(SetPwm(duty=0.05, duration_s=0.2))
         await asyncio.sleep(0.18)
 
         assert rig.drive.loop.pwm == 13
@@ -171,7 +171,7 @@ async def test_polls_between_the_packets_of_a_duty_do_not_end_it():
 async def test_a_stop_ends_a_duty_at_once():
     async with dialect_rig(LS_182AP, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.05, duration_s=5.0))
+        await rig.send(SetPwm(duty=0.05, duration_s=5.0))
         await asyncio.sleep(0.1)
 
         await rig.rig.client.stop(AXIS)
@@ -185,21 +185,21 @@ async def test_a_stop_ends_a_duty_at_once():
 
 @pytest.mark.parametrize("turns", range(1, 20, 2))
 @pytest.mark.parametrize(
-    ("verb", "request_"),
+    "command",
     [
-        (Verb.SET_PWM, SetPwm(duty=0.05, duration_s=3.0)),
-        (Verb.HOME, Home(method="forward_limit", velocity=5.0)),
-        (Verb.MOVE_ANALOG, MoveAnalog(target=800, velocity=5.0)),
-        (Verb.TRACK, Track(position=0.1)),
+        SetPwm(duty=0.05, duration_s=3.0),
+        Home(method="forward_limit", velocity=5.0),
+        MoveAnalog(target=800, velocity=5.0),
+        Track(position=0.1),
     ],
 )
-async def test_whenever_a_stop_comes_nothing_moves_afterwards(verb, request_, turns):
+async def test_whenever_a_stop_comes_nothing_moves_afterwards(command, turns):
     async with dialect_rig(LS_182AP, pwm=PWM, tracking={"step": 0.5, "rate": 50.0}, acceleration=2000) as rig:
         await rig.power_on()
         axis = rig.rig.daemon.rig.axis(AXIS)
 
         async with asyncio.TaskGroup() as group:
-            group.create_task(_ignoring_refusals(axis.execute(verb, request_)))
+            group.create_task(_ignoring_refusals(axis.execute(command)))
             await asyncio.sleep(turns * 0.0004)
             await rig.rig.daemon.rig.stop((AXIS,))
         await rig.until(lambda state: state.state is AxisState.STANDSTILL)
@@ -220,9 +220,9 @@ async def _ignoring_refusals(work):
 async def test_a_duty_may_be_replaced_while_it_runs():
     async with dialect_rig(V4, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.05, duration_s=0.1))
+        await rig.send(SetPwm(duty=0.05, duration_s=0.1))
 
-        reply = await rig.send(Verb.SET_PWM, SetPwm(duty=-0.05, duration_s=0.2))
+        reply = await rig.send(SetPwm(duty=-0.05, duration_s=0.2))
         await asyncio.sleep(0.15)
 
         assert rig.drive.loop.pwm == -13
@@ -234,7 +234,7 @@ async def test_a_duty_may_be_replaced_while_it_runs():
 async def test_a_duty_does_not_survive_the_loss_of_the_line(dialect, duration_s, unplugged_s):
     async with dialect_rig(dialect, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.05, duration_s=duration_s))
+        await rig.send(SetPwm(duty=0.05, duration_s=duration_s))
         await asyncio.sleep(0.2)
 
         rig.chain.unplug(asyncio.get_running_loop().time(), unplugged_s)
@@ -249,9 +249,9 @@ async def test_a_duty_does_not_survive_the_loss_of_the_line(dialect, duration_s,
 async def test_halt_ends_a_duty():
     async with dialect_rig(V4, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.05, duration_s=5.0))
+        await rig.send(SetPwm(duty=0.05, duration_s=5.0))
 
-        state = await rig.done(Verb.HALT, Halt())
+        state = await rig.done(Halt())
 
         assert (state.state, state.enabled, state.last_error) == (
             AxisState.STANDSTILL,
@@ -263,20 +263,20 @@ async def test_halt_ends_a_duty():
 async def test_a_move_during_a_duty_is_refused():
     async with dialect_rig(V4, pwm=PWM) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.0, duration_s=1.0))
+        await rig.send(SetPwm(duty=0.0, duration_s=1.0))
 
         with pytest.raises(WrongState, match="continuous_motion"):
-            await rig.send(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+            await rig.send(MoveAbsolute(position=1.0))
 
 
 async def test_the_end_of_a_duty_does_not_disturb_what_came_after_a_reset():
     async with dialect_rig(LS_182AP, pwm=PWM) as rig:
         await rig.power_on()
-        await rig.send(Verb.SET_PWM, SetPwm(duty=0.0, duration_s=1.0))
-        await rig.send(Verb.HALT, Halt())
+        await rig.send(SetPwm(duty=0.0, duration_s=1.0))
+        await rig.send(Halt())
         await rig.until(lambda state: state.state is AxisState.STANDSTILL)
 
-        state = await rig.done(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=15.0, velocity=5.0))
+        state = await rig.done(MoveAbsolute(position=15.0, velocity=5.0))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
 
@@ -294,7 +294,7 @@ async def test_a_duty_beyond_the_configured_bounds_is_refused(request_, complain
         await rig.power_on()
 
         with pytest.raises(ValueOutOfRange, match=complaint) as refusal:
-            await rig.send(Verb.SET_PWM, request_)
+            await rig.send(request_)
 
         assert (refusal.value.nearest, rig.drive.loop.servo_on) == (nearest, True)
 
@@ -304,4 +304,4 @@ async def test_an_axis_takes_no_duty_unless_it_is_configured_for_it():
         await rig.power_on()
 
         with pytest.raises(NotSupported, match="not configured for raw duties"):
-            await rig.send(Verb.SET_PWM, SetPwm(duty=0.1, duration_s=1))
+            await rig.send(SetPwm(duty=0.1, duration_s=1))

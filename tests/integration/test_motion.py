@@ -15,7 +15,6 @@ from ldcnd.model.commands import (
     QuickStop,
     Reset,
     SetPosition,
-    Verb,
 )
 from ldcnd.model.samples import AxisState, Moving, PositionSample, TelemetryItem, VelocitySample
 from tests.support.rig import RunningRig, running_rig
@@ -23,7 +22,7 @@ from tests.support.rig import RunningRig, running_rig
 
 async def powered(rig: RunningRig, axis: str) -> None:
     await rig.until(axis, lambda state: state.link == "up")
-    await rig.client.command(axis, Verb.POWER, Power(on=True))
+    await rig.client.command(axis, Power(on=True))
 
 
 async def position_of(rig: RunningRig, axis: str) -> float:
@@ -44,7 +43,7 @@ async def test_a_move_ends_within_one_count(axis, resolution):
     async with running_rig() as rig:
         await powered(rig, axis)
 
-        reply = await rig.client.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsolute(position=-7.3))
+        reply = await rig.client.command(axis, MoveAbsolute(position=-7.3))
         state = await rig.client.wait_for_end(axis, reply.command_id)
 
         assert (state.state, state.moving, state.last_error) == (AxisState.STANDSTILL, Moving.NO, None)
@@ -57,7 +56,7 @@ async def test_a_move_takes_as_long_as_its_reply_says():
         loop = asyncio.get_running_loop()
         began_s = loop.time()
 
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))
+        reply = await rig.client.command("x", MoveAbsolute(position=50.0))
         await rig.client.wait_for_end("x", reply.command_id)
 
         assert reply.duration_s == pytest.approx(2.6, abs=0.01)
@@ -68,7 +67,7 @@ async def test_the_state_tells_where_a_move_ends_and_when():
     async with running_rig() as rig:
         await powered(rig, "x")
 
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=30.0))
+        reply = await rig.client.command("x", MoveAbsolute(position=30.0))
         under_way = (await rig.client.state("x")).command
         ended = await rig.client.wait_for_end("x", reply.command_id)
 
@@ -82,7 +81,7 @@ async def test_relative_moves_add_up_without_drift():
         await powered(rig, "x")
 
         for _ in range(5):
-            reply = await rig.client.command("x", Verb.MOVE_RELATIVE, MoveRelative(distance=1.234))
+            reply = await rig.client.command("x", MoveRelative(distance=1.234))
             await rig.client.wait_for_end("x", reply.command_id)
 
         assert reply.position == pytest.approx(6.17)
@@ -93,7 +92,7 @@ async def test_the_published_velocity_is_positive_forward():
     async with running_rig() as rig:
         await powered(rig, "x")
 
-        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=20.0))
+        await rig.client.command("x", MoveVelocity(velocity=20.0))
         await asyncio.sleep(0.5)
         async with rig.client.samples("x", TelemetryItem.VELOCITY) as velocities:
             _, sample = await anext(velocities)
@@ -106,7 +105,7 @@ async def test_a_jog_on_a_referenced_axis_ends_at_the_software_limit():
     async with running_rig() as rig:
         await powered(rig, "x")
 
-        reply = await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=-50.0))
+        reply = await rig.client.command("x", MoveVelocity(velocity=-50.0))
         assert (await rig.until("x", lambda state: state.command is not None)).state is AxisState.CONTINUOUS_MOTION
         await rig.client.wait_for_end("x", reply.command_id)
 
@@ -117,7 +116,7 @@ async def test_a_jog_without_a_limit_ends_at_its_horizon():
     async with running_rig() as rig:
         await powered(rig, "c")
 
-        reply = await rig.client.command("c", Verb.MOVE_VELOCITY, MoveVelocity(velocity=2.0))
+        reply = await rig.client.command("c", MoveVelocity(velocity=2.0))
         state = await rig.client.wait_for_end("c", reply.command_id)
 
         assert reply.position == pytest.approx(120.0, abs=0.1)
@@ -128,16 +127,16 @@ async def test_a_jog_without_a_limit_ends_at_its_horizon():
 async def test_halt_brings_an_axis_to_rest_and_lets_it_move_again():
     async with running_rig() as rig:
         await powered(rig, "c")
-        await rig.client.command("c", Verb.MOVE_VELOCITY, MoveVelocity(velocity=90.0))
+        await rig.client.command("c", MoveVelocity(velocity=90.0))
         await asyncio.sleep(1.0)
 
-        reply = await rig.client.command("c", Verb.HALT, Halt())
+        reply = await rig.client.command("c", Halt())
         state = await rig.client.wait_for_end("c", reply.command_id)
 
         assert (state.state, state.stop_latched) == (AxisState.STANDSTILL, False)
         assert state.last_error is not None
         assert "aborted by halt" in state.last_error
-        reply = await rig.client.command("c", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+        reply = await rig.client.command("c", MoveAbsolute(position=0.0))
         await rig.client.wait_for_end("c", reply.command_id)
         assert await settled(rig, "c") == pytest.approx(0.0, abs=0.011)
 
@@ -145,10 +144,10 @@ async def test_halt_brings_an_axis_to_rest_and_lets_it_move_again():
 async def test_a_second_move_in_mid_move_is_refused():
     async with running_rig() as rig:
         await powered(rig, "x")
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))
+        reply = await rig.client.command("x", MoveAbsolute(position=50.0))
 
         with pytest.raises(WrongState, match="discrete_motion"):
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+            await rig.client.command("x", MoveAbsolute(position=0.0))
 
         await rig.client.wait_for_end("x", reply.command_id)
         assert await settled(rig, "x") == pytest.approx(50.0, abs=0.0011)
@@ -157,7 +156,7 @@ async def test_a_second_move_in_mid_move_is_refused():
 async def test_a_stop_in_mid_move_latches_until_reset():
     async with running_rig() as rig:
         await powered(rig, "x")
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0))
+        await rig.client.command("x", MoveAbsolute(position=90.0))
         await asyncio.sleep(1.0)
 
         reply = await rig.client.stop("x")
@@ -168,10 +167,10 @@ async def test_a_stop_in_mid_move_latches_until_reset():
         where = await settled(rig, "x")
         assert 15 < where < 30
         with pytest.raises(StopLatched) as refusal:
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+            await rig.client.command("x", MoveAbsolute(position=0.0))
         assert refusal.value.remedy == "send reset"
-        await rig.client.command("x", Verb.RESET, Reset())
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0))
+        await rig.client.command("x", Reset())
+        reply = await rig.client.command("x", MoveAbsolute(position=0.0))
         await rig.client.wait_for_end("x", reply.command_id)
         assert await settled(rig, "x") == pytest.approx(0.0, abs=0.0011)
 
@@ -179,11 +178,11 @@ async def test_a_stop_in_mid_move_latches_until_reset():
 async def test_a_quick_stop_needs_no_ramp():
     async with running_rig() as rig:
         await powered(rig, "x")
-        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=20.0, acceleration=20.0))
+        await rig.client.command("x", MoveVelocity(velocity=20.0, acceleration=20.0))
         await asyncio.sleep(1.5)
         before = await position_of(rig, "x")
 
-        await rig.client.command("x", Verb.QUICK_STOP, QuickStop())
+        await rig.client.command("x", QuickStop())
 
         assert await settled(rig, "x") - before < 3.0  # the ramp alone would be 10 mm
 
@@ -192,7 +191,7 @@ async def test_a_stop_of_the_rig_stops_everything_at_once():
     async with running_rig() as rig:
         for axis in ("x", "y", "z"):
             await powered(rig, axis)
-            await rig.client.command(axis, Verb.MOVE_VELOCITY, MoveVelocity(velocity=10.0))
+            await rig.client.command(axis, MoveVelocity(velocity=10.0))
         await asyncio.sleep(0.5)
 
         reply = await rig.client.stop()
@@ -213,7 +212,7 @@ async def test_a_stop_does_not_close_the_loop_of_a_disabled_axis():
 
         assert (state.state, state.enabled, state.stop_latched) == (AxisState.DISABLED, False, True)
         with pytest.raises(StopLatched):
-            await rig.client.command("x", Verb.POWER, Power(on=True))
+            await rig.client.command("x", Power(on=True))
 
 
 async def test_a_stop_overtakes_a_move_that_came_before_it():
@@ -222,7 +221,7 @@ async def test_a_stop_overtakes_a_move_that_came_before_it():
         axis = rig.daemon.rig.axis("x")
 
         async with asyncio.TaskGroup() as group:
-            move = group.create_task(_outcome(axis.execute(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))))
+            move = group.create_task(_outcome(axis.execute(MoveAbsolute(position=50.0))))
             group.create_task(_outcome(rig.daemon.rig.stop(("x",))))
 
         assert isinstance(move.result(), StopLatched)
@@ -237,7 +236,7 @@ async def test_whenever_a_stop_comes_nothing_moves_afterwards(turns):
         axis = rig.daemon.rig.axis("x")
 
         async with asyncio.TaskGroup() as group:
-            group.create_task(_outcome(axis.execute(Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))))
+            group.create_task(_outcome(axis.execute(MoveAbsolute(position=50.0))))
             await asyncio.sleep(turns * 0.0004)
             await rig.daemon.rig.stop(("x",))
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
@@ -256,10 +255,10 @@ async def _outcome(work):
 async def test_power_off_in_mid_move_ends_the_move():
     async with running_rig() as rig:
         await powered(rig, "x")
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0))
+        reply = await rig.client.command("x", MoveAbsolute(position=90.0))
         await asyncio.sleep(0.5)
 
-        await rig.client.command("x", Verb.POWER, Power(on=False))
+        await rig.client.command("x", Power(on=False))
         state = await rig.client.wait_for_end("x", reply.command_id)
 
         assert (state.state, state.enabled) == (AxisState.DISABLED, False)
@@ -271,7 +270,7 @@ async def test_homing_finds_the_reference_and_defines_the_position(axis):
     async with running_rig() as rig:
         await powered(rig, axis)
 
-        reply = await rig.client.command(axis, Verb.HOME, Home())
+        reply = await rig.client.command(axis, Home())
         assert (await rig.client.state(axis)).state is AxisState.HOMING
         state = await rig.client.wait_for_end(axis, reply.command_id)
 
@@ -284,25 +283,25 @@ async def test_a_search_that_finds_nothing_ends_with_a_reason():
     async with running_rig() as rig:
         await powered(rig, "c")
 
-        reply = await rig.client.command("c", Verb.HOME, Home(method="forward_limit", velocity=10, timeout_s=2))
+        reply = await rig.client.command("c", Home(method="forward_limit", velocity=10, timeout_s=2))
         state = await rig.client.wait_for_end("c", reply.command_id)
 
         assert (state.state, state.referenced) == (AxisState.STANDSTILL, False)
         assert state.last_error == "home: no forward_limit within 2 s"
         with pytest.raises(NotReferenced):
-            await rig.client.command("c", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0))
+            await rig.client.command("c", MoveAbsolute(position=0))
 
 
 async def test_a_position_that_was_set_shifts_limits_and_targets():
     async with running_rig() as rig:
         await powered(rig, "x")
 
-        await rig.client.command("x", Verb.SET_POSITION, SetPosition(position=95.0))
+        await rig.client.command("x", SetPosition(position=95.0))
 
         assert await position_of(rig, "x") == pytest.approx(95.0, abs=0.0011)
         with pytest.raises(PositionLimit):
-            await rig.client.command("x", Verb.MOVE_RELATIVE, MoveRelative(distance=6.0))
-        reply = await rig.client.command("x", Verb.MOVE_RELATIVE, MoveRelative(distance=5.0))
+            await rig.client.command("x", MoveRelative(distance=6.0))
+        reply = await rig.client.command("x", MoveRelative(distance=5.0))
         await rig.client.wait_for_end("x", reply.command_id)
         assert await settled(rig, "x") == pytest.approx(100.0, abs=0.0011)
 
@@ -312,6 +311,6 @@ async def test_an_axis_that_is_not_powered_says_how_to_power_it():
         await rig.until("x", lambda state: state.link == "up")
 
         with pytest.raises(WrongState) as refusal:
-            await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1.0))
+            await rig.client.command("x", MoveAbsolute(position=1.0))
 
         assert "power" in refusal.value.remedy

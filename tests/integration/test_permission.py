@@ -43,15 +43,15 @@ async def moving_to_first_target(rig: RunningRig, lease_s: float = 60.0):
     """Hold x, on the way to its first target, for four seconds or so."""
     await rig.until("x", lambda state: state.link == "up")
     async with control(rig.client, "ann", "x", lease_s=lease_s) as held:
-        await held.command("x", Verb.POWER, Power(on=True))
-        await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
+        await held.command("x", Power(on=True))
+        await held.command("x", MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
         yield held
 
 
 def buffered(rig: RunningRig, held: Control, **fields: object) -> "asyncio.Task[object]":
     """Send a move that waits for the one under way."""
     request = MoveAbsolute(position=60.0, buffer_mode=BufferMode.BUFFERED, **fields)
-    return asyncio.create_task(held.command("x", Verb.MOVE_ABSOLUTE, request, 30.0), name="buffered")
+    return asyncio.create_task(held.command("x", request, 30.0), name="buffered")
 
 
 async def stays_at_first_target(rig: RunningRig) -> None:
@@ -94,8 +94,8 @@ async def test_a_buffered_move_of_a_client_that_died_is_refused_although_its_axi
     async with running_rig(config()) as rig:
         await rig.until("x", lambda state: state.link == "up")
         async with control(rig.client, "ann", "x", lease_s=1.0) as held:
-            await held.command("x", Verb.POWER, Power(on=True))
-            await held.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
+            await held.command("x", Power(on=True))
+            await held.command("x", MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
             waiting = buffered(rig, held)
             await asyncio.sleep(0.5)
             rig.daemon._control.authority.expire(float("inf"))  # nothing was renewed
@@ -118,10 +118,10 @@ async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
 async def test_a_buffered_move_without_a_lease_is_refused_once_its_axis_is_held():
     async with running_rig(config(authority="open")) as rig:
         await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
         request = MoveAbsolute(position=60.0, buffer_mode=BufferMode.BUFFERED)
-        waiting = asyncio.create_task(rig.client.command("x", Verb.MOVE_ABSOLUTE, request, 30.0))
+        waiting = asyncio.create_task(rig.client.command("x", request, 30.0))
         await asyncio.sleep(0.5)
         async with control(rig.client, "bob", "x", lease_s=60.0):
             with pytest.raises(LeaseHeld):
@@ -163,7 +163,7 @@ async def test_an_aborting_move_that_is_refused_halts_nothing(verb, request_):
 async def test_an_aborting_move_halts_and_then_moves():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         request = MoveAbsolute(position=3.0, buffer_mode=BufferMode.ABORTING)
-        reply = await held.command("x", Verb.MOVE_ABSOLUTE, request, 30.0)
+        reply = await held.command("x", request, 30.0)
         await rig.client.wait_for_end("x", reply.command_id)
         assert (await rig.client.last("x", "position")).value == pytest.approx(3.0, abs=0.05)
 
@@ -171,7 +171,7 @@ async def test_an_aborting_move_halts_and_then_moves():
 async def test_a_stop_between_the_halt_and_the_start_of_an_aborting_move_wins():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         request = MoveAbsolute(position=3.0, buffer_mode=BufferMode.ABORTING)
-        aborting = asyncio.create_task(held.command("x", Verb.MOVE_ABSOLUTE, request, 30.0))
+        aborting = asyncio.create_task(held.command("x", request, 30.0))
         await rig.until("x", lambda state: state.state is AxisState.STOPPING)
         await rig.client.stop("x")
         with pytest.raises(StopLatched):
@@ -185,10 +185,10 @@ async def test_a_homing_whose_lease_was_lost_begins_no_further_leg():
     async with running_rig(config()) as rig:
         await rig.until("y", lambda state: state.link == "up")
         async with control(rig.client, "ann", "y", lease_s=60.0) as held:
-            await held.command("y", Verb.POWER, Power(on=True))
-            reply = await held.command("y", Verb.HOME, Home())
+            await held.command("y", Power(on=True))
+            reply = await held.command("y", Home())
             await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
-            reply = await held.command("y", Verb.HOME, Home())
+            reply = await held.command("y", Home())
             rig.daemon._control.authority.expire(float("inf"))
             state = await rig.client.wait_for_end("y", reply.command_id)
             assert "lease" in (state.last_error or ""), state
@@ -206,11 +206,11 @@ async def test_a_stream_of_set_points_ends_with_its_lease():
     async with running_rig(rig_config) as rig:
         await rig.until("z", lambda state: state.link == "up")
         async with control(rig.client, "ann", "z", lease_s=60.0) as held:
-            await held.command("z", Verb.POWER, Power(on=True))
-            await held.command("z", Verb.TRACK, Track(position=0.1))
+            await held.command("z", Power(on=True))
+            await held.command("z", Track(position=0.1))
             rig.daemon._control.authority.expire(float("inf"))
             with pytest.raises(LeaseExpired):
-                await held.command("z", Verb.TRACK, Track(position=0.2))
+                await held.command("z", Track(position=0.2))
 
 
 async def test_a_stop_that_comes_while_the_loop_is_being_closed_leaves_it_open():
@@ -220,14 +220,14 @@ async def test_a_stop_that_comes_while_the_loop_is_being_closed_leaves_it_open()
         power_of, stops = axis.driver.power, []
 
         async def power(*, on: bool) -> None:
-            stops.append(asyncio.ensure_future(axis.execute(Verb.STOP, Stop())))
+            stops.append(asyncio.ensure_future(axis.execute(Stop())))
             await asyncio.sleep(0)
             await asyncio.gather(*stops)
             await power_of(on=on)
 
         axis.driver.power = power
         with pytest.raises(StopLatched):
-            await rig.client.command("x", Verb.POWER, Power(on=True))
+            await rig.client.command("x", Power(on=True))
         state = await rig.until("x", lambda state: state.stop_latched)
         await asyncio.sleep(1.0)
         assert not (await rig.client.state("x")).enabled, state
@@ -236,9 +236,7 @@ async def test_a_stop_that_comes_while_the_loop_is_being_closed_leaves_it_open()
 async def test_limits_are_those_of_the_plan_at_the_start():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         with pytest.raises(PositionLimit):
-            await held.command(
-                "x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1e6, buffer_mode=BufferMode.BUFFERED), 30.0
-            )
+            await held.command("x", MoveAbsolute(position=1e6, buffer_mode=BufferMode.BUFFERED), 30.0)
 
 
 MOVES = {"load", "start", "track", "power", "set_gains", "start_group"}

@@ -3,7 +3,7 @@
 import pytest
 
 from ldcnd.errors import MalformedRequest
-from ldcnd.model.commands import MoveAbsolute, Power, Preview, Verb
+from ldcnd.model.commands import MoveAbsolute, Power, Preview
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
@@ -16,11 +16,11 @@ def sent(rig: RunningRig) -> list[str]:
 async def test_a_plan_is_what_the_move_then_is():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
 
         plan = await rig.client.plan("x", Preview(position=12.3456, velocity=7.0))
         before = len(sent(rig))
-        move = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=12.3456, velocity=7.0))
+        move = await rig.client.command("x", MoveAbsolute(position=12.3456, velocity=7.0))
 
         assert plan.refusal is None
         assert plan.obstacles == ()

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.model.commands import Home, MoveAbsolute, Power, Verb
+from ldcnd.model.commands import Home, MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, client, daemon, simulated_terminal
 
@@ -24,8 +24,8 @@ async def test_the_daemon_moves_and_homes_drives_behind_a_terminal(tmp_path):
     async with simulated_terminal(link, "ls182ap", "ls182ap", "picservo-v4", "picservo-v4"):
         async with daemon(config) as endpoint, client(endpoint) as rig:
             for axis, target in (("x", 10.0), ("z", -5.0)):
-                await rig.command(axis, Verb.POWER, Power(on=True))
-                reply = await rig.command(axis, Verb.MOVE_ABSOLUTE, MoveAbsolute(position=target))
+                await rig.command(axis, Power(on=True))
+                reply = await rig.command(axis, MoveAbsolute(position=target))
                 state = await rig.wait_for_end(axis, reply.command_id)
                 assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
                 async with rig.samples(axis, TelemetryItem.POSITION) as positions, asyncio.timeout(5):
@@ -34,7 +34,7 @@ async def test_the_daemon_moves_and_homes_drives_behind_a_terminal(tmp_path):
                         if abs(position.counts - target * COUNTS_PER_MM[axis]) <= 1:
                             break
 
-            reply = await rig.command("z", Verb.HOME, Home())
+            reply = await rig.command("z", Home())
             state = await rig.wait_for_end("z", reply.command_id)
             assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
 

@@ -51,8 +51,8 @@ async def record_a_move(path, seconds, **options):
     """Record a rig whose axis x moves to 5 mm; return how many values were published on each key."""
     async with recorded_rig(path, **options) as recorded:
         await recorded.rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        await recorded.rig.client.command("x", Verb.POWER, Power(on=True))
-        await recorded.rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
+        await recorded.rig.client.command("x", Power(on=True))
+        await recorded.rig.client.command("x", MoveAbsolute(position=5.0))
         await asyncio.sleep(seconds)
     return recorded.published
 
@@ -60,7 +60,7 @@ async def record_a_move(path, seconds, **options):
 async def thirty_one_axes_are_in_the_file(path, seconds, position_hz):
     async with recorded_rig(path, thirty_one_axes(position_hz)) as recorded:
         await recorded.rig.until("a7", lambda state: state.state is AxisState.DISABLED)
-        await recorded.rig.client.command("a7", Verb.POWER, Power(on=True))
+        await recorded.rig.client.command("a7", Power(on=True))
         await asyncio.sleep(seconds)
 
     topics = checked_topics(path)

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.config.rig import load_config
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState
 from ldcnd.recording.reading import AxisHistory, Recording, axis_history
@@ -22,8 +22,8 @@ async def record_a_move_and_an_outage(path):
     async with recorded_rig(path, chains={"line0": chain}) as recorded:
         rig = recorded.rig
         await rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=5.0))
         await asyncio.sleep(3.0)
         chain.unplug(asyncio.get_running_loop().time(), for_s=1.0)
         await asyncio.sleep(4.0)

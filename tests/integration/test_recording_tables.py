@@ -7,7 +7,7 @@ import json
 import pytest
 
 from ldcnd.errors import ConfigError
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState
 from ldcnd.recording.tables import export_tables
@@ -19,8 +19,8 @@ async def record_a_move(path):
     async with recorded_rig(path) as recorded:
         rig = recorded.rig
         await rig.until("x", lambda state: state.state is AxisState.DISABLED)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=5.0))
+        await rig.client.command("x", Power(on=True))
+        reply = await rig.client.command("x", MoveAbsolute(position=5.0))
         await rig.client.wait_for_end("x", reply.command_id)
         await asyncio.sleep(3.0)
     return reply.command_id

@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -29,7 +29,7 @@ def set_power(chain, address, *, on):
 async def power_all(rig):
     for name in NAMES:
         await rig.until(name, lambda state: state.link is LinkState.UP)
-        await rig.client.command(name, Verb.POWER, Power(on=True))
+        await rig.client.command(name, Power(on=True))
 
 
 async def arrivals(rig, axis, item):
@@ -52,9 +52,9 @@ async def test_a_drive_that_lost_power_is_back_within_3_s_and_the_others_finish_
     loop = asyncio.get_running_loop()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END, margin_ms=margin_ms)) as rig:
         await power_all(rig)
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0, velocity=10.0))
-        await rig.client.command("z", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=-40.0, velocity=5.0))
-        await rig.client.command("c", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=900.0))
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=10.0))
+        await rig.client.command("z", MoveAbsolute(position=-40.0, velocity=5.0))
+        await rig.client.command("c", MoveAbsolute(position=900.0))
         await asyncio.sleep(1)
         seen = len(rig.sent)
         polled_at_s = await arrivals(rig, "x", TelemetryItem.POSITION)
@@ -97,7 +97,7 @@ async def test_the_axis_works_again_once_it_is_powered():
         set_power(chain, 2, on=True)
         await rig.until("y", lambda state: state.link is LinkState.UP)
 
-        await rig.client.command("y", Verb.POWER, Power(on=True))
+        await rig.client.command("y", Power(on=True))
         state = await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
 
     assert not state.referenced
@@ -155,7 +155,7 @@ async def test_a_stop_works_while_a_drive_is_dark():
     chain = chain_of()
     async with rig_on(chain, simulated_config()) as rig:
         await power_all(rig)
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0, velocity=5.0))
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=5.0))
         set_power(chain, 4, on=False)
         loop = asyncio.get_running_loop()
         slowest_s = 0.0
@@ -208,7 +208,7 @@ async def test_members_of_a_group_with_a_leader_come_back_to_their_group():
     config = simulated_config(UNSEEN_MOTIONS_END, group=[{"name": "pair", "axes": ["y", "z"], "leader": "z"}])
     async with rig_on(chain, config) as rig:
         await power_all(rig)
-        await rig.client.command("z", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=-40.0, velocity=5.0))
+        await rig.client.command("z", MoveAbsolute(position=-40.0, velocity=5.0))
         set_power(chain, 2, on=False)
         await rig.until("y", lambda state: state.link is LinkState.DOWN)
         await asyncio.sleep(1)
@@ -244,7 +244,7 @@ async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
     )
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
         await power_all(rig)
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0, velocity=2.0))
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=2.0))
         await asyncio.sleep(5 - asyncio.get_running_loop().time())
         for _ in range(5):
             set_power(chain, 3, on=False)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState
 from tests.support.rig import running_rig
 
@@ -11,8 +11,8 @@ async def test_a_newcomer_powers_an_axis_and_moves_it():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.state is AxisState.DISABLED)
 
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        reply = await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=10.0))
+        await rig.client.command("x", Power(on=True))
+        reply = await rig.client.command("x", MoveAbsolute(position=10.0))
         state = await rig.client.wait_for_end("x", reply.command_id)
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)

@@ -16,7 +16,7 @@ from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import CommandReply, MoveRelative, Power, Verb
+from ldcnd.model.commands import CommandReply, MoveRelative, Power
 from ldcnd.model.samples import AxisState, PositionSample, StateSample
 from tests.support.process import LDCND, free_port
 from tests.support.rig import SIMULATED
@@ -77,7 +77,7 @@ async def position_after(positions: Samples, seq: int) -> PositionSample:
 
 async def ready(client: RigClient) -> None:
     """Close the loop of x."""
-    await client.command("x", Verb.POWER, Power(on=True))
+    await client.command("x", Power(on=True))
     async with client.samples("x", "state") as states:
         while True:
             _, state = await anext(states)
@@ -97,7 +97,7 @@ async def insist(ask: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
 async def move(client: RigClient, number: int) -> CommandReply:
     """Send one move, under one id, until it is answered, and wait for its end; what a careful client does."""
     request = MoveRelative(distance=STEP, command_id=f"move-{number}", instance="routed")
-    reply = await insist(lambda: client.command("x", Verb.MOVE_RELATIVE, request, timeout_s=0.5))
+    reply = await insist(lambda: client.command("x", request, timeout_s=0.5))
     await insist(lambda: client.wait_for_end("x", reply.command_id))
     return reply
 

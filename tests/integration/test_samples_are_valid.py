@@ -9,7 +9,7 @@ from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.commands import Halt, MoveVelocity, Power, Verb
+from ldcnd.model.commands import Halt, MoveVelocity, Power
 from ldcnd.model.samples import SAMPLE_MODELS, AxisState, LinkState, TelemetryItem
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
@@ -49,10 +49,10 @@ async def test_what_is_published_of_drives_that_move_stop_fail_and_fall_silent(e
         await samples_of(rig, taken)
         for axis in ("x", "c"):
             await rig.until(axis, lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_VELOCITY, MoveVelocity(velocity=1.0))
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=1.0))
         await asyncio.sleep(0.5)
-        await rig.client.command("x", Verb.HALT, Halt())
+        await rig.client.command("x", Halt())
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
         await rig.client.stop("x")
         await rig.until("c", lambda state: state.link is LinkState.DOWN)

@@ -187,7 +187,7 @@ async def test_a_viewer_who_commands_is_told_that_he_may_not(rig: SecuredRig) ->
 
     async with open_zenoh_session(settings) as session:
         with pytest.raises(SessionError, match="not permitted to command"):
-            await RigClient(session, "sim").command("x", Verb.POWER, Power(on=True))
+            await RigClient(session, "sim").command("x", Power(on=True))
 
 
 async def test_events_tell_whose_certificate_a_command_came_with(rig: SecuredRig) -> None:
@@ -195,7 +195,7 @@ async def test_events_tell_whose_certificate_a_command_came_with(rig: SecuredRig
 
     async with open_zenoh_session(settings) as session:
         client = RigClient(session, "sim")
-        await client.command("z", Verb.HALT, Halt(client="ann", command_id="by-ann"))
+        await client.command("z", Halt(client="ann", command_id="by-ann"))
         with rig.login("operator") as stranger:  # an operator with a program that does not say who it is
             answers(stranger, "ldcn/sim/@cmd/z/halt", {"command_id": "by-somebody"})
         await client.stop("z", client="ann")

@@ -3,7 +3,7 @@
 import asyncio
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.model.commands import Power, Verb
+from ldcnd.model.commands import Power
 from ldcnd.model.samples import AxisState
 from tests.support.rig import SIMULATED, running_rig
 
@@ -21,7 +21,7 @@ async def test_an_overvoltage_at_its_time_is_a_fault_of_its_axis_only():
         loop = asyncio.get_running_loop()
         for axis in ("x", "y"):
             await rig.until(axis, lambda state: state.link == "up")
-            await rig.client.command(axis, Verb.POWER, Power(on=True))
+            await rig.client.command(axis, Power(on=True))
         assert loop.time() < HAPPENS_AT_S
 
         await rig.until("y", lambda state: state.state is AxisState.ERROR_STOP)

@@ -10,7 +10,6 @@ from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, StringChecksu
 from ldcnd.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import Verb
 from ldcnd.model.parameters import WriteParameter
 from ldcnd.model.plan import RigPlan
 from ldcnd.model.samples import TelemetryItem
@@ -248,12 +247,12 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
         write = WriteParameter(parameter="Pn102", value=50)
 
         with pytest.raises(BusyTracing, match="e=9"):
-            await client.command("feed", Verb.WRITE_PARAMETER, write)
-        reply = await client.command("spool", Verb.WRITE_PARAMETER, write)
+            await client.command("feed", write)
+        reply = await client.command("spool", write)
         with pytest.raises(BusyTracing, match="trace test-1 is waiting"):
             await arm_trace(client, "feed", trace_request())
-        aborted = await client.command("feed", Verb.TRACE_ABORT, AbortTrace(), 10)
-        after = await client.command("feed", Verb.WRITE_PARAMETER, write)
+        aborted = await client.command("feed", AbortTrace(), 10)
+        after = await client.command("feed", write)
         header = await client.trace_header("feed")
 
     assert (reply.written, after.written) == (True, True)
@@ -341,9 +340,9 @@ async def test_trace_that_was_left_armed_in_the_drive_is_ended_on_request_only()
         with pytest.raises(BusyTracing, match="busy tracing"):
             await arm_trace(client, "feed", trace_request())
         left = drive.mode
-        reply = await client.command("feed", Verb.TRACE_ABORT, AbortTrace())
+        reply = await client.command("feed", AbortTrace())
         ended = drive.mode
         with pytest.raises(WrongState, match="no trace is under way"):
-            await client.command("feed", Verb.TRACE_ABORT, AbortTrace())
+            await client.command("feed", AbortTrace())
 
     assert (left, ended, reply.trace_id) == (0x2000, 0, None)

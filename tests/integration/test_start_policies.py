@@ -8,7 +8,7 @@ import pytest
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import LoadTrajectory
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
@@ -33,9 +33,9 @@ async def leave_x_moving(chain, config, *, to=50.0):
     """Let a first daemon start a motion of x, with z enabled, and kill it in the middle."""
     async with rig_on(chain, config) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("z", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=to))
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("z", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=to))
         await asyncio.sleep(0.5)
         await rig.kill()
 
@@ -147,7 +147,7 @@ def creep(chain, counts_per_tick):
 async def left_creeping(chain, counts_per_tick):
     async with rig_on(chain, simulated_config()) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
         await rig.kill()
     creep(chain, counts_per_tick)
 
@@ -185,7 +185,7 @@ async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_move
     chain = chain_of()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
         creep(chain, 0.3)
         now_s = asyncio.get_running_loop().time()
         chain.unplug(now_s, 1.0)
@@ -220,8 +220,8 @@ async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():
     chain = chain_of()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=50.0))
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=50.0))
         await asyncio.sleep(0.5)
 
         chain.unplug(asyncio.get_running_loop().time(), 1.0)

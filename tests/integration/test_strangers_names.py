@@ -6,7 +6,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.errors import ErrorCode
-from ldcnd.model.events import EventList, EventsRequest
+from ldcnd.model.events import ReadEvents
 from ldcnd.printable import is_printable
 from tests.support.rig import running_rig
 from tests.support.session_pair import error_of
@@ -19,7 +19,7 @@ async def test_a_command_with_such_a_name_is_refused_and_leaves_no_event(field: 
     async with running_rig() as rig:
         payload = json.dumps({"on": True, field: CLIPBOARD}).encode()
         answers = await rig.session.query("ldcn/sim/@cmd/x/power", payload, encoding="application/json")
-        events = (await rig.client.rig_command("events", EventsRequest(), EventList)).events
+        events = (await rig.client.ask(ReadEvents())).events
 
     refusal = error_of(answers)
     assert refusal.code is ErrorCode.MALFORMED_REQUEST
@@ -31,7 +31,7 @@ async def test_a_stop_with_such_a_name_stops_and_its_event_names_no_one():
     async with running_rig() as rig:
         payload = json.dumps({"client": CLIPBOARD}).encode()
         (answer,) = await rig.session.query("ldcn/sim/@stop/x", payload, encoding="application/json")
-        events = (await rig.client.rig_command("events", EventsRequest(axis="x"), EventList)).events
+        events = (await rig.client.ask(ReadEvents(axis="x"))).events
 
     assert not answer.is_error
     assert [event.client for event in events if event.verb == "stop"] == [None]

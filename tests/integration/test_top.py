@@ -6,7 +6,7 @@ from asyncio.subprocess import PIPE
 import pytest
 from textual.widgets import DataTable, Static
 
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.top.glance import RigGlance
 from ldcnd.top.screen import TopScreen
 from tests.support.process import LDCND, ROOT, client, daemon
@@ -24,7 +24,7 @@ async def until(pilot, wanted):
 async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there_is_no_terminal():
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
         printing = await asyncio.create_subprocess_exec(*LDCND, "top", "-e", endpoint, "--json", stdout=PIPE)
-        await rig.command("x", Verb.POWER, Power(on=True))
+        await rig.command("x", Power(on=True))
         screen = TopScreen(rig)
         async with screen.run_test(size=(140, 24)) as pilot:
             axes, answer = screen.query_one("#axes", DataTable), screen.query_one("#answer", Static)
@@ -33,7 +33,7 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
                 return {axes.get_row_at(row)[2].plain: axes.get_row_at(row)[3].plain for row in range(axes.row_count)}
 
             await until(pilot, lambda: states().get("x") == "standstill")
-            await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90.0, velocity=5.0))
+            await rig.command("x", MoveAbsolute(position=90.0, velocity=5.0))
             await until(pilot, lambda: states()["x"] == "discrete_motion")
             await pilot.press("s")
             await until(pilot, lambda: "stopped and latched: x, y, z, c" in str(answer.content))

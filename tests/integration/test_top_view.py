@@ -4,7 +4,7 @@ import asyncio
 from contextlib import asynccontextmanager
 
 from ldcnd.client.trouble import Severity
-from ldcnd.model.commands import Halt, MoveAbsolute, Power, Verb
+from ldcnd.model.commands import Halt, MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, Moving
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.top.columns import as_text, headline
@@ -52,8 +52,8 @@ async def test_every_axis_and_line_of_a_healthy_rig_is_shown_with_its_rates():
 async def test_a_move_shows_where_it_goes_and_who_has_control():
     async with running_rig() as rig, followed(rig) as glance:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=20.0))
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=20.0))
         moving = await until(glance, lambda now: any(row.target is not None for row in now.axes))
         (x,) = [row for row in moving.axes if row.axis == "x"]
 
@@ -64,9 +64,9 @@ async def test_a_move_shows_where_it_goes_and_who_has_control():
 async def test_an_axis_without_trouble_shows_how_its_last_command_ended():
     async with running_rig() as rig, followed(rig) as glance:
         await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
-        await rig.client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=20.0))
-        await rig.client.command("x", Verb.HALT, Halt())
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=20.0))
+        await rig.client.command("x", Halt())
         shown = await until(glance, lambda now: now.axes and now.axes[0].trouble)
 
     assert (shown.axes[0].axis, shown.axes[0].severity) == ("x", Severity.NOTICE)

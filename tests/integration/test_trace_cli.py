@@ -7,7 +7,7 @@ from asyncio.subprocess import PIPE
 import pytest
 
 from ldcnd.client.trace_file import load_trace
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon
 
@@ -46,7 +46,7 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     file, picture = tmp_path / "move.csv", tmp_path / "move.png"
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
-        await rig.command("x", Verb.POWER, Power(on=True))
+        await rig.command("x", Power(on=True))
         channels = ("-c", "position", "-c", "velocity")
         trigger = ("--trigger", "velocity:rising:5", "--pre", "10", "--samples", "100")
         async with asyncio.TaskGroup() as group:
@@ -56,7 +56,7 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
             async with asyncio.timeout(30):
                 while (header := await rig.trace_header("x")) is None or header.phase is TracePhase.FILLING:
                     await asyncio.sleep(0.1)
-            await rig.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=10.0))
+            await rig.command("x", MoveAbsolute(position=10.0))
         refused = await ldcnd("trace", "take", "x", "-e", endpoint, "-c", "torque")
         last = await ldcnd("trace", "last", "x", "-e", endpoint)
     shown = await ldcnd("trace", "show", str(file))

@@ -12,7 +12,7 @@ from ldcnd.errors import (
     TooManyRequests,
     ValueOutOfRange,
 )
-from ldcnd.model.commands import Track, Verb
+from ldcnd.model.commands import Track
 from ldcnd.model.samples import AxisState
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from tests.support.dialect_rig import (
@@ -41,7 +41,7 @@ async def test_an_axis_follows_a_stream_of_set_points(dialect):
         await rig.power_on()
 
         for step in range(1, 26):
-            await rig.send(Verb.TRACK, Track(position=step * 0.1))
+            await rig.send(Track(position=step * 0.1))
             await asyncio.sleep(0.02)
         following = await rig.rig.client.state(AXIS)
         state = await rig.until(lambda state: state.command is None)
@@ -56,17 +56,17 @@ async def test_tracking_needs_a_drive_that_knows_it():
         await rig.power_on()
 
         with pytest.raises(NotSupported, match="cannot track"):
-            await rig.send(Verb.TRACK, Track(position=0.1))
+            await rig.send(Track(position=0.1))
 
 
 async def test_a_set_point_too_far_from_the_last_one_is_refused():
     async with dialect_rig(V4, tracking=TRACKING) as rig:
         await rig.power_on()
-        await rig.send(Verb.TRACK, Track(position=0.5))
+        await rig.send(Track(position=0.5))
         await asyncio.sleep(0.02)
 
         with pytest.raises(ValueOutOfRange, match=r"0\.6 from the last one, the limit is 0\.5") as refusal:
-            await rig.send(Verb.TRACK, Track(position=1.1))
+            await rig.send(Track(position=1.1))
 
         assert refusal.value.nearest == pytest.approx(1.0)
         assert (await rig.rig.client.state(AXIS)).command.verb == "track"
@@ -75,13 +75,13 @@ async def test_a_set_point_too_far_from_the_last_one_is_refused():
 async def test_set_points_faster_than_the_rate_are_refused():
     async with dialect_rig(V4, tracking=TRACKING | {"rate": 5.0}) as rig:
         await rig.power_on()
-        await rig.send(Verb.TRACK, Track(position=0.1))
+        await rig.send(Track(position=0.1))
 
         with pytest.raises(TooManyRequests, match="more than 5 set-points a second"):
-            await rig.send(Verb.TRACK, Track(position=0.2))
+            await rig.send(Track(position=0.2))
 
         await asyncio.sleep(0.2)
-        await rig.send(Verb.TRACK, Track(position=0.2))
+        await rig.send(Track(position=0.2))
 
 
 async def test_the_mean_rate_is_kept_although_single_set_points_may_come_early():
@@ -93,7 +93,7 @@ async def test_the_mean_rate_is_kept_although_single_set_points_may_come_early()
 
         while loop.time() < began_s + 3.0:
             try:
-                await rig.send(Verb.TRACK, Track(position=(taken + 1) * 0.01))
+                await rig.send(Track(position=(taken + 1) * 0.01))
                 taken += 1
             except TooManyRequests:
                 pass
@@ -106,28 +106,28 @@ async def test_a_set_point_keeps_to_reference_and_software_limits():
     async with dialect_rig(V4, tracking=TRACKING, limits={"position_max": 0.3}) as rig:
         await rig.power_on()
         with pytest.raises(PositionLimit):
-            await rig.send(Verb.TRACK, Track(position=0.31))
+            await rig.send(Track(position=0.31))
     async with dialect_rig(V4, tracking=TRACKING, reference="required") as rig:
         await rig.power_on()
         with pytest.raises(NotReferenced):
-            await rig.send(Verb.TRACK, Track(position=0.1))
+            await rig.send(Track(position=0.1))
 
 
 async def test_a_set_point_is_never_sent_twice_and_the_stream_goes_on():
     no_replies = FaultPlan((Fault(FaultKind.REPLY_LOST, from_s=10.0, until_s=10.05),))
     async with dialect_rig(V4, faults=no_replies, tracking=TRACKING) as rig:
         await rig.power_on()
-        await rig.send(Verb.TRACK, Track(position=0.1))
+        await rig.send(Track(position=0.1))
         loop = asyncio.get_running_loop()
         await asyncio.sleep(9.9 - loop.time())
-        await rig.send(Verb.TRACK, Track(position=0.2))
+        await rig.send(Track(position=0.2))
         await asyncio.sleep(10.0001 - loop.time())
 
         with pytest.raises(OutcomeUnknown):
-            await rig.send(Verb.TRACK, Track(position=0.3))
+            await rig.send(Track(position=0.3))
         state = await rig.rig.client.state(AXIS)
         await asyncio.sleep(0.1)
-        await rig.send(Verb.TRACK, Track(position=0.4))
+        await rig.send(Track(position=0.4))
 
         records = rig.rig.daemon.rig.buses[0].bus.wire_log.records()
         sent = [record.data for record in records if record.data[2:4] == b"\x57\x11"]
@@ -138,10 +138,10 @@ async def test_a_set_point_is_never_sent_twice_and_the_stream_goes_on():
 async def test_a_stop_ends_a_stream():
     async with dialect_rig(V4, tracking=TRACKING) as rig:
         await rig.power_on()
-        await rig.send(Verb.TRACK, Track(position=0.1))
+        await rig.send(Track(position=0.1))
 
         await rig.rig.client.stop(AXIS)
         await asyncio.sleep(0.1)
 
         with pytest.raises(Exception, match="a stop is latched"):
-            await rig.send(Verb.TRACK, Track(position=0.2))
+            await rig.send(Track(position=0.2))

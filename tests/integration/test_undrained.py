@@ -12,7 +12,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import StopLatched
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import Power, Reset, Verb
+from ldcnd.model.commands import Power, Reset
 from tests.support.process import ROOT, daemon
 
 pytestmark = [pytest.mark.real_time, pytest.mark.timeout(120)]
@@ -42,12 +42,12 @@ async def answered(rig: RigClient) -> None:
         assert (await rig.stop()).confirmed == ("x", "y", "z", "c")
     async with limit(ANSWERED_WITHIN_S):
         with pytest.raises(StopLatched):
-            await rig.command("x", Verb.POWER, Power(on=True))
+            await rig.command("x", Power(on=True))
     for axis in "xyzc":
         async with limit(ANSWERED_WITHIN_S):
-            await rig.command(axis, Verb.RESET, Reset())
+            await rig.command(axis, Reset())
     async with limit(ANSWERED_WITHIN_S):
-        await rig.command("x", Verb.POWER, Power(on=False))
+        await rig.command("x", Power(on=False))
 
 
 async def test_stops_and_commands_are_answered_in_time_while_fifty_subscribers_never_drain(tmp_path: Path):

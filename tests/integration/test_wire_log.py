@@ -9,7 +9,7 @@ from ldcnd.config.bus import RecorderConfig
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.capture.flight_recorder import LONGEST_DATA_BYTES
 from ldcnd.errors import ValueOutOfRange
-from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
+from ldcnd.model.rig_commands import ReadWireLog
 from ldcnd.wirelog.recorder import WireEvent, parse_records
 from tests.support.rig import SIMULATED, running_rig
 
@@ -37,7 +37,7 @@ async def test_a_long_log_comes_in_pages_without_gap_or_repetition():
         bus = rig.daemon.rig.buses[0].bus
         name = bus.settings.name
 
-        page = await rig.client.rig_command("wire_log", ReadWireLog(bus=name, seconds=3600), WireLogReply)
+        page = await rig.client.ask(ReadWireLog(bus=name, seconds=3600))
         fetched = await fetch_wire_log(rig.client, name, seconds=3600)
 
         assert page.next_record - page.first_record == len(page.lines) > 100
@@ -54,7 +54,7 @@ async def test_a_page_that_was_overwritten_starts_at_the_oldest_record_left():
         await asyncio.sleep(15.0)
         name = rig.daemon.rig.buses[0].bus.settings.name
 
-        page = await rig.client.rig_command("wire_log", ReadWireLog(bus=name, from_record=0), WireLogReply)
+        page = await rig.client.ask(ReadWireLog(bus=name, from_record=0))
 
         log = rig.daemon.rig.buses[0].bus.wire_log
         assert page.first_record >= log.added - len(log.records()) > 0

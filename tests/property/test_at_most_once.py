@@ -17,7 +17,7 @@ from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import PlainCommand
 from ldcnd.errors import LdcndError, RequestRefused
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import MoveRelative, Power, Verb
+from ldcnd.model.commands import MoveRelative, Power
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop
@@ -89,13 +89,13 @@ async def live(chain: Chain, dice: random.Random) -> tuple[int, list[str]]:
     async def client(rig: RigClient) -> None:
         while not (state := await rig.state("x")) or state.link != "up":
             await asyncio.sleep(0.05)
-        await rig.command("x", Verb.POWER, Power(on=True))
+        await rig.command("x", Power(on=True))
         await asyncio.sleep(max(0.0, FAULTS_FROM_S - loop.time()))
         meant = (await rig.daemon()).instance
         step = MoveRelative(distance=500, command_id="step", instance=meant)
         for _ in range(ATTEMPTS):
             try:
-                await rig.command("x", Verb.MOVE_RELATIVE, step, timeout_s=dice.choice((0.01, 0.05, 0.5)))
+                await rig.command("x", step, timeout_s=dice.choice((0.01, 0.05, 0.5)))
                 told.append("accepted")
             except RequestRefused as error:
                 told.append(error.code.value)

@@ -15,7 +15,7 @@ from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.replay import config_of, overheard, play, published_line, virtual_time
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.wirelog.capture import Capture
 
@@ -70,9 +70,9 @@ async def _record(name: str) -> Recording:
         await daemon.wait_up()
         client = RigClient(clients, config.rig)
         await asyncio.sleep(STARTS_AT_S + POWERED_AT_S - loop.time())
-        await client.command("x", Verb.POWER, Power(on=True))
+        await client.command("x", Power(on=True))
         await asyncio.sleep(STARTS_AT_S + MOVED_AT_S - loop.time())
-        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=15.0, client="bench"))
+        await client.command("x", MoveAbsolute(position=15.0, client="bench"))
         await asyncio.sleep(STARTS_AT_S + LENGTH_S - loop.time())
         capture = daemon.capture("line0", "test data")
         kept = tuple(published)

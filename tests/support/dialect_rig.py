@@ -4,9 +4,10 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.commands import AxisCommand, CommandReply, Power, Verb
+from ldcnd.model.commands import AxisCommand, CommandReply, Power
 from ldcnd.model.samples import AxisState, FaultSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultPlan
@@ -20,6 +21,8 @@ AXIS = "x"
 COUNTS_PER_MM = 1000
 GAINS = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000}
 PLANT = MotorPlant(reverse_limit_counts=-20_000, forward_limit_counts=20_000, pot_span_counts=(-25_000, 25_000))
+
+ReplyT = TypeVar("ReplyT", bound=CommandReply)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,19 +58,19 @@ class DialectRig:
     chain: Chain
     drive: SimulatedDrive
 
-    async def send(self, verb: Verb, request: AxisCommand[CommandReply]) -> CommandReply:
+    async def send(self, command: AxisCommand[ReplyT]) -> ReplyT:
         """Send a command to the axis."""
-        return await self.rig.client.command(AXIS, verb, request)
+        return await self.rig.client.command(AXIS, command)
 
-    async def done(self, verb: Verb, request: AxisCommand[CommandReply]) -> StateSample:
+    async def done(self, command: AxisCommand[CommandReply]) -> StateSample:
         """Send a command, wait until it is over, and return the state after it."""
-        reply = await self.send(verb, request)
+        reply = await self.send(command)
         return await self.rig.client.wait_for_end(AXIS, reply.command_id)
 
     async def power_on(self) -> None:
         """Close the loop."""
         await self.until(lambda state: state.state is AxisState.DISABLED)
-        await self.send(Verb.POWER, Power(on=True))
+        await self.send(Power(on=True))
 
     async def until(self, wanted: Callable[[StateSample], bool]) -> StateSample:
         """Wait for a state of the axis."""

@@ -24,10 +24,10 @@ from ldcnd.messaging.codec import (
     reply_encoding,
     to_json,
 )
+from ldcnd.model.catalogue import AXIS_COMMANDS
 from ldcnd.model.commands import ErrorReply, Home, MoveAbsolute, Power, Reset
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import REQUEST_MODELS
 from ldcnd.model.samples import (
     AxisState,
     CurrentCommand,
@@ -184,7 +184,7 @@ def test_an_answer_may_be_longer_than_any_request() -> None:
 
 
 @given(
-    st.sampled_from(list(REQUEST_MODELS.values())),
+    st.sampled_from(list(AXIS_COMMANDS.values())),
     st.binary(max_size=200) | anything.map(msgpack.packb) | anything.map(lambda value: json.dumps(value).encode()),
     st.sampled_from(["application/json", "application/msgpack", "zenoh/bytes"]),
 )

@@ -9,7 +9,7 @@ from ldcnd.daemon.command.ledger import Entry
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import BusDown, SessionError
 from ldcnd.messaging.codec import to_json
-from ldcnd.model.commands import Power, Verb
+from ldcnd.model.commands import Power
 from ldcnd.model.events import CommandStatus, ReadEvents
 
 
@@ -24,7 +24,7 @@ class Told:
     def happens(
         self, status: CommandStatus = CommandStatus.ACCEPTED, error: BusDown | None = None, client: str | None = None
     ) -> None:
-        entry = Entry("c1", "x", Verb.POWER, Power(on=False), client=client, status=status)
+        entry = Entry("c1", "x", Power(on=False), client=client, status=status)
         self.log.changed(entry, error)
 
     def published(self) -> list[tuple[int, int, int, str, str | None]]:

@@ -2,14 +2,14 @@ import pytest
 
 from ldcnd.daemon.command.ledger import REMEMBERED, Entry, Ledger
 from ldcnd.errors import CommandIdReused, StopLatched, UnknownCommand
-from ldcnd.model.commands import CommandReply, Halt, MoveAbsolute, Verb
+from ldcnd.model.commands import CommandReply, Halt, MoveAbsolute
 from ldcnd.model.events import CommandStatus
 
 MOVE = MoveAbsolute(position=1.0)
 
 
-def entry(command_id="c1", request=MOVE, verb=Verb.MOVE_ABSOLUTE) -> Entry:
-    return Entry(command_id, "x", verb, request, "ann")
+def entry(command_id="c1", command=MOVE) -> Entry:
+    return Entry(command_id, "x", command, "ann")
 
 
 @pytest.fixture
@@ -37,23 +37,23 @@ def test_a_repeated_id_is_known_whatever_proves_that_it_may(ledger):
     ledger.open(entry())
 
     again = MOVE.model_copy(update={"lease": "l", "sequence": 7, "not_after": 9, "client": "ann"})
-    assert ledger.repeated("c1", "x", Verb.MOVE_ABSOLUTE, again) == ledger.get("c1")
-    assert ledger.repeated("c2", "x", Verb.MOVE_ABSOLUTE, MOVE) is None
+    assert ledger.repeated("c1", "x", again) == ledger.get("c1")
+    assert ledger.repeated("c2", "x", MOVE) is None
 
 
 @pytest.mark.parametrize(
-    ("axis", "verb", "request_"),
+    ("axis", "command"),
     [
-        ("y", Verb.MOVE_ABSOLUTE, MOVE),
-        ("x", Verb.HALT, Halt()),
-        ("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=2.0)),
+        ("y", MOVE),
+        ("x", Halt()),
+        ("x", MoveAbsolute(position=2.0)),
     ],
 )
-def test_an_id_belongs_to_one_command(ledger, axis, verb, request_):
+def test_an_id_belongs_to_one_command(ledger, axis, command):
     ledger.open(entry())
 
     with pytest.raises(CommandIdReused):
-        ledger.repeated("c1", axis, verb, request_)
+        ledger.repeated("c1", axis, command)
 
 
 def test_a_refusal_is_kept_with_its_reason(ledger, heard):

@@ -10,7 +10,7 @@ from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.messaging.session import Declaration, Qos, Query
-from ldcnd.model.commands import Power, Verb
+from ldcnd.model.commands import Power
 from ldcnd.model.samples import PositionSample
 from tests.support.session_pair import JSON, KEYS, POSITION
 
@@ -89,21 +89,21 @@ async def test_an_error_that_is_news_is_raised_in_words(newer: Newer) -> None:
     await newer.answers(KEYS.all_commands, lambda query: query.reply_error(refusal, JSON))
 
     with pytest.raises(LdcndError, match=r"wait for the new moon \(moon_is_full"):
-        await newer.client.command("x", Verb.POWER, POWER)
+        await newer.client.command("x", POWER)
 
 
 async def test_a_command_that_nobody_answers_although_the_daemon_is_there_is_not_permitted(newer: Newer) -> None:
     await newer.answers(KEYS.daemon, present)
 
     with pytest.raises(SessionError, match="not permitted to command"):
-        await newer.client.command("x", Verb.POWER, POWER)
+        await newer.client.command("x", POWER)
 
 
 async def test_a_command_whose_daemon_has_disappeared_has_an_unknown_outcome(newer: Newer) -> None:
     declared = await newer.answers(KEYS.daemon, present)
     with pytest.raises(SessionError):
-        await newer.client.command("x", Verb.POWER, POWER)  # now it knows the daemon
+        await newer.client.command("x", POWER)  # now it knows the daemon
     await declared.close()
 
     with pytest.raises(OutcomeUnknown, match="no daemon serves rig bench1"):
-        await newer.client.command("x", Verb.POWER, POWER)
+        await newer.client.command("x", POWER)

@@ -19,7 +19,7 @@ from ldcnd.daemon.process.service import Service, describe
 from ldcnd.daemon.process.systemd import Notifier, reloading, status
 from ldcnd.errors import ConfigError, VelocityLimit
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
+from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.rig import EPOCH_NS, SIMULATED
 
@@ -201,8 +201,8 @@ async def test_end_brings_a_moving_axis_to_rest(manager: Manager):
     async with service_of(manager) as (service, daemon, client):
         await daemon.wait_up()
         await asyncio.sleep(1)
-        await client.command("x", Verb.POWER, Power(on=True))
-        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=90))
+        await client.command("x", Power(on=True))
+        await client.command("x", MoveAbsolute(position=90))
         await asyncio.sleep(1)
         assert daemon.rig.axes["x"].tracker.state is AxisState.DISCRETE_MOTION
 
@@ -222,15 +222,15 @@ async def test_reload_is_framed_and_changes_limits_at_once(manager: Manager):
     async with service_of(manager, lambda: changed) as (service, daemon, client):
         await daemon.wait_up()
         await asyncio.sleep(1)
-        await client.command("x", Verb.POWER, Power(on=True))
+        await client.command("x", Power(on=True))
         manager.heard()
 
         service.reload()
 
         messages = [message for message in await manager.listen(1) if message != "WATCHDOG=1"]
         with pytest.raises(VelocityLimit):
-            await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1, velocity=6))
-        reply = await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1))
+            await client.command("x", MoveAbsolute(position=1, velocity=6))
+        reply = await client.command("x", MoveAbsolute(position=1))
     assert messages[0] == "RELOADING=1\nMONOTONIC_USEC=1234567"
     assert messages[1].startswith("READY=1\nSTATUS=rig sim: 1/1 buses")
     assert reply.velocity == pytest.approx(4.0, rel=0.01)
@@ -242,8 +242,8 @@ async def test_reload_does_not_touch_a_motion(manager: Manager):
     async with service_of(manager, lambda: changed) as (service, daemon, client):
         await daemon.wait_up()
         await asyncio.sleep(1)
-        await client.command("x", Verb.POWER, Power(on=True))
-        await client.command("x", Verb.MOVE_ABSOLUTE, MoveAbsolute(position=20))
+        await client.command("x", Power(on=True))
+        await client.command("x", MoveAbsolute(position=20))
 
         service.reload()
         await asyncio.sleep(2)

@@ -14,7 +14,6 @@ from ldcnd.errors import OutcomeUnknown
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, encode
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import Verb
 from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, AbortTrace, TakeTrace, TraceChannel, TracePhase, TraceSource
 
 LONG = -1.2345678901234567e-300
@@ -95,7 +94,7 @@ async def until(publisher, phase):
 async def test_the_longest_trace_of_the_longest_numbers_fits_into_payloads():
     tracer = FakeTracer(MOST_CHANNELS)
     async with recording(tracer) as (recorder, publisher):
-        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        await recorder.carry_out("t-1", REQUEST)
         tracer.traces[0].outcome.set_result(recorded(MOST_SAMPLES, MOST_CHANNELS, LONG))
         await until(publisher, TracePhase.COMPLETE)
         last = dict(publisher.last)
@@ -111,7 +110,7 @@ async def test_a_shorter_trace_leaves_no_chunk_of_the_longer_one_before():
     tracer = FakeTracer()
     async with recording(tracer) as (recorder, publisher):
         for number, samples in enumerate((2000, 10)):
-            await recorder.carry_out(f"t-{number}", Verb.TRACE, REQUEST)
+            await recorder.carry_out(f"t-{number}", REQUEST)
             tracer.traces[number].outcome.set_result(recorded(samples, 1))
             await until(publisher, TracePhase.COMPLETE)
         keys = list(publisher.last)
@@ -123,10 +122,10 @@ async def test_a_shorter_trace_leaves_no_chunk_of_the_longer_one_before():
 async def test_a_bug_in_a_tracer_ends_its_trace_only():
     tracer = FakeTracer()
     async with recording(tracer) as (recorder, publisher):
-        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        await recorder.carry_out("t-1", REQUEST)
         tracer.traces[0].outcome.set_exception(ZeroDivisionError())
         await until(publisher, TracePhase.FAILED)
-        reply = await recorder.carry_out("t-2", Verb.TRACE, REQUEST)
+        reply = await recorder.carry_out("t-2", REQUEST)
 
     assert reply.trace_id == "t-2"
 
@@ -134,8 +133,8 @@ async def test_a_bug_in_a_tracer_ends_its_trace_only():
 async def test_an_abort_in_the_same_moment_as_the_arming_still_ends_the_trace():
     tracer = FakeTracer()
     async with recording(tracer) as (recorder, publisher):
-        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
-        reply = await recorder.carry_out("t-2", Verb.TRACE_ABORT, AbortTrace())
+        await recorder.carry_out("t-1", REQUEST)
+        reply = await recorder.carry_out("t-2", AbortTrace())
 
         assert (reply.trace_id, header(publisher).phase) == ("t-1", TracePhase.ABORTED)
 
@@ -143,10 +142,10 @@ async def test_an_abort_in_the_same_moment_as_the_arming_still_ends_the_trace():
 async def test_an_abort_that_takes_too_long_says_that_nobody_knows():
     tracer = FakeTracer()
     async with recording(tracer) as (recorder, publisher):
-        await recorder.carry_out("t-1", Verb.TRACE, REQUEST)
+        await recorder.carry_out("t-1", REQUEST)
         tracer.traces[0].stubborn = True
 
         with pytest.raises(OutcomeUnknown, match="did not leave its trace"):
-            await recorder.carry_out("t-2", Verb.TRACE_ABORT, AbortTrace())
+            await recorder.carry_out("t-2", AbortTrace())
 
         assert header(publisher).phase is TracePhase.RECORDING

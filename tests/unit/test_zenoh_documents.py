@@ -13,11 +13,10 @@ from ldcnd.daemon.publish.asyncapi import asyncapi_document, asyncapi_text
 from ldcnd.daemon.publish.contract import Kind, all_schemas, as_markdown, channels
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding
 from ldcnd.messaging.keys import Keys, matches
+from ldcnd.model.catalogue import AXIS_COMMANDS, RIG_COMMANDS
 from ldcnd.model.commands import Verb
 from ldcnd.model.frozen import Frozen, schema_name
-from ldcnd.model.requests import REQUEST_MODELS
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.verbs import RIG_VERBS
 from ldcnd.pki.access import RULES
 
 ROOT = Path(__file__).parents[2]
@@ -78,7 +77,7 @@ def test_every_verb_and_every_item_is_a_channel() -> None:
     keys = {spelled(channel.key) for channel in channels()}
 
     assert {KEYS.command("axis", verb) for verb in Verb} <= keys
-    assert {KEYS.command("_", verb) for verb in RIG_VERBS} <= keys
+    assert {KEYS.command("_", verb) for verb in RIG_COMMANDS} <= keys
     assert {KEYS.telemetry("axis", item) for item in TelemetryItem} <= keys
     assert {KEYS.stop(), KEYS.stop("axis")} <= keys
 
@@ -105,7 +104,7 @@ def test_every_payload_has_a_public_schema() -> None:
 
 
 def test_no_verb_of_the_rig_is_described_as_a_motion_of_an_axis() -> None:
-    assert not {models.request for models in RIG_VERBS.values()} & set(REQUEST_MODELS.values())
+    assert not set(RIG_COMMANDS.values()) & set(AXIS_COMMANDS.values())
 
 
 def test_channel_names_are_unique() -> None:

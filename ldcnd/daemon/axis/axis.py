@@ -25,14 +25,25 @@ from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
-from ldcnd.daemon.trace.recorder import TRACE_VERBS, TraceRecorder
+from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, LdcndError, NotSupported, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
-from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Move, PlanReply, Preview, Verb
+from ldcnd.model.commands import (
+    AxisCommand,
+    BufferMode,
+    Capability,
+    CommandReply,
+    Move,
+    PlanReply,
+    Preview,
+    QuickStop,
+    Stop,
+    Verb,
+)
 from ldcnd.model.samples import Moving, TelemetryItem
 
 log = get_logger("axis")
@@ -249,16 +260,14 @@ class AxisService:
 
     async def execute(
         self,
-        verb: Verb,
-        request: AxisCommand[CommandReply],
+        command: AxisCommand[CommandReply],
         command_id: str | None = None,
         permit: Permit | None = None,
     ) -> CommandReply:
         """Carry out a command in its turn; returns once the drive has acknowledged it.
 
         Args:
-            verb: what to do.
-            request: with which values.
+            command: what to do.
             command_id: names the command; one is made when it is missing.
             permit: as made when it was admitted; a caller inside the daemon needs none.
 
@@ -267,20 +276,22 @@ class AxisService:
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
         command_id = command_id or self._next_command_id()
-        if verb in (Verb.STOP, Verb.QUICK_STOP) and self.stoppable:
-            await self.stop(StopMode.SMOOTH if verb is Verb.STOP else StopMode.ABRUPT)
-            return CommandReply(command_id=command_id, axis=self.config.name, verb=verb)
-        if verb not in self.driver.capabilities:
+        if isinstance(command, Stop | QuickStop) and self.stoppable:
+            await self.stop(StopMode.SMOOTH if isinstance(command, Stop) else StopMode.ABRUPT)
+            return CommandReply(command_id=command_id, axis=self.config.name, verb=command.verb)
+        if command.verb not in self.driver.capabilities:
             raise NotSupported(
-                f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
+                f"axis {self.config.name}: {self.config.model} cannot {command.verb}",
+                axis=self.config.name,
+                value=command.verb.value,
             )
-        turn = Turn(command_id, verb, permit or self.permit(verb))
+        turn = Turn(command_id, command.verb, permit or self.permit(command.verb))
         turn.permit.ask()
         if not self._turns.free:
-            return await self._turns.wait(turn, request)
+            return await self._turns.wait(turn, command)
         try:
             async with self._turns.at_work:
-                return await self._obey(turn, request)
+                return await self._obey(turn, command)
         finally:
             if not math.isinf(self._commands.deadline_s):
                 self._turns.wake()  # for the steps of what has begun
@@ -360,13 +371,13 @@ class AxisService:
             return True
         return False
 
-    async def _obey(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
+    async def _obey(self, turn: Turn, command: AxisCommand[CommandReply]) -> CommandReply:
         turn.permit.ask()
-        if turn.verb in TRACE_VERBS:
-            return await self.traces.carry_out(turn.command_id, turn.verb, request)
-        if self._parameters and Parameters.takes(turn.verb):
-            return await self._parameters.carry_out(turn.command_id, turn.verb, request)
-        return await self._commands.carry_out(turn, request)
+        if command.capability is Capability.TRACES:
+            return await self.traces.carry_out(turn.command_id, command)
+        if self._parameters and command.capability is Capability.PARAMETERS:
+            return await self._parameters.carry_out(turn.command_id, command)
+        return await self._commands.carry_out(turn, command)
 
     def _require_reachable(self) -> None:
         guards.check_reachable(self.tracker.view())

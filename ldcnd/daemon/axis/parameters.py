@@ -3,19 +3,22 @@
 from ldcnd.drivers.driver import AxisDriver
 from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.errors import NotSupported
-from ldcnd.model.commands import AxisCommand, CommandReply, Verb
+from ldcnd.model.commands import AxisCommand, CommandReply
 from ldcnd.model.parameters import (
     AlarmReport,
     ClearCounter,
     CounterReply,
     DriveProfile,
+    ListParameters,
     ParameterDump,
     ParameterList,
     ParameterReply,
+    ReadAlarms,
+    ReadAllParameters,
     ReadParameter,
+    ReadProfile,
     WriteParameter,
 )
-from ldcnd.model.requests import REPLY_MODELS
 
 
 class Parameters:
@@ -25,26 +28,26 @@ class Parameters:
         self._driver = driver
         self._access = access
 
-    @staticmethod
-    def takes(verb: Verb) -> bool:
-        """Tell whether a verb is one of these."""
-        return verb in REPLY_MODELS
-
-    async def carry_out(self, command_id: str, verb: Verb, request: AxisCommand[CommandReply]) -> CommandReply:
-        """Do what the request says.
+    async def carry_out(self, command_id: str, command: AxisCommand[CommandReply]) -> CommandReply:
+        """Do what the command says.
 
         Raises:
             RequestRefused: it cannot be done; nothing was changed.
             DriveFault: the drive declined.
             BusError: the line failed; `OutcomeUnknown` when a write could not be read back.
         """
-        axis, access = self._driver.spec.name, self._access
-        match request:
+        axis, access, verb = self._driver.spec.name, self._access, command.verb
+        match command:
+            case ListParameters():
+                return ParameterList(command_id=command_id, axis=axis, verb=verb, parameters=access.known())
             case ReadParameter():
-                value = await access.read(request.parameter, unlisted=request.unlisted)
+                value = await access.read(command.parameter, unlisted=command.unlisted)
                 return ParameterReply(command_id=command_id, axis=axis, verb=verb, value=value)
+            case ReadAllParameters():
+                values = await access.read_all()
+                return ParameterDump(command_id=command_id, axis=axis, verb=verb, values=values)
             case WriteParameter():
-                done = await access.write(request)
+                done = await access.write(command)
                 return ParameterReply(
                     command_id=command_id,
                     axis=axis,
@@ -63,22 +66,10 @@ class Parameters:
                     value=cleared.value,
                     remarks=cleared.remarks,
                 )
-            case _:
-                return await self._told(command_id, verb)
-
-    async def _told(self, command_id: str, verb: Verb) -> CommandReply:
-        """Answer the verbs that take no value."""
-        axis, access = self._driver.spec.name, self._access
-        match verb:
-            case Verb.LIST_PARAMETERS:
-                return ParameterList(command_id=command_id, axis=axis, verb=verb, parameters=access.known())
-            case Verb.READ_ALL_PARAMETERS:
-                values = await access.read_all()
-                return ParameterDump(command_id=command_id, axis=axis, verb=verb, values=values)
-            case Verb.READ_ALARMS:
+            case ReadAlarms():
                 present, history = await access.alarms()
                 return AlarmReport(command_id=command_id, axis=axis, verb=verb, present=present, history=history)
-            case Verb.READ_PROFILE:
+            case ReadProfile():
                 return DriveProfile(
                     command_id=command_id,
                     axis=axis,

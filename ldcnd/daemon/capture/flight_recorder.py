@@ -14,6 +14,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.messaging.codec import to_json
 from ldcnd.messaging.keys import RIG_ITSELF
+from ldcnd.model.commands import Command
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.rig_commands import ReadWireLog, WireLogReply
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
@@ -35,15 +36,15 @@ class Journal:
         self._logs = {name: [log] for log, names in logs for name in names}
         self._logs[RIG_ITSELF] = [log for log, _ in logs]
 
-    def asked(self, axis: str, verb: str, request: Frozen, lease: str | None = None) -> None:
+    def asked(self, axis: str, command: Command[Frozen], lease: str | None = None) -> None:
         """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
-        token = lease or getattr(request, "lease", None)
+        token = lease or getattr(command, "lease", None)
         if token is None:
-            payload = to_json(request, exclude_defaults=True)
+            payload = to_json(command, exclude_defaults=True)
         else:
-            fields = request.model_dump(mode="json", exclude_defaults=True)
+            fields = command.model_dump(mode="json", exclude_defaults=True)
             payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":")).encode()
-        self._note(axis, f"{axis}/{verb} ".encode() + payload)
+        self._note(axis, f"{axis}/{command.verb} ".encode() + payload)
 
     def stopped(self, axis: str | None) -> None:
         """Note a stop of an axis, or of the rig."""

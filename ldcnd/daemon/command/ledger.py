@@ -18,7 +18,7 @@ class Entry:
     """One command.
 
     Attributes:
-        request: what was asked; a repetition must ask the same.
+        command: what was asked; a repetition must ask the same.
         client: who asked, as far as that is known.
         login: whose link it came over, if that has a certificate.
         status: how far it has got.
@@ -28,13 +28,17 @@ class Entry:
 
     command_id: str
     axis: str
-    verb: Verb
-    request: AxisCommand[CommandReply]
+    command: AxisCommand[CommandReply]
     client: str | None
     login: str | None = None
     status: CommandStatus = CommandStatus.ACCEPTED
     reason: str | None = None
     answer: CommandReply | LdcndError | None = None
+
+    @property
+    def verb(self) -> Verb:
+        """The verb of the command."""
+        return self.command.verb
 
 
 class Ledger:
@@ -49,14 +53,14 @@ class Ledger:
         self._entries: OrderedDict[str, Entry] = OrderedDict()
         self._changed = changed
 
-    def repeated(self, command_id: str, axis: str, verb: Verb, request: AxisCommand[CommandReply]) -> Entry | None:
+    def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> Entry | None:
         """Return the entry that this id has already, or None when it is new.
 
         Raises:
             CommandIdReused: the id belongs to another command.
         """
         entry = self._entries.get(command_id)
-        if entry and (entry.axis, entry.verb, _content(entry.request)) != (axis, verb, _content(request)):
+        if entry and (entry.axis, entry.verb, _content(entry.command)) != (axis, command.verb, _content(command)):
             raise CommandIdReused(
                 f"command id {command_id!r} belongs to {entry.verb} of axis {entry.axis}",
                 axis=axis,
@@ -117,8 +121,7 @@ class Ledger:
         entry = self._entries[entry.command_id] = Entry(
             command_id=entry.command_id,
             axis=entry.axis,
-            verb=entry.verb,
-            request=entry.request,
+            command=entry.command,
             client=entry.client,
             login=entry.login,
             status=status,
@@ -135,7 +138,7 @@ class Ledger:
                 return
 
 
-def _content(request: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:
-    """Return what a request asks for, without what only proves that it may."""
+def _content(command: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:
+    """Return what a command asks for, without what only proves that it may."""
     proofs = dict.fromkeys(("client", "lease", "sequence", "instance", "not_after"))
-    return request.model_copy(update=proofs)
+    return command.model_copy(update=proofs)

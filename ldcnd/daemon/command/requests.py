@@ -2,23 +2,19 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from functools import partial
 
-from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.capture.flight_recorder import Journal
-from ldcnd.daemon.command.dispatch import Control, move_together
-from ldcnd.daemon.command.loss import LeaseWatch, rehearse
+from ldcnd.daemon.command.dispatch import Dispatcher
+from ldcnd.daemon.command.loss import LeaseWatch
 from ldcnd.daemon.line.rig import Rig
-from ldcnd.errors import InternalError, LdcndError, MalformedRequest, ShuttingDown, TooManyRequests, UnknownVerb
+from ldcnd.errors import InternalError, LdcndError, ShuttingDown, TooManyRequests, UnknownVerb
 from ldcnd.log import LogLimit, get_logger
 from ldcnd.messaging.codec import decode, encode, reply_encoding
-from ldcnd.messaging.keys import RIG_ITSELF, Keys
+from ldcnd.messaging.keys import RIG_ITSELF, CommandAddress, Keys
 from ldcnd.messaging.session import Query
-from ldcnd.model.commands import MoveAbsolute, PlanReply, Preview, Stop, StopReply, Verb, Why
+from ldcnd.model.catalogue import BY_VERB
+from ldcnd.model.commands import About, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.requests import REQUEST_MODELS
-from ldcnd.model.rig_commands import MoveTogether, MoveTogetherReply, Rehearse
-from ldcnd.model.verbs import MOVE_TOGETHER, PLAN, REHEARSE, WHY
 
 log = get_logger("requests")
 
@@ -31,9 +27,11 @@ PENDING_REQUESTS = 64
 class Requests:
     """Answers the command and stop queries of one rig, each exactly once."""
 
-    def __init__(self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, control: Control, leases: LeaseWatch) -> None:
+    def __init__(
+        self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, dispatcher: Dispatcher, leases: LeaseWatch
+    ) -> None:
         self._rig = rig
-        self._control = control
+        self._dispatcher = dispatcher
         self._leases = leases
         self._keys = keys
         self._group = group
@@ -89,43 +87,11 @@ class Requests:
         address = self._keys.parse_command(query.key)
         if self._closing:
             raise ShuttingDown("the daemon is stopping", axis=address.axis)
-        if address.axis == RIG_ITSELF and address.verb == REHEARSE:
-            rehearsal = decode(Rehearse, query.payload, query.encoding)
-            self._journal.asked(RIG_ITSELF, REHEARSE, rehearsal)
-            return await rehearse(self._rig, rehearsal)
-        if address.axis == RIG_ITSELF and address.verb == MOVE_TOGETHER:
-            request = decode(MoveTogether, query.payload, query.encoding)
-            self._journal.asked(RIG_ITSELF, MOVE_TOGETHER, request)
-            return await self._move_together(request, query.login)
-        if address.axis == RIG_ITSELF:
-            return self._control.rig.answer(address.verb, query.payload, query.encoding)
-        axis = self._rig.axis(address.axis)
-        if address.verb == WHY:
-            return self._control.commands.why(axis, decode(Why, query.payload, query.encoding))
-        if address.verb == PLAN:
-            return self._plan(axis, decode(Preview, query.payload, query.encoding))
-        try:
-            verb = Verb(address.verb)
-        except ValueError:
-            raise UnknownVerb(
-                f"there is no command {address.verb!r}; there are {', '.join(Verb)}",
-                axis=address.axis,
-                value=address.verb,
-            ) from None
-        command = decode(REQUEST_MODELS[verb], query.payload, query.encoding)
-        self._journal.asked(address.axis, verb, command)
-        return await self._control.commands.carry_out(address.axis, verb, command, query.login)
-
-    async def _move_together(self, request: MoveTogether, login: str | None) -> MoveTogetherReply:
-        moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in request.moves}
-        if len(moves) < len(request.moves):
-            raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
-        replies = await move_together(self._rig, moves, partial(self._control.commands.carry_out, login=login))
-        return MoveTogetherReply(replies=replies)
-
-    def _plan(self, axis: AxisService, request: Preview) -> PlanReply:
-        why = self._control.commands.why(axis, Why(absolute=request.position is not None))
-        return axis.preview(request, tuple(cause.text for cause in why.causes))
+        if address.axis != RIG_ITSELF:
+            self._rig.axis(address.axis)  # an unknown axis is refused before an unknown verb
+        kind = _command_class(address)
+        command = decode(kind, query.payload, query.encoding)
+        return await self._dispatcher.answer(address.axis, command, query.login)
 
     async def _stop(self, query: Query) -> Frozen:
         """Stop even if the payload is nonsense: a stop is always accepted."""
@@ -175,7 +141,7 @@ class Requests:
         except LdcndError:
             request = Stop()
         try:
-            self._control.commands.stopped(names, confirmed, request, query.login)
+            self._dispatcher.stopped(names, confirmed, request, query.login)
         except Exception:
             log.exception("stop not entered into the events", key=query.key)
 
@@ -187,3 +153,17 @@ class Requests:
         if (fields := self._refusals_logged.admit()) is not None:
             log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
         query.refuse(error)
+
+
+def _command_class(address: CommandAddress) -> type[Command[Frozen]]:
+    """Return what a key stands for.
+
+    Raises:
+        UnknownVerb: there is no such command.
+    """
+    axis = None if address.axis == RIG_ITSELF else address.axis
+    known = BY_VERB[About.RIG if axis is None else About.AXIS]
+    if command := known.get(address.verb):
+        return command
+    whose = "the rig has" if axis is None else "there is"
+    raise UnknownVerb(f"{whose} no command {address.verb!r}, only {', '.join(known)}", axis=axis, value=address.verb)

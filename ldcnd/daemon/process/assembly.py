@@ -13,8 +13,8 @@ from ldcnd.config.bus import BusConfig
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.authority import random_token
-from ldcnd.daemon.command.dispatch import build_control
+from ldcnd.daemon.command.authority import Authority, random_token
+from ldcnd.daemon.command.dispatch import Dispatcher
 from ldcnd.daemon.command.events import EventLog
 from ldcnd.daemon.command.ledger import Ledger
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
@@ -91,15 +91,13 @@ def build_daemon(
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
     buses = tuple(_build_bus(config, bus, make_axis, chains, openers, eeprom) for bus in config.bus)
     rig = Rig(config.rig, buses, groups)
-    leased = config.authority == "leased"
-    control = build_control(
-        rig, ledger, events, clock, next_command_id, instance=instance, leased=leased, next_token=next_token
-    )
+    authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
+    dispatcher = Dispatcher(rig, authority, ledger, events, clock, next_command_id, instance)
 
     def eeprom_writes(axis: AxisService) -> int | None:
         return eeprom.total(axis.config.name) if eeprom and axis.driver.parameters else None
 
-    return Daemon(config, session, rig, control, publisher, clock, instance, eeprom_writes)
+    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, eeprom_writes)
 
 
 def _build_bus(

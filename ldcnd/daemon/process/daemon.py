@@ -7,7 +7,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
 from ldcnd.daemon.capture.watch import CaptureWatch
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.dispatch import Control
+from ldcnd.daemon.command.dispatch import Dispatcher
 from ldcnd.daemon.command.loss import LeaseWatch, apply_policy
 from ldcnd.daemon.command.requests import Requests
 from ldcnd.daemon.line.rig import Rig
@@ -46,14 +46,14 @@ class Daemon:
         config: RigConfig,
         session: Session,
         rig: Rig,
-        control: Control,
+        dispatcher: Dispatcher,
         publisher: Publisher,
         clock: Clock,
         instance: str,
         eeprom_writes: EepromWrites,
     ) -> None:
         self.rig = rig
-        self._control = control
+        self._dispatcher = dispatcher
         self._config = config
         self._session = session
         self._keys = Keys(config.rig)
@@ -117,9 +117,9 @@ class Daemon:
         refused, what moves comes to rest, tokens go, lines close.
         """
         async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
-            declared.callback(self._control.events.tell)  # last of all
-            leases = LeaseWatch(self.rig, self._control.authority, self._run.clock, group)
-            requests = Requests(self.rig, self._keys, group, self._control, leases)
+            declared.callback(self._dispatcher.events.tell)  # last of all
+            leases = LeaseWatch(self.rig, self._dispatcher.authority, self._run.clock, group)
+            requests = Requests(self.rig, self._keys, group, self._dispatcher, leases)
             serving = [group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses]
             try:
                 await self._declare(declared, requests)
@@ -167,7 +167,7 @@ class Daemon:
         if address.axis is not None or address.instance == self._run.instance:
             return
         log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
-        self._control.commands.rival = address.instance if alive else None
+        self._dispatcher.rival = address.instance if alive else None
 
     async def _come_to_rest(self) -> None:
         """The daemon ends: do to each axis what its policy says; bounded."""

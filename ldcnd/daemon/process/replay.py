@@ -23,7 +23,7 @@ from ldcnd.messaging.codec import Encoding, as_json
 from ldcnd.messaging.keys import RIG_ITSELF, Keys
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.messaging.session import Qos, Sample, SampleKind
-from ldcnd.model.verbs import ACQUIRE
+from ldcnd.model.rig_commands import Acquire
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.transport.port_url import SOCKET
 from ldcnd.wirelog.capture import Capture, CaptureHeader
@@ -197,7 +197,7 @@ def _query(keys: Keys, text: str) -> tuple[str, bytes]:
     if axis == STOP:
         return keys.stop(verb or None), b""
     fields = json.loads(payload)
-    if (axis, verb) == (RIG_ITSELF, ACQUIRE):
+    if (axis, verb) == (RIG_ITSELF, Acquire.verb):
         fields.pop("lease", None)  # that was the answer
     return keys.command(axis, verb), json.dumps(fields).encode()
 
@@ -206,5 +206,5 @@ def _tokens(records: tuple[WireRecord, ...]) -> Iterator[str | None]:
     """Yield what the leases that were given are known by in the capture."""
     for record in records:
         name, _, payload = record.data.decode(errors="replace").partition(" ")
-        if record.event is WireEvent.COMMAND and name == f"{RIG_ITSELF}/{ACQUIRE}":
+        if record.event is WireEvent.COMMAND and name == f"{RIG_ITSELF}/{Acquire.verb}":
             yield json.loads(payload).get("lease")

@@ -8,6 +8,7 @@ import json
 
 from ldcnd.daemon.publish.contract import Channel, Kind, channels
 from ldcnd.messaging.codec import Encoding
+from ldcnd.model.catalogue import MODELS
 from ldcnd.model.commands import ErrorReply
 from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.version import version
@@ -30,7 +31,7 @@ def asyncapi_document() -> dict[str, object]:
     for channel in found:
         for model in (channel.sent, channel.taken):
             if model:
-                models[schema_name(model)] = model
+                models[schema_name(model)] = MODELS.get(schema_name(model), model)
     schemas: dict[str, object] = {}
     for name, model in models.items():
         schemas[name] = _schema(model, schemas)

@@ -12,17 +12,15 @@ from types import MappingProxyType
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.messaging.keys import EVENT, RIG_ITSELF, Keys
-from ldcnd.model.catalogue import PUBLIC_MODELS
-from ldcnd.model.commands import CommandReply, Stop, StopReply
+from ldcnd.model.catalogue import COMMANDS, PUBLIC_MODELS
+from ldcnd.model.commands import About, Stop, StopReply
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen, schema_name, schema_text
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
 from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.model.traces import TraceChunk, TraceHeader
-from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
 _NAMES = ("rig", "axis", "bus", "monitor")
 _STAND_IN = "the_{}_here"
@@ -76,7 +74,7 @@ class Channel:
 
 def channels() -> tuple[Channel, ...]:
     """Return all channels of one rig, in the order in which they are documented."""
-    return (*_telemetry(), *_descriptions(), *_axis_commands(), *_rig_commands(), *_stops())
+    return (*_telemetry(), *_descriptions(), *_commands(), *_stops())
 
 
 def _telemetry() -> Iterator[Channel]:
@@ -106,16 +104,10 @@ def _descriptions() -> Iterator[Channel]:
     yield _channel(_KEYS.bus_health(_BUS), Kind.HEALTH, BusHealth)
 
 
-def _axis_commands() -> Iterator[Channel]:
-    for verb, model in REQUEST_MODELS.items():
-        yield _channel(_KEYS.command(_AXIS, verb), Kind.COMMAND, REPLY_MODELS.get(verb, CommandReply), model)
-    for question, models in AXIS_QUESTIONS.items():
-        yield _channel(_KEYS.command(_AXIS, question), Kind.COMMAND, models.reply, models.request)
-
-
-def _rig_commands() -> Iterator[Channel]:
-    for verb, models in RIG_VERBS.items():
-        yield _channel(_KEYS.command(RIG_ITSELF, verb), Kind.COMMAND, models.reply, models.request)
+def _commands() -> Iterator[Channel]:
+    for command in COMMANDS:
+        key = _KEYS.command(RIG_ITSELF if command.about is About.RIG else _AXIS, command.verb)
+        yield _channel(key, Kind.COMMAND, command.reply_model(), command)
 
 
 def _stops() -> Iterator[Channel]:

@@ -16,14 +16,13 @@ from ldcnd.errors import ErrorCode
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
 from ldcnd.messaging.session import Query
-from ldcnd.model.commands import CommandReply, Verb
+from ldcnd.model.catalogue import COMMANDS
+from ldcnd.model.commands import About, Verb
 from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo, RegisterInfo
 from ldcnd.model.plan import RigPlan
-from ldcnd.model.requests import REPLY_MODELS, REQUEST_MODELS
 from ldcnd.model.samples import Sample, TelemetryItem
-from ldcnd.model.verbs import AXIS_QUESTIONS, RIG_VERBS
 
 WORK_PER_STEP = 16
 """Payloads that go into an answer in one turn of the loop; to encode a sample counts for 4, a description for 16."""
@@ -222,21 +221,16 @@ def axis_info(bus: BusService, axis: AxisService) -> AxisInfo:
 
 def command_list() -> CommandList:
     """Describe all commands."""
-    motions = [
-        ("<axis>", verb.value, model, REPLY_MODELS.get(verb, CommandReply)) for verb, model in REQUEST_MODELS.items()
-    ]
-    questions = [("<axis>", verb, models.request, models.reply) for verb, models in AXIS_QUESTIONS.items()]
-    rig = [(RIG_ITSELF, verb, models.request, models.reply) for verb, models in RIG_VERBS.items()]
     return CommandList(
         commands=tuple(
             CommandInfo(
-                verb=verb,
-                key=f"@cmd/{whom}/{verb}",
-                summary=(request.__doc__ or "").strip().splitlines()[0],
-                request_schema=schema_name(request),
-                reply_schema=schema_name(reply),
+                verb=command.verb,
+                key=f"@cmd/{RIG_ITSELF if command.about is About.RIG else '<axis>'}/{command.verb}",
+                summary=command.summary(),
+                request_schema=schema_name(command),
+                reply_schema=schema_name(command.reply_model()),
             )
-            for whom, verb, request, reply in (*motions, *questions, *rig)
+            for command in COMMANDS
         ),
         errors=tuple(code.value for code in ErrorCode),
         encodings=tuple(encoding.value for encoding in Encoding),

@@ -18,7 +18,6 @@ from ldcnd.model.traces import AbortTrace, TakeTrace, TraceAbortReply, TraceChun
 
 log = get_logger("trace")
 
-TRACE_VERBS = frozenset({Verb.TRACE, Verb.TRACE_ABORT})
 ABORT_S = 8.0
 """Longer than a drive's recorder may take to be left on a bad line."""
 CHUNK_BYTES = 12_000
@@ -60,7 +59,7 @@ class TraceRecorder:
         """What can be recorded."""
         return self._tracer.channels
 
-    async def carry_out(self, command_id: str, verb: Verb, request: AxisCommand[CommandReply]) -> CommandReply:
+    async def carry_out(self, command_id: str, command: AxisCommand[CommandReply]) -> CommandReply:
         """Arm or abort a trace; called by the axis in turn with its other commands.
 
         Raises:
@@ -70,13 +69,15 @@ class TraceRecorder:
             DriveFault: the drive declined.
             BusError: the line failed.
         """
-        match request:
+        match command:
             case TakeTrace():
-                return await self._arm(command_id, request)
+                return await self._arm(command_id, command)
             case AbortTrace():
                 return await self._abort(command_id)
             case _:
-                raise NotSupported(f"axis {self._axis}: {verb} is not for traces", axis=self._axis, value=verb.value)
+                raise NotSupported(
+                    f"axis {self._axis}: {command.verb} is not for traces", axis=self._axis, value=command.verb
+                )
 
     def disconnected(self) -> None:
         """The line, or the drive's power, is gone."""

@@ -37,9 +37,9 @@ from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, s
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
 from ldcnd.exchange import Exchange
-from ldcnd.model.commands import HomeMethod, PinMode, Verb
+from ldcnd.model.catalogue import verbs_for
+from ldcnd.model.commands import Capability, HomeMethod, PinMode, Verb
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.verb import PARAMETER_CAPABILITIES
 
 SOURCES = MappingProxyType(
     {
@@ -452,4 +452,4 @@ def _capabilities(profile: Profile) -> frozenset[Verb]:
         Verb.SET_OUTPUTS: not profile.limit_outputs,
     }
     able = frozenset(capability for capability in Verb if not lacking.get(capability, False))
-    return able - PARAMETER_CAPABILITIES
+    return able - verbs_for(Capability.PARAMETERS)

@@ -37,9 +37,9 @@ from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.trace import SmartStepTracer
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.exchange import Timing
-from ldcnd.model.commands import HomeMethod
+from ldcnd.model.catalogue import verbs_for
+from ldcnd.model.commands import Capability, HomeMethod
 from ldcnd.model.samples import MonitorName, TelemetryItem
-from ldcnd.model.verb import PARAMETER_CAPABILITIES, TRACE_CAPABILITIES
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class SmartStepAxis(ReadOnlyAxis):
         self.spec = spec.axis
         self.profile = spec.profile
         self.identity: str | None = None
-        self.capabilities = PARAMETER_CAPABILITIES | TRACE_CAPABILITIES
+        self.capabilities = verbs_for(Capability.PARAMETERS, Capability.TRACES)
         self.adc_full_scale = None
         self.home_methods: frozenset[HomeMethod] = frozenset()
         self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
