@@ -5,7 +5,7 @@ import asyncio
 from ldcnd.daemon.publish.meta import COUNTERS_HZ, axis_info, command_list
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import Home, Power, SetGains, Verb
+from ldcnd.model.commands import Home, Power, SetGains
 from tests.support.rig import RunningRig, running_rig
 
 KEYS = Keys("sim")
@@ -55,15 +55,15 @@ async def test_the_description_of_an_axis_is_as_new_as_the_axis():
         (bus,) = rig.daemon.rig.buses
         axis = rig.daemon.rig.axis("x")
         stale = []
-        for verb, request in (
-            (Verb.POWER, Power(on=True)),
-            (Verb.SET_GAINS, SetGains(kp=123)),
-            (Verb.HOME, Home()),
+        for command in (
+            Power(on=True),
+            SetGains(kp=123),
+            Home(),
         ):
-            await rig.client.command("x", verb, request)
+            await rig.client.command("x", command)
             fresh, _ = encode(axis_info(bus, axis), Encoding.JSON)
             if await payload(rig, KEYS.axis("x")) != fresh:
-                stale.append(verb)
+                stale.append(command.verb)
 
     assert stale == []
 
