@@ -94,7 +94,7 @@ async def test_a_daemon_that_was_started_anew_is_told():
     async with running_rig() as rig, follow_events(rig.client) as events:
         await commands(rig, 1)
         await taken(events, 1)
-        log = rig.daemon._control.rig._events
+        log = rig.daemon._dispatcher.events
         log._run, log._end = "another", 0
         log._kept.clear()
         ids = await commands(rig, 1, first=1)

@@ -20,7 +20,7 @@ from ldcnd.errors import (
     StopLatched,
     ValueOutOfRange,
 )
-from ldcnd.model.commands import BufferMode, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop, Track, Verb
+from ldcnd.model.commands import BufferMode, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop, Track
 from ldcnd.model.samples import AxisState
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
@@ -98,7 +98,7 @@ async def test_a_buffered_move_of_a_client_that_died_is_refused_although_its_axi
             await held.command("x", MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
             waiting = buffered(rig, held)
             await asyncio.sleep(0.5)
-            rig.daemon._control.authority.expire(float("inf"))  # nothing was renewed
+            rig.daemon._dispatcher.authority.expire(float("inf"))  # nothing was renewed
             with pytest.raises(LeaseExpired):
                 await waiting
         await stays_at_first_target(rig)
@@ -108,10 +108,10 @@ async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         waiting = buffered(rig, held)
         await asyncio.sleep(0.5)
-        rig.daemon._control.commands.rival = "other"
+        rig.daemon._dispatcher.rival = "other"
         with pytest.raises(DuplicateDaemon):
             await waiting
-        rig.daemon._control.commands.rival = None
+        rig.daemon._dispatcher.rival = None
         await stays_at_first_target(rig)
 
 
@@ -140,21 +140,18 @@ async def test_a_buffered_move_goes_on_under_a_lease_that_its_holder_has_widened
 
 
 @pytest.mark.parametrize(
-    ("verb", "request_"),
+    "command",
     [
-        (Verb.MOVE_ABSOLUTE, MoveAbsolute(position=1e6, buffer_mode=BufferMode.ABORTING)),
-        (Verb.MOVE_RELATIVE, MoveRelative(distance=1e6, buffer_mode=BufferMode.ABORTING)),
-        (
-            Verb.MOVE_VELOCITY,
-            MoveVelocity(velocity=1.0, acceleration=0.00001, buffer_mode=BufferMode.ABORTING),
-        ),
+        MoveAbsolute(position=1e6, buffer_mode=BufferMode.ABORTING),
+        MoveRelative(distance=1e6, buffer_mode=BufferMode.ABORTING),
+        MoveVelocity(velocity=1.0, acceleration=0.00001, buffer_mode=BufferMode.ABORTING),
     ],
 )
-async def test_an_aborting_move_that_is_refused_halts_nothing(verb, request_):
+async def test_an_aborting_move_that_is_refused_halts_nothing(command):
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         before = (await rig.client.state("x")).command.command_id
         with pytest.raises((ValueOutOfRange, PositionLimit)):
-            await held.command("x", verb, request_)
+            await held.command("x", command)
         state = await rig.client.state("x")
         assert (state.state, state.command.command_id) == (AxisState.DISCRETE_MOTION, before)
         await stays_at_first_target(rig)
@@ -189,7 +186,7 @@ async def test_a_homing_whose_lease_was_lost_begins_no_further_leg():
             reply = await held.command("y", Home())
             await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
             reply = await held.command("y", Home())
-            rig.daemon._control.authority.expire(float("inf"))
+            rig.daemon._dispatcher.authority.expire(float("inf"))
             state = await rig.client.wait_for_end("y", reply.command_id)
             assert "lease" in (state.last_error or ""), state
             assert not state.referenced
@@ -208,7 +205,7 @@ async def test_a_stream_of_set_points_ends_with_its_lease():
         async with control(rig.client, "ann", "z", lease_s=60.0) as held:
             await held.command("z", Power(on=True))
             await held.command("z", Track(position=0.1))
-            rig.daemon._control.authority.expire(float("inf"))
+            rig.daemon._dispatcher.authority.expire(float("inf"))
             with pytest.raises(LeaseExpired):
                 await held.command("z", Track(position=0.2))
 
