@@ -11,6 +11,7 @@ from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
+from ldcnd.drivers.dissector import install
 from ldcnd.drivers.transcript import Describe, describer
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.wirelog.pcapng import encode_pcapng
@@ -22,6 +23,22 @@ FORMAT = click.option(
     "--format", "form", type=click.Choice(FORMATS), help="[default: by the suffix of --out, else text]"
 )
 OUT = click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write a file instead of printing.")
+
+
+def _install_dissector(context: click.Context, _option: click.Parameter, wanted: bool) -> None:  # noqa: FBT001 - click's
+    if wanted and not context.resilient_parsing:
+        click.echo(install(Path.home()))
+        context.exit()
+
+
+DISSECTOR = click.option(
+    "--dissector",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_install_dissector,
+    help="Install the dissector of these lines for Wireshark and tshark of this user, print its file, and end.",
+)
 
 
 @click.group()
@@ -57,12 +74,13 @@ def list_buses(target: Target) -> None:
 )
 @FORMAT
 @OUT
+@DISSECTOR
 @with_target
 def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Path | None) -> None:
     """Show what was on the line BUS in the last seconds, or write it to a file.
 
     text is a capture: bytes, with their meaning as comments; `ldcnd bus replay` plays it back. words has the meaning
-    alone. pcapng is for Wireshark, in link type USER0. --json prints or writes one object a record instead.
+    alone. pcapng is for Wireshark, which reads it with the plugin of --dissector. --json prints or writes one object a record instead.
     """
     log, header, describe = target.run(lambda client: _fetch(client, bus, seconds))
     _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)

@@ -21,6 +21,7 @@ _INBOUND, _OUTBOUND = 1, 2
 _DIRECTIONS = {
     WireEvent.SENT: _OUTBOUND,
     WireEvent.RECEIVED: _INBOUND,
+    WireEvent.PART: _INBOUND,
     WireEvent.STRAY: _INBOUND,
 }
 

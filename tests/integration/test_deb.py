@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sysconfig
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,7 @@ def test_package_holds_what_the_service_needs_and_touches_nothing_else(deb: Path
         "./usr/lib/modules-load.d/ldcnd.conf",
         "./usr/share/doc/ldcnd/INSTALL.md",
         "./usr/share/doc/ldcnd/copyright",
+        f"./usr/lib/{sysconfig.get_config_var('MULTIARCH')}/wireshark/plugins/ldcnd.lua",
         "./usr/share/doc/ldcnd/examples/simulated.toml",
         "./usr/share/doc/ldcnd/sbom.cdx.json",
         "./usr/share/man/man1/ldcnd.1.gz",

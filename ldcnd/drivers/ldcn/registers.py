@@ -214,7 +214,7 @@ def encode_gains(profile: Profile, gains: Gains) -> bytes:
         raise NotSupported(f"{profile.title} has no step multiplier")
     values = (gains.kp, gains.kd, gains.ki, gains.il, gains.ol, gains.cl, gains.el, gains.sr)
     optional = (gains.deadband, gains.step_multiplier)
-    fields = _fields(profile)
+    fields = gain_fields(profile)
     return b"".join(field.encode(value) for field, value in zip(fields, values + optional, strict=False))
 
 
@@ -225,14 +225,14 @@ def decode_gains(profile: Profile, data: bytes) -> Gains:
     """
     values = []
     at = 0
-    for field in _fields(profile):
+    for field in gain_fields(profile):
         present = field is not _STEP_MULTIPLIER or at < len(data)
         values.append(field.decode(data[at:]) if present else 1)
         at += field.width
     return Gains(*values)
 
 
-def _fields(profile: Profile) -> tuple[Field, ...]:
+def gain_fields(profile: Profile) -> tuple[Field, ...]:
     """Return the registers in order; older devices have fewer."""
     fields: tuple[Field, ...] = (
         _KP,
