@@ -80,7 +80,7 @@ def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Pa
     """Show what was on the line BUS in the last seconds, or write it to a file.
 
     text is a capture: bytes, with their meaning as comments; `ldcnd bus replay` plays it back. words has the meaning
-    alone. pcapng is for Wireshark, which reads it with the plugin of --dissector. --json prints or writes one object a record instead.
+    alone. pcapng is for Wireshark with the plugin of --dissector. --json prints or writes one object a record instead.
     """
     log, header, describe = target.run(lambda client: _fetch(client, bus, seconds))
     _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)

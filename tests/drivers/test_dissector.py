@@ -25,8 +25,8 @@ from tests.support.rig import SIMULATED, running_rig
 
 TSHARK = shutil.which("tshark") or ""
 needs_tshark = pytest.mark.skipif(not TSHARK, reason="no tshark: apt-get install tshark")
-OF_LDCN = """address command checksum_ok request reply status position velocity adc home position_error device_id version
-    aux dialect"""
+OF_LDCN = """address command checksum_ok request reply status position velocity adc home position_error device_id
+    version aux dialect"""
 OF_SMARTSTEP = "unit address data checksum_ok request"
 FIELDS = (
     "frame.number",
