@@ -78,6 +78,15 @@ class PwmConfig(Frozen):
     """Longest time that a duty stays on."""
 
 
+class AnalogConfig(Frozen):
+    """Bounds of `move_analog` when the request names none; the daemon keeps them, the drive knows none."""
+
+    timeout_s: float = Field(default=10.0, gt=0, le=3600)
+    """Longest motion, in seconds."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest way from where it begins, in axis units; without it as far as the velocity goes in the time."""
+
+
 class TrackingConfig(Frozen):
     """Bounds of `track`; without this table the axis refuses it."""
 
@@ -154,6 +163,8 @@ class AxisConfig(Frozen):
     """How `home` searches when the request does not say."""
     pwm: PwmConfig | None = None
     """Bounds of `set_pwm`; without them the axis takes no raw duty."""
+    analog: AnalogConfig = AnalogConfig()
+    """Bounds of `move_analog`."""
     tracking: TrackingConfig | None = None
     """Bounds of `track`; without them the axis follows no set-points."""
     rates: RatesConfig = RatesConfig()

@@ -300,7 +300,7 @@ class MoveRelative(Move):
 
 
 class MoveVelocity(Move):
-    """Move at a constant velocity until told otherwise or until the software limit."""
+    """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`."""
 
     verb = Verb.MOVE_VELOCITY
 
@@ -437,6 +437,11 @@ class MoveAnalog(AxisCommand[CommandReply]):
     """Speed in units a second; the axis default when missing."""
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
+    timeout_s: float | None = Field(default=None, gt=0, le=3600)
+    """Longest motion, in seconds; the axis's `analog.timeout_s` when missing. The daemon ends it, not the drive."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest way from where it begins, in axis units, and the way to stop behind it; the axis's `analog.distance` when
+    missing, and without that as far as the velocity goes in the time. The daemon ends it, not the drive."""
 
 
 class SetPwm(AxisCommand[CommandReply]):

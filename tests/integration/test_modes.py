@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from dataclasses import replace
 
 import pytest
 
@@ -13,7 +14,7 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveAnalog, SetPwm, Track, Verb
-from ldcnd.model.samples import AxisState
+from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
@@ -21,6 +22,7 @@ from tests.support.dialect_rig import (
     LS_173AP,
     LS_182AP,
     LS_182AP_22,
+    PLANT,
     SC,
     V1,
     V4,
@@ -112,6 +114,54 @@ async def test_an_analog_move_stops_beyond_a_software_limit():
             "move_analog: stopped beyond a software limit",
         )
         assert 3.0 < rig.position_mm < 4.0
+
+
+DEAD_SENSOR = replace(PLANT, pot_span_counts=(-(1 << 40), 1 << 40), forward_limit_counts=1 << 30)
+"""A coupling that slips: the sensor stays where it is."""
+
+
+@pytest.mark.parametrize(
+    ("bounds", "failure", "way_mm"),
+    [
+        ({"timeout_s": 2.0}, "not there within 2 s", 10.0),
+        ({"distance": 3.0}, "not there within 3 mm", 3.0),
+        ({}, "not there within 10 s", 50.0),
+    ],
+)
+async def test_an_analog_move_whose_sensor_does_not_follow_ends_at_its_bounds(bounds, failure, way_mm):
+    async with dialect_rig(LS_182AP, DEAD_SENSOR, reference="required") as rig:
+        await rig.power_on()
+
+        state = await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0, **bounds))
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, f"move_analog: {failure}")
+        assert rig.position_mm == pytest.approx(way_mm, abs=0.8)
+
+
+async def test_an_analog_move_takes_its_bounds_from_the_configuration():
+    async with dialect_rig(LS_182AP, DEAD_SENSOR, analog={"timeout_s": 60, "distance": 2}) as rig:
+        await rig.power_on()
+
+        state = await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0))
+
+        assert state.last_error == "move_analog: not there within 2 mm"
+
+
+async def test_an_analog_move_that_went_out_of_sight_is_ended_when_the_line_is_back():
+    loss = {"bus": "run_to_target"}
+    async with dialect_rig(LS_182AP, DEAD_SENSOR, analog={"timeout_s": 3}, loss=loss) as rig:
+        await rig.power_on()
+        await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0))
+        await asyncio.sleep(0.5)
+
+        rig.chain.unplug(asyncio.get_running_loop().time(), 4.0)
+        await rig.until(lambda state: state.link is LinkState.DOWN)
+        await rig.until(lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(1.0)
+        where = rig.position_mm
+        await asyncio.sleep(5.0)
+
+        assert rig.position_mm == pytest.approx(where, abs=0.01)
 
 
 async def test_a_plain_move_after_an_analog_one_ignores_the_sensor():

@@ -82,7 +82,7 @@ def check_may_move(axis: AxisView) -> None:
 
 
 def check_stands(axis: AxisView) -> None:
-    """Refuse while a motion runs: a new trajectory in mid-move is erratic on these drives."""
+    """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
     if axis.state in MOTION_STATES:
         raise WrongState(
             f"axis {axis.name} is in {axis.state}", axis=axis.name, value=axis.state, remedy="send halt and wait"

@@ -1,7 +1,7 @@
 """The price list of an LDCN/NMC module: its exchanges, and the rate that its clock makes of a nominal one.
 
-Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; the wait of one servo cycle: PIC-SERVO manual,
-section 3.
+Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 4.1 (the wait of one servo cycle),
+5.2.
 """
 
 from functools import partial

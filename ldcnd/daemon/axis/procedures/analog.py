@@ -1,9 +1,14 @@
-"""A motion to a value of the analog position sensor, watched for the software limits: the drive knows none."""
+"""A motion to a value of the analog position sensor, bounded by the daemon in time, distance and software limits.
+
+In the drive it is a motion at constant velocity that ends when the sensor reads the target (LS-182AP manual, "Load
+Trajectory"): with a sensor that does not follow, for which a slipped coupling is enough, it has no end there. Only
+limit switches stop it in the drive, where they are armed.
+"""
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion
 from ldcnd.daemon.axis.procedure import Procedure, Turn
-from ldcnd.daemon.axis.state import Completion
+from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AnalogMotion, AxisReading, StopMode
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.commands import CommandReply, MoveAnalog
@@ -11,12 +16,17 @@ from ldcnd.model.samples import AxisState
 
 
 class AnalogMove(Procedure):
-    """One such motion; it ends when the drive says so, and its only step is to stop beyond a software limit."""
+    """One such motion; it ends when the drive says so, and its only step is to stop at one of its bounds."""
 
     def __init__(self, motion: AxisMotion, turn: Turn, request: MoveAnalog) -> None:
+        bounds = motion.config.analog
         self.turn = turn
         self._motion = motion
         self._request = request
+        self._timeout_s = request.timeout_s or bounds.timeout_s
+        self._distance = request.distance or bounds.distance
+        self._from_counts = 0
+        self._failure = ""
 
     async def begin(self) -> CommandReply:
         """See `Procedure`.
@@ -31,30 +41,51 @@ class AnalogMove(Procedure):
         self._check_target()
         speed = motion.config.velocity if request.velocity is None else request.velocity
         plan = motion.planner.at_velocity(view, speed, request.acceleration)
+        self._distance = self._distance or abs(plan.velocity) * self._timeout_s
+        self._from_counts = motion.latest().position_counts
         await self.turn.permit.load(
             AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
         )
+        self.deadline_s = motion.clock.now_s() + self._timeout_s
+        self._failure = f"not there within {self._timeout_s:g} s"
         await motion.start(self.turn, AxisState.DISCRETE_MOTION, Completion.PROFILE)
         return motion.reply(self.turn).model_copy(
             update={"target": request.target, "velocity": plan.velocity, "acceleration": plan.acceleration}
         )
 
     def calls_for_step(self, reading: AxisReading) -> bool:
-        """See `Procedure`."""
-        limits, tracker = self._motion.config.limits, self._motion.tracker
-        if not tracker.referenced or self.outlived(tracker):
+        """See `Procedure`: a bound is reached, or the axis lost its command while it was out of sight and may run."""
+        motion, tracker = self._motion, self._motion.tracker
+        if tracker.command is None:
+            return True
+        travelled = abs(motion.scale.to_units(reading.position_counts - self._from_counts))
+        if self._distance is not None and travelled > self._distance:
+            self._failure = f"not there within {self._distance:g} {motion.config.unit}"
+            return True
+        if not tracker.referenced:
             return False
-        position = self._motion.telemetry.position(reading.position_counts)
-        low, high = limits.position_min, limits.position_max
-        return (low is not None and position < low) or (high is not None and position > high)
+        position = motion.telemetry.position(reading.position_counts)
+        low, high = motion.config.limits.position_min, motion.config.limits.position_max
+        if (low is not None and position < low) or (high is not None and position > high):
+            self._failure = "stopped beyond a software limit"
+            return True
+        return False
 
     async def step(self) -> bool:
-        """See `Procedure`: stop."""
-        await self._motion.driver.stop(StopMode.SMOOTH)
-        self.turn.still_wanted()
-        self._motion.stopping(self.turn.command_id, self.turn.verb)
-        self._motion.tracker.failing("stopped beyond a software limit")
+        """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
+        motion = self._motion
+        ours = motion.tracker.command is not None
+        await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
+        if ours:
+            motion.stopping(self.turn.command_id, self.turn.verb)
+            motion.tracker.failing(self._failure)
         return False
+
+    def outlived(self, tracker: AxisTracker) -> bool:
+        """See `Procedure`; without a command the drive may still run until it is seen at rest."""
+        if tracker.command is None:
+            return tracker.at_rest
+        return super().outlived(tracker)
 
     def _check_target(self) -> None:
         name, full_scale, target = (
