@@ -9,12 +9,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ldcnd.drivers.ldcn.profiles import Support
+from ldcnd.drivers.ldcn.pic_io import LINES
+from ldcnd.drivers.ldcn.profiles import PIC_IO, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.model.frozen import Frozen
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, ChainSpec, ModuleSpec, TimedEvent
+from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, Line, ModuleSpec, TimedEvent
+from ldcnd.sim.ldcn.io import IoWiring
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import (
     AnalogEnd,
@@ -39,6 +41,8 @@ def _known_module(model: str) -> str:
 
 ModuleName = Annotated[str, AfterValidator(_known_module)]
 """A module as in `ldcnd sim --chain`."""
+LineNumber = Annotated[int, Field(ge=1, le=LINES)]
+Byte = Annotated[int, Field(ge=0, le=255)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 CountRange = tuple[int, int]
 
@@ -157,6 +161,24 @@ class Quirks(Frozen):
     """Whether a CMC sends status items 6 and 7 before its advanced features are on."""
 
 
+class IoConfig(Frozen):
+    """What is connected to a PIC-I/O."""
+
+    low: tuple[LineNumber, ...] = ()
+    """Lines held low from outside; the others are pulled up."""
+    wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
+    """Pairs of a line and the line that it drives while it is an output."""
+    adc: tuple[Byte, Byte, Byte] = (0, 0, 0)
+    """Values of the three A/D inputs, 0 to 255 for 0 to 5 V."""
+    pulses_hz: float = Field(default=0.0, ge=0, le=4_000_000)
+    """A square wave at I/O 10, for the counter."""
+
+    def wiring(self) -> IoWiring:
+        """Return what the simulator builds."""
+        wires = {driven: driver for driver, driven in self.wires}
+        return IoWiring(frozenset(self.low), wires, self.adc, self.pulses_hz)
+
+
 class SimulatedModuleConfig(Frozen):
     """One simulated module and the machine on its shaft."""
 
@@ -170,16 +192,25 @@ class SimulatedModuleConfig(Frozen):
     """Where the manuals allow variants."""
     conditions: tuple[Condition, ...] = ()
     """What is wrong around the drive from the beginning."""
+    io: IoConfig | None = None
+    """What is connected to a PIC-I/O."""
 
     @property
     def is_drive(self) -> bool:
         """Whether it has a motor."""
         return MODELS[self.model][0].support is Support.FULL
 
+    @property
+    def has_terminals(self) -> bool:
+        """Whether it is a PIC-I/O."""
+        return MODELS[self.model][0] is PIC_IO
+
     @model_validator(mode="after")
-    def _only_drives_suffer(self) -> Self:
+    def _what_it_can_have(self) -> Self:
         if self.conditions and not self.is_drive:
             raise ValueError(f"conditions: a {self.model} has no motor")
+        if self.io is not None and not self.has_terminals:
+            raise ValueError(f"io: a {self.model} has no terminals")
         return self
 
     def spec(self, seed: int) -> ModuleSpec:
@@ -196,7 +227,8 @@ class SimulatedModuleConfig(Frozen):
             return replace(settings, **given)
 
         plant = replace(travel, **self.plant.model_dump(exclude_none=True))
-        return ModuleSpec(self.model, plant, adjust=adjust, conditions=frozenset(self.conditions))
+        wiring = self.io.wiring() if self.io else IoWiring()
+        return ModuleSpec(self.model, plant, adjust=adjust, conditions=frozenset(self.conditions), wiring=wiring)
 
 
 class SimulatedEventConfig(Frozen):
@@ -211,18 +243,40 @@ class SimulatedEventConfig(Frozen):
     ends: Condition | None = None
     """or one that ends,"""
     power: Literal["on", "off"] | None = None
-    """or the module's own supply; switched on, it starts as after a reset."""
+    """or the module's own supply; switched on, it starts as after a reset,"""
+    line: LineNumber | None = None
+    """or a line of a PIC-I/O, which is driven to `level`,"""
+    adc: int | None = Field(default=None, ge=1, le=3)
+    """or an A/D input of a PIC-I/O, which takes `value`."""
+    level: Literal["low", "high"] | None = None
+    """With `line`: the level from outside."""
+    value: Byte | None = None
+    """With `adc`: 0 to 255 for 0 to 5 V."""
 
     @model_validator(mode="after")
     def _one_thing(self) -> Self:
-        if sum(each is not None for each in (self.begins, self.ends, self.power)) != 1:
-            raise ValueError("an event needs exactly one of begins, ends, power")
+        if sum(each is not None for each in (self.begins, self.ends, self.power, self.line, self.adc)) != 1:
+            raise ValueError("an event needs exactly one of begins, ends, power, line, adc")
+        if (self.line is None) is not (self.level is None):
+            raise ValueError("line and level belong together")
+        if (self.adc is None) is not (self.value is None):
+            raise ValueError("adc and value belong together")
         return self
+
+    @property
+    def concerns_terminals(self) -> bool:
+        """Whether it happens to a PIC-I/O."""
+        return self.line is not None or self.adc is not None
 
     def spec(self, starts_at_s: float) -> TimedEvent:
         """Return what the simulator plays."""
-        present = self.begins is not None or self.power == "on"
-        return TimedEvent(starts_at_s + self.at_s, self.module, self.begins or self.ends, present=present)
+        what: Condition | Line | Analog | None = self.begins or self.ends
+        if self.line is not None:
+            what = Line(self.line)
+        elif self.adc is not None and self.value is not None:
+            what = Analog(self.adc, self.value)
+        present = self.begins is not None or self.power == "on" or self.level == "high"
+        return TimedEvent(starts_at_s + self.at_s, self.module, what, present=present)
 
 
 class SimulatedFaultConfig(Frozen):
@@ -278,7 +332,9 @@ class SimulatedChainConfig(Frozen):
             if event.module > len(self.module):
                 raise ValueError(f"event[{number}]: there is no module {event.module}, only {len(self.module)}")
             module = self.module[event.module - 1]
-            if event.power is None and not module.is_drive:
+            if event.concerns_terminals and not module.has_terminals:
+                raise ValueError(f"event[{number}]: module {event.module} is a {module.model} and has no terminals")
+            if event.power is None and not event.concerns_terminals and not module.is_drive:
                 raise ValueError(f"event[{number}]: module {event.module} is a {module.model} and has no motor")
         return self
 

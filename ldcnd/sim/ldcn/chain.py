@@ -24,7 +24,7 @@ from ldcnd.errors import ValueOutOfRange
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from ldcnd.sim.ldcn.io import SimulatedIo
+from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo, SimulatedOther
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
@@ -97,6 +97,7 @@ class ModuleSpec:
         settings: None for those of `MODELS`, with phase and drift of the servo cycle drawn from the chain's seed.
         adjust: changes single settings and leaves the others as they are.
         conditions: what is wrong around the drive from the beginning; empty for modules without a motor.
+        wiring: what is connected to a PIC-I/O; others ignore it.
     """
 
     name: str
@@ -104,6 +105,22 @@ class ModuleSpec:
     settings: ModuleSettings | None = None
     adjust: Callable[[ModuleSettings], ModuleSettings] = _unchanged
     conditions: frozenset[Condition] = frozenset()
+    wiring: IoWiring = field(default_factory=IoWiring)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """The level of a PIC-I/O's line, 1 to 12, as it is driven from outside; `present` says high."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Analog:
+    """The value of a PIC-I/O's A/D input, 1 to 3."""
+
+    channel: int
+    value: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,13 +130,14 @@ class TimedEvent:
     Attributes:
         at_s: the instant on the line's clock.
         place: of the module in the chain; 1 is next to the host.
-        condition: what begins or ends around the drive; None for the module's own supply.
-        present: whether it begins (the supply: is switched on) or ends.
+        what: a condition that begins or ends around a drive, something at the terminals of a PIC-I/O; None for the
+            module's own supply.
+        present: whether the condition begins, the line goes high, or the supply is switched on.
     """
 
     at_s: float
     place: int
-    condition: Condition | None
+    what: Condition | Line | Analog | None
     present: bool
 
 
@@ -146,8 +164,8 @@ def build_chain(spec: ChainSpec) -> Chain:
     """Build the modules of a chain, all just powered up at the instant 0 of the line's clock.
 
     Raises:
-        ValueOutOfRange: a module name is unknown, there is no module, or an event is for none or for one that has no
-            motor.
+        ValueOutOfRange: a module name is unknown, there is no module, or an event is for none or for one to which it
+            cannot happen.
     """
     if not spec.modules:
         raise ValueOutOfRange("a simulated chain needs at least one module", value=0, limit=1, nearest=1)
@@ -164,12 +182,17 @@ def build_chain(spec: ChainSpec) -> Chain:
 
 
 def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], None]:
-    if event.condition is None:
-        return lambda at_s: module.power(on=event.present, at_s=at_s)
-    condition = event.condition
-    if not isinstance(module, SimulatedDrive):
-        raise ValueOutOfRange(f"module {event.place} has no motor to suffer {condition}", value=event.place)
-    return lambda at_s: module.set_condition(condition, present=event.present, at_s=at_s)
+    match event.what, module:
+        case None, _:
+            return lambda at_s: module.power(on=event.present, at_s=at_s)
+        case Condition() as condition, SimulatedDrive() as drive:
+            return lambda at_s: drive.set_condition(condition, present=event.present, at_s=at_s)
+        case Line(number), SimulatedIo() as io:
+            return lambda at_s: io.drive_line(number, high=event.present, at_s=at_s)
+        case Analog(channel, value), SimulatedIo() as io:
+            return lambda at_s: io.set_adc(channel, value, at_s)
+    lacking = "motor" if isinstance(event.what, Condition) else "terminals"
+    raise ValueOutOfRange(f"module {event.place} has no {lacking} for {event.what}", value=event.place)
 
 
 def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
@@ -183,4 +206,4 @@ def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
         for condition in spec.conditions:
             drive.set_condition(condition, present=True, at_s=0.0)
         return drive
-    return SimulatedIo(profile, settings)
+    return SimulatedIo(profile, settings, spec.wiring) if profile is PIC_IO else SimulatedOther(profile, settings)

@@ -1,40 +1,188 @@
-"""Simulated modules without a servo loop, as far as a host that enumerates a chain needs them: PIC-I/O and PIC-STEP.
+"""Simulated modules without a servo loop: PIC-I/O with what is connected to it, and modules that are only identified.
 
-They keep the chain together, obey what is common to all modules, and answer with a layout of their own.
-Sources: later vendor data sheets; widths of items that no source here describes are 0.
+A line of a PIC-I/O that is an output has the level of its latch. An input has the level of the output that is wired to
+it, or the one that it is driven to from outside, or is pulled up. Where the data sheet leaves room:
+
+* Output latches, stored outputs and PWM values are 0 after a reset; a line that becomes an output shows its latch.
+* Synch Output may be repeated, and applies the stored values again.
+* Counter and timer are 0 and off after a reset, and keep their count while they are off.
+
+Source: PIC-I/O data sheet, 2.2, 3.1.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from ldcnd.drivers.ldcn.profiles import PIC_IO, Profile
+from ldcnd.drivers.ldcn.pic_io import (
+    ALL_LINES,
+    CHECKSUM_ERROR,
+    COUNTER_LINE,
+    TIMER_HZ,
+    IoItem,
+    IoStatus,
+    SetDirection,
+    SetOutput,
+    SetPwm,
+    SetSynchOutput,
+    SetTimerMode,
+    SynchInput,
+    SynchOutput,
+    encode_io_status,
+)
+from ldcnd.drivers.ldcn.profiles import PIC_STEP, Profile
 from ldcnd.drivers.ldcn.received import ReceivedCommand
-from ldcnd.drivers.ldcn.status import StatusFlag, StatusItem
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
-PIC_IO_ITEM_BYTES = (2, 1, 1, 1, 4, 2, 2, 4)
-"""Inputs, A/D 1 to 3, timer, identity, inputs and timer as captured by the synchronisation command."""
+COUNTER_SPAN = 1 << 32
+_TICKS_PER_CYCLE = round(TIMER_HZ * SERVO_CYCLE_S)
+STEP_ITEM_BYTES = (4, 1, 2, 1, 4, 2, 1, 0)
+"""Position, A/D, step time, inputs, home, identity, outputs of a PIC-STEP, as hosts of it expect them."""
 IDENTITY_ONLY_ITEM_BYTES = (0, 0, 0, 0, 0, 2, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Terminals:
-    """What is connected to a PIC-I/O: twelve input bits and three A/D values."""
+class IoWiring:
+    """What is connected to a PIC-I/O from the beginning.
 
-    inputs: int = 0x0FFF
-    analog: tuple[int, int, int] = (0, 0, 0)
+    Attributes:
+        low: lines, 1 to 12, that are held low from outside; the others are pulled up.
+        wires: lines that another line drives while that is an output, each by the number of its driver.
+        adc: the values of the three A/D inputs, 0 to 255.
+        pulses_hz: of a square wave at the counter's line, for the counter only; 0 for none.
+    """
+
+    low: frozenset[int] = frozenset()
+    wires: Mapping[int, int] = field(default_factory=dict)
+    adc: tuple[int, int, int] = (0, 0, 0)
+    pulses_hz: float = 0.0
 
 
 class SimulatedIo(SimulatedModule):
-    """A module that only reports.
+    """A PIC-I/O.
 
     Attributes:
-        terminals: may be replaced while it runs.
+        outputs: bits of the lines that are outputs.
+        latch: the levels to which outputs are set.
+        pwm: both PWM values, 0 to 255.
     """
 
+    def __init__(self, profile: Profile, settings: ModuleSettings, wiring: IoWiring | None = None) -> None:
+        wiring = wiring or IoWiring()
+        self._wires = dict(wiring.wires)
+        self._low = sum(1 << line - 1 for line in wiring.low)
+        self._adc = list(wiring.adc)
+        self._pulses_per_cycle = wiring.pulses_hz * SERVO_CYCLE_S
+        self.outputs = 0
+        self.latch = 0
+        super().__init__(profile, settings)
+
+    @property
+    def levels(self) -> int:
+        """The levels of the twelve pins."""
+        levels = ~self._low & ALL_LINES
+        for line, driver in self._wires.items():
+            if self.outputs & 1 << driver - 1:
+                levels = levels & ~(1 << line - 1) | (self.latch >> driver - 1 & 1) << line - 1
+        return levels & ~self.outputs | self.latch & self.outputs
+
+    def drive_line(self, line: int, *, high: bool, at_s: float) -> None:
+        """Drive a line, 1 to 12, from outside at that instant of the line's clock; an output wins over it."""
+        self.catch_up(at_s)
+        before = self.levels
+        self._low = self._low & ~(1 << line - 1) | (0 if high else 1 << line - 1)
+        self._count_edges(before)
+
+    def set_adc(self, channel: int, value: int, at_s: float) -> None:
+        """Change the voltage at an A/D input, 1 to 3, to 0 to 255 for 0 to 5 V."""
+        self.catch_up(at_s)
+        self._adc[channel - 1] = value
+
+    # -- module ------------------------------------------------------------------------------------------------------
+
+    def restart(self) -> None:
+        """See `SimulatedModule`: all lines become inputs; what is connected stays."""
+        self.outputs = 0
+        self.latch = 0
+        self.pwm = (0, 0)
+        self._stored = SetSynchOutput(0, 0, 0)
+        self._mode = SetTimerMode(enabled=False)
+        self._counted = 0  # under earlier modes
+        self._raw = 0.0  # edges or clocks under this mode, before the prescaler
+        self._captured = (0, 0)
+
+    def run(self, cycles: int) -> None:
+        """See `SimulatedModule`: the module's own clock drives the timer, the world outside the counter."""
+        if not self._mode.enabled:
+            return
+        if not self._mode.counter:
+            self._raw += cycles * _TICKS_PER_CYCLE
+        elif not self.outputs & 1 << COUNTER_LINE - 1:
+            self._raw += cycles * self._pulses_per_cycle * self._cycle_s / SERVO_CYCLE_S
+
+    def execute(self, command: ReceivedCommand) -> None:
+        """See `SimulatedModule`."""
+        before = self.levels
+        match command:
+            case SetDirection(inputs):
+                self.outputs = ~inputs & ALL_LINES
+            case SetPwm(pwm1, pwm2):
+                self.pwm = (pwm1, pwm2)
+            case SetOutput(levels):
+                self._set_latch(levels)
+            case SetSynchOutput():
+                self._stored = command
+            case SynchOutput():
+                self._set_latch(self._stored.levels)
+                self.pwm = (self._stored.pwm1, self._stored.pwm2)
+            case SetTimerMode():
+                self._counted = 0 if self.settings.counter_cleared_by_mode else self._count
+                self._raw = 0.0
+                self._mode = command
+            case SynchInput():
+                self._captured = (self.levels, self._count)
+        self._count_edges(before)
+
+    def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
+        """See `SimulatedModule`."""
+        adc1, adc2, adc3 = self._adc
+        levels, counter = self._captured
+        status = IoStatus(
+            rejected=checksum_error,
+            levels=self.levels,
+            adc1=adc1,
+            adc2=adc2,
+            adc3=adc3,
+            counter=self._count,
+            device_id=self.profile.device_id,
+            version=self.settings.version,
+            captured_levels=levels,
+            captured_counter=counter,
+        )
+        return encode_io_status(IoItem(items), status, undefined_bits=self.settings.undefined_status_bits)
+
+    @property
+    def _count(self) -> int:
+        return (self._counted + int(self._raw) // self._mode.prescale) % COUNTER_SPAN
+
+    def _set_latch(self, levels: int) -> None:
+        """Set the outputs; bits of lines that are inputs are ignored."""
+        self.latch = self.latch & ~self.outputs | levels & self.outputs
+
+    def _count_edges(self, before: int) -> None:
+        """Count a rising edge at the counter's line, while that is an input."""
+        bit = 1 << COUNTER_LINE - 1
+        if self._mode.enabled and self._mode.counter and self.levels & ~before & ~self.outputs & bit:
+            self._raw += 1
+
+
+class SimulatedOther(SimulatedModule):
+    """A module that keeps its place in the chain and answers with zeros in the widths of its kind."""
+
     def __init__(self, profile: Profile, settings: ModuleSettings) -> None:
-        self.terminals = Terminals()
-        self._item_bytes = PIC_IO_ITEM_BYTES if profile is PIC_IO else IDENTITY_ONLY_ITEM_BYTES
+        self._item_bytes = STEP_ITEM_BYTES if profile is PIC_STEP else IDENTITY_ONLY_ITEM_BYTES
         super().__init__(profile, settings)
 
     def restart(self) -> None:
@@ -44,16 +192,14 @@ class SimulatedIo(SimulatedModule):
         """See `SimulatedModule`: nothing here moves."""
 
     def execute(self, command: ReceivedCommand) -> None:
-        """See `SimulatedModule`: outputs and timers are not simulated."""
+        """See `SimulatedModule`: acknowledged, without any effect."""
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
         """See `SimulatedModule`."""
-        body = bytearray([StatusFlag.CHECKSUM_ERROR if checksum_error else 0])
-        identity = self.profile.device_id | self.settings.version << 8
-        terminals = self.terminals
-        values = (terminals.inputs, *terminals.analog, 0, identity, terminals.inputs, 0)
-        for bit, (width, value) in enumerate(zip(self._item_bytes, values, strict=True)):
+        body = bytearray([CHECKSUM_ERROR if checksum_error else 0])
+        identity = bytes((self.profile.device_id, self.settings.version))
+        for bit, width in enumerate(self._item_bytes):
             if items & 1 << bit:
-                body += value.to_bytes(4, "little")[:width]
+                body += identity if 1 << bit == StatusItem.IDENTITY else bytes(width)
         body.append(sum(body) & 0xFF)
         return bytes(body)
