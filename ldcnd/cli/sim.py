@@ -1,17 +1,26 @@
 """`ldcnd sim`: a simulated line behind a pseudo-terminal, for any host that speaks to a serial port."""
 
 import json
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Self, TextIO
 
 import click
 
 from ldcnd.config.simulation import FaultPlanConfig, SimulationConfig
 from ldcnd.config.toml import read_toml
+from ldcnd.drivers.ldcn.packet import HEADER, PacketReader
+from ldcnd.drivers.transcript import describer
 from ldcnd.errors import ConfigError
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import serve_pty
+from ldcnd.version import version
+from ldcnd.wirelog.capture import CaptureHeader, capture_lines
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 DEFAULT_SEED = 1
 
@@ -22,7 +31,8 @@ DEFAULT_SEED = 1
 @click.option("--file", type=click.Path(path_type=Path), help="The modules and what happens to them (TOML).")
 @click.option("--fault-plan", type=click.Path(path_type=Path), help="What else may go wrong on the wires (TOML).")
 @click.option("--baud-check", is_flag=True, help="Bytes at another rate than a module's are garbage to it.")
-@click.option("--seed", type=int, help="Of everything that is drawn by lot: instead of the file's, or of 1.")
+@click.option("--seed", type=int, help="Of everything that is random: instead of the file's, or of 1.")
+@click.option("--wire-log", type=click.Path(path_type=Path), help="Write what the host does to this file (a capture).")
 @click.option("--json", "as_json", is_flag=True, help="Print the terminal and the modules as JSON.")
 def command(
     link: Path | None,
@@ -30,6 +40,7 @@ def command(
     file: Path | None,
     fault_plan: Path | None,
     seed: int | None,
+    wire_log: Path | None,
     *,
     baud_check: bool,
     as_json: bool,
@@ -43,10 +54,87 @@ def command(
     def opened(path: Path) -> None:
         print(_readiness(path, spec) if as_json else path, flush=True)
 
-    try:
-        serve_pty(build_chain(spec), link, baud_check=spec.baud_check, opened=opened)
-    except OSError as error:
-        raise click.ClickException(f"no terminal: {error}") from error
+    with ExitStack() as stack:
+        try:
+            observer = stack.enter_context(WireLogFile.open(wire_log)) if wire_log else None
+        except OSError as error:
+            raise click.ClickException(f"no wire log: {error}") from error
+        try:
+            serve_pty(build_chain(spec), link, baud_check=spec.baud_check, opened=opened, observer=observer)
+        except OSError as error:
+            raise click.ClickException(f"no terminal: {error}") from error
+
+
+class WireLogFile:
+    """Writes what passes through the terminal as a capture, record by record, so that a crash loses nothing.
+
+    A record holds one packet of the host with its instant, however the host cut it, or what stood between packets.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        self._describe = describer("ldcn", {})
+        self._reader = PacketReader()
+        self._pending = bytearray()
+        self._baud: int | None = None
+        self._at_s = 0.0
+
+    @classmethod
+    @contextmanager
+    def open(cls, path: Path) -> Iterator[Self]:
+        """Create the file and write the header.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        header = CaptureHeader(
+            version=version(),
+            bus="simulated",
+            family="ldcn",
+            port="pty",
+            baud=19_200,
+            instance="sim",
+            zero_ns=time.time_ns(),
+            started_s=0.0,
+            until_s=0.0,
+            first_record=0,
+            cause="ldcnd sim --wire-log",
+        )
+        with path.open("w", encoding="utf-8", buffering=1) as file:
+            file.writelines(f"{line}\n" for line in capture_lines(header, (), lambda _: ""))
+            log = cls(file)
+            yield log
+            log.end()
+
+    def sent(self, at_s: float, data: bytes, baud: int | None) -> None:
+        """Take bytes of the host."""
+        self._at_s = at_s
+        if baud is not None and baud != self._baud:
+            self._baud = baud
+            self._write(WireRecord(at_s, WireEvent.BAUD, note=str(baud)))
+        for value in data:
+            if value == HEADER and not self._reader.in_packet:
+                self._flush(at_s)
+            self._pending.append(value)
+            if self._reader.feed(value):
+                self._flush(at_s)
+
+    def received(self, at_s: float, data: bytes) -> None:
+        """Take bytes for the host."""
+        self._write(WireRecord(at_s, WireEvent.RECEIVED, data))
+
+    def end(self) -> None:
+        """Write what is left of an unfinished packet."""
+        self._flush(self._at_s)
+
+    def _flush(self, at_s: float) -> None:
+        if self._pending:
+            self._write(WireRecord(at_s, WireEvent.SENT, bytes(self._pending)))
+            self._pending.clear()
+
+    def _write(self, record: WireRecord) -> None:
+        words = self._describe(record)
+        self._file.write(f"{record}\n#   {words}\n" if words else f"{record}\n")
 
 
 def _spec(chain: str | None, file: Path | None, seed: int | None) -> ChainSpec:

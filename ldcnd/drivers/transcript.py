@@ -7,7 +7,8 @@ an LDCN status packet follows from the requests before it.
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PROFILES, Profile
+from ldcnd.drivers.ldcn.pic_io import IoItem, IoStatus, decode_io_status
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PROFILES, DeviceKind, Profile, identify
 from ldcnd.drivers.ldcn.received import DefineStatus, HardReset, PlainCommand, ReadStatus, interpret_bytes
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusFlag, StatusItem, decode_status
 from ldcnd.drivers.smartstep.packet import decode_command, decode_reply
@@ -35,14 +36,17 @@ class Parts:
 class LdcnTranscript:
     """Reads the records of one LDCN line, oldest first.
 
+    A node that tells its identity is read by its dialect from then on. Until then it is read as LS-182AP.
+
     Args:
-        profiles: the dialects by node address; nodes that are not in it are read as LS-182AP.
+        profiles: the dialects by node address, as far as they are known.
     """
 
     def __init__(self, profiles: Mapping[int, Profile]) -> None:
         self._profiles = profiles
+        self._learned: dict[int, Profile] = {}
         self._defined: dict[int, StatusItem] = {}
-        self._asked: tuple[Profile, StatusItem] = (LS_182AP, STATUS_BYTE_ONLY)
+        self._asked: tuple[int, Profile, StatusItem] = (0, LS_182AP, STATUS_BYTE_ONLY)
         self._parts = Parts()
 
     def describe(self, record: WireRecord) -> str:
@@ -61,7 +65,7 @@ class LdcnTranscript:
 
     def _request(self, data: bytes) -> str:
         address = interpret_bytes(LS_182AP, data).address
-        profile = self._profiles.get(address, LS_182AP)
+        profile = self._learned.get(address) or self._profiles.get(address, LS_182AP)
         meaning = interpret_bytes(profile, data)
         command = meaning.command
         items = self._defined.get(address, STATUS_BYTE_ONLY)
@@ -72,13 +76,21 @@ class LdcnTranscript:
                 items = command.items
             case HardReset():
                 self._defined.clear()
-        self._asked = (profile, items)
+                self._learned.clear()
+        self._asked = (address, profile, items)
         words = command.command.name if isinstance(command, PlainCommand) else str(command)
         return "; ".join((f"node {address}: {words}", *meaning.oddities))
 
     def _reply(self, data: bytes) -> str:
-        profile, items = self._asked
-        return _status_words(decode_status(profile, items, data))
+        address, profile, items = self._asked
+        if profile.kind is DeviceKind.IO:
+            return _io_words(decode_io_status(IoItem(items), data))
+        status = decode_status(profile, items, data)
+        if status.device_id is not None and status.version is not None:
+            told = identify(status.device_id, status.version)
+            if told:
+                self._learned[address] = told
+        return _status_words(status)
 
 
 class SmartStepTranscript:
@@ -114,6 +126,15 @@ def describer(family: str, models: Mapping[int, str]) -> Describe:
     if family == "smartstep":
         return SmartStepTranscript().describe
     return LdcnTranscript({node: PROFILES[model] for node, model in models.items() if model in PROFILES}).describe
+
+
+def _io_words(status: IoStatus) -> str:
+    words = ["status CHECKSUM_ERROR" if status.rejected else "status"]
+    for field in fields(status):
+        value = getattr(status, field.name)
+        if field.name != "rejected" and value is not None:
+            words.append(f"{field.name} {value:03X}" if "levels" in field.name else f"{field.name} {value}")
+    return ", ".join(words)
 
 
 def _status_words(status: Status) -> str:

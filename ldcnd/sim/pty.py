@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Self
+from typing import Protocol, Self
 
 from ldcnd.sim.chain import Chain
 from ldcnd.transport.line_discipline import actual_baud
@@ -29,6 +29,16 @@ LONGEST_SLEEP_S = 0.05
 READ_BYTES = 4096
 
 
+class LineObserver(Protocol):
+    """Told what passes through the terminal; instants are seconds since it was opened."""
+
+    def sent(self, at_s: float, data: bytes, baud: int | None) -> None:
+        """Take bytes that the host wrote, and its rate, as far as the line knows it."""
+
+    def received(self, at_s: float, data: bytes) -> None:
+        """Take bytes that were delivered to the host."""
+
+
 class PtyLine:
     """A chain and the pseudo-terminal in front of it; a context manager that removes what it made.
 
@@ -36,13 +46,21 @@ class PtyLine:
         path: the terminal that a host opens.
     """
 
-    def __init__(self, chain: Chain, link: Path | None = None, *, baud_check: bool = False) -> None:
+    def __init__(
+        self,
+        chain: Chain,
+        link: Path | None = None,
+        *,
+        baud_check: bool = False,
+        observer: LineObserver | None = None,
+    ) -> None:
         """Open the terminal.
 
         Args:
             chain: whose clock starts at 0 now; built with the same `baud_check`.
             link: symbolic link to make to the terminal; one that is there already is replaced.
             baud_check: tell the chain the rate to which the host sets the terminal.
+            observer: told what passes.
 
         Raises:
             OSError: there is no terminal left, or the link cannot be made.
@@ -50,6 +68,7 @@ class PtyLine:
         self._chain = chain
         self._baud_check = baud_check
         self._link = link
+        self._observer = observer
         self._modules = itertools.cycle(chain.modules)
         self._started_s = time.perf_counter()
         self._master, self._slave = os.openpty()
@@ -96,13 +115,18 @@ class PtyLine:
             data = os.read(self._master, READ_BYTES)
             if self._baud_check:
                 self._chain.baud = self._host_baud()
-            self._chain.write(self._now_s(), data)
+            now_s = self._now_s()
+            self._chain.write(now_s, data)
+            if self._observer:
+                self._observer.sent(now_s, data, self._chain.baud if self._baud_check else None)
 
     def _deliver(self) -> None:
         due = b"".join(data for _, data in self._chain.advance(self._now_s()))
         if due:
             with suppress(BlockingIOError):  # nobody reads: a real line does not wait either
                 os.write(self._master, due)
+            if self._observer:
+                self._observer.received(self._now_s(), due)
 
     def _catch_up(self) -> None:
         """Use the host's turn for one module after another, so that one that was not asked for long answers in time."""
@@ -121,6 +145,7 @@ def serve_pty(
     baud_check: bool = False,
     stop: Callable[[], bool] | None = None,
     opened: Callable[[Path], None] | None = None,
+    observer: LineObserver | None = None,
 ) -> None:
     """Serve a chain behind a pseudo-terminal; blocks.
 
@@ -131,13 +156,14 @@ def serve_pty(
         stop: asked at least every 50 ms whether to end. Without it SIGTERM and SIGINT end it; then only the main
             thread may call.
         opened: told the terminal's path once it can be used.
+        observer: told what passes.
 
     Raises:
         OSError: there is no terminal left, or the link cannot be made.
     """
     with ExitStack() as stack:
         stopped = stop or stack.enter_context(_until_signalled())
-        line = stack.enter_context(PtyLine(chain, link, baud_check=baud_check))
+        line = stack.enter_context(PtyLine(chain, link, baud_check=baud_check, observer=observer))
         if opened:
             opened(line.path)
         line.run(stopped)

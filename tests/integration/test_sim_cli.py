@@ -1,6 +1,6 @@
 """`ldcnd sim` as a program: another program's host drives it, and its files do what they say.
 
-The host here knows the protocol from the manual only; it uses nothing of ldcnd.
+The host here knows the protocol from the manual only; it uses nothing of ldcnd but what reads its wire log.
 """
 
 import json
@@ -14,6 +14,9 @@ import time
 from contextlib import contextmanager
 
 import pytest
+
+from ldcnd.wirelog.capture import parse_capture
+from ldcnd.wirelog.recorder import WireEvent
 
 pytestmark = pytest.mark.real_time
 
@@ -147,8 +150,12 @@ def refusal(*arguments):
 def test_an_independent_host_enumerates_speeds_up_and_moves(tmp_path):
     link = tmp_path / "line"
 
-    with simulated(link, "--baud-check", "--chain", "ls182ap picio picservo-v4 picservo-sc") as told:
-        assert told["modules"] == ["ls182ap", "picio", "picservo-v4", "picservo-sc"]
+    log = tmp_path / "host.capture"
+
+    with simulated(
+        link, "--baud-check", "--wire-log", str(log), "--chain", "ls182ap pic-io picservo-v4 pic-servo-sc"
+    ) as told:
+        assert told["modules"] == ["ls-182ap", "pic-io", "pic-servo-v4", "pic-servo-sc"]
         assert told["terminal"] == str(link.resolve())
         with host_at(link) as host:
             assert host.enumerate() == [(90, 20), (2, 1), (0, 4), (0, 10)]
@@ -167,6 +174,11 @@ def test_an_independent_host_enumerates_speeds_up_and_moves(tmp_path):
                 assert host.state(address)[1] != target
                 assert host.arrives(address, target)
     assert not link.is_symlink()
+    records = parse_capture(log.read_text()).records
+    assert [record.note for record in records if record.event is WireEvent.BAUD][:2] == ["19200", "115200"]
+    sent = [record.data for record in records if record.event is WireEvent.SENT]
+    assert bytes.fromhex("aa ff 0f 0e") in sent
+    assert "node 1: LoadTrajectory(" in log.read_text()
 
 
 FILE = """

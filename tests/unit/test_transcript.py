@@ -1,5 +1,5 @@
 from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_IO, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.smartstep.packet import Command as SmartStepCommand
 from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus
@@ -38,6 +38,32 @@ def test_the_layout_of_a_reply_follows_the_node_s_dialect_and_its_defined_items(
 
     assert len(defined) == 3  # one byte less than a LS-182AP would send
     assert transcript.describe(received(defined)) == "status 00, adc 77"
+
+
+def test_a_pic_io_is_not_read_as_a_servo():
+    transcript = LdcnTranscript({2: PIC_IO})
+
+    direction = transcript.describe(sent(bytes.fromhex("aa 02 20 f7 0f 28")))
+    pwm = transcript.describe(sent(bytes.fromhex("aa 02 24 80 40 e6")))
+    transcript.describe(sent(bytes.fromhex("aa 02 13 03 18")))
+    reply = transcript.describe(received(bytes.fromhex("00 f7 0f 80 86")))
+
+    assert direction == "node 2: SetDirection(inputs=4087)"
+    assert pwm == "node 2: SetPwm(pwm1=128, pwm2=64)"
+    assert reply == "status, levels FF7, adc1 128"
+
+
+def test_a_node_that_tells_its_identity_is_read_by_its_dialect_until_the_next_reset():
+    transcript = LdcnTranscript({})
+    transcript.describe(sent(bytes.fromhex("aa 02 13 20 35")))
+    transcript.describe(received(bytes.fromhex("00 02 01 03")))
+
+    known = transcript.describe(sent(bytes.fromhex("aa 02 26 08 00 30")))
+    transcript.describe(sent(bytes.fromhex("aa ff 0f 0e")))
+    unknown = transcript.describe(sent(bytes.fromhex("aa 02 26 08 00 30")))
+
+    assert known == "node 2: SetOutput(levels=8)"
+    assert unknown.startswith("node 2: SetGain(")
 
 
 def test_a_reset_takes_the_defined_items_back():

@@ -1,0 +1,50 @@
+"""What `ldcnd sim --wire-log` writes about a foreign host."""
+
+from ldcnd.cli.sim import WireLogFile
+from ldcnd.wirelog.capture import parse_capture
+from ldcnd.wirelog.recorder import WireEvent
+
+
+def written(path, deeds):
+    with WireLogFile.open(path) as log:
+        for deed, *arguments in deeds:
+            getattr(log, deed)(*arguments)
+    return parse_capture(path.read_text())
+
+
+def test_packets_are_records_however_the_host_cuts_them(tmp_path):
+    capture = written(
+        tmp_path / "host.capture",
+        [
+            ("sent", 0.1, bytes(3) + bytes.fromhex("aa 00 21"), None),
+            ("sent", 0.2, bytes.fromhex("01 ff 21 aa 01 13"), None),
+            ("sent", 0.3, bytes.fromhex("20 34 aa 01"), None),
+        ],
+    )
+
+    assert [record.data.hex() for record in capture.records] == ["000000", "aa002101ff21", "aa01132034", "aa01"]
+    assert [record.at_s for record in capture.records] == [0.1, 0.2, 0.3, 0.3]
+    assert capture.header.family == "ldcn"
+
+
+def test_rates_and_replies_are_records_and_packets_are_put_into_words(tmp_path):
+    path = tmp_path / "host.capture"
+    capture = written(
+        path,
+        [
+            ("sent", 0.0, bytes.fromhex("aa 02 13 20 35"), 19_200),
+            ("received", 0.01, bytes.fromhex("00 02 01 03")),
+            ("sent", 0.1, bytes.fromhex("aa 02 26 08 00 30"), 19_200),
+            ("sent", 0.2, bytes.fromhex("aa 02 0e 10"), 115_200),
+        ],
+    )
+
+    assert [record.event for record in capture.records] == [
+        WireEvent.BAUD,
+        WireEvent.SENT,
+        WireEvent.RECEIVED,
+        WireEvent.SENT,
+        WireEvent.BAUD,
+        WireEvent.SENT,
+    ]
+    assert "node 2: SetOutput(levels=8)" in path.read_text()
