@@ -205,9 +205,11 @@ def monitors(target: Target, axis: str) -> None:
 @with_target
 def alarms(target: Target, axis: str) -> None:
     """Show the present alarm of AXIS and the history that its drive keeps."""
-    reply = target.run(lambda client: client.command(axis, ReadAlarms()))
-    past = "".join(f"\n  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
-    target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}{past}")
+    reply = target.run(lambda client: client.command(axis, Verb.READ_ALARMS, ReadAlarms(), timeout_s=30.0))
+    if not isinstance(reply, AlarmReport):
+        raise NotSupported(f"axis {axis} keeps no alarms", axis=axis)
+    past = (f"  {entry.code:04X}H {entry.text}" for entry in reply.history)
+    target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}", *past)
 
 
 @command.command("clear-counter")

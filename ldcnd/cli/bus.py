@@ -58,7 +58,7 @@ def list_buses(target: Target) -> None:
         losses = f"{bus.timeouts} timeouts, {bus.corrupt_replies} corrupt, {bus.resent} resent"
         target.show(
             bus,
-            f"{bus.bus:10} {bus.port:20} {bus.baud:7d} baud  {health}\n"
+            f"{bus.bus:10} {bus.port:20} {bus.baud:7d} baud  {health}",
             f"           {bus.exchanges} exchanges, {losses}; 99 % of polls within {bus.poll_p99_s * 1e3:.2f} ms",
         )
 

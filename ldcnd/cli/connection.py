@@ -15,6 +15,7 @@ from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.frozen import Frozen
+from ldcnd.printable import printable
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ResultT = TypeVar("ResultT")
@@ -61,9 +62,10 @@ class Target:
 
         return asyncio.run(within())
 
-    def show(self, model: Frozen, text: str) -> None:
-        """Print one result."""
-        print(model.model_dump_json() if self.as_json else text, flush=True)
+    def show(self, model: Frozen, *lines: str) -> None:
+        """Print one result: as a line of JSON, or as these lines."""
+        shown = (model.model_dump_json(),) if self.as_json else lines
+        print("\n".join(map(printable, shown)), flush=True)
 
     def _settings(self) -> ZenohSettings:
         endpoints = self.connect or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))

@@ -27,7 +27,7 @@ def command(target: Target, watch: float | None) -> None:
                     "no rig answers", remedy="start one with `ldcnd run`, or name a router with --connect"
                 )
             for rig in fleet:
-                target.show(rig, table(rig))
+                target.show(rig, *table(rig))
             if watch is None:
                 return
             if not fleet:
@@ -37,13 +37,13 @@ def command(target: Target, watch: float | None) -> None:
     target.run_session(work)
 
 
-def table(rig: RigReport) -> str:
+def table(rig: RigReport) -> list[str]:
     """Return a rig as lines of text: itself, what is wrong, its axes."""
     version = f"ldcnd {rig.daemon.version}" if rig.daemon else "version unknown"
     lines = [f"{rig.rig}  {version}  run {rig.instance}  {'look at it' if rig.problems else 'well'}"]
     lines += [f"  ! {problem}" for problem in rig.problems]
     lines += [f"  {_axis(axis)}" for axis in rig.axes]
-    return "\n".join(lines)
+    return lines
 
 
 def _axis(axis: AxisReport) -> str:

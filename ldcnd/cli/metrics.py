@@ -24,27 +24,22 @@ def command(target: Target, address: ListenAddress) -> None:
 
 async def _serve(client: RigClient, address: ListenAddress) -> None:
     try:
-        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415 - an optional package
+        from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
 
         from ldcnd.metrics.exposition import HealthCollector  # noqa: PLC0415
+        from ldcnd.metrics.server import metrics_server  # noqa: PLC0415
     except ImportError as error:
-        raise ConfigError("prometheus-client is not installed", remedy="install ldcnd[metrics]") from error
+        raise ConfigError("prometheus-client is not installed", remedy="pip install 'ldcnd[metrics]'") from error
     loop = asyncio.get_running_loop()
     collector = HealthCollector(client.rig, loop.time)
     registry = CollectorRegistry()
     registry.register(collector)
     ending = asyncio.Event()
     on_end(ending.set)
-    async with client.health(collector.take):
-        try:
-            server, thread = start_http_server(address.port, address.host, registry)
-        except OSError as error:
-            where = f"{address.in_url}:{address.port}"
-            raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
-        click.echo(f"metrics on http://{address.in_url}:{server.server_port}/metrics")
-        try:
+    try:
+        async with client.health(collector.take), metrics_server(registry, address.host, address.port) as port:
+            click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
             await ending.wait()
-        finally:
-            server.shutdown()
-            server.server_close()
-            thread.join()
+    except OSError as error:
+        where = f"{address.in_url}:{address.port}"
+        raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error

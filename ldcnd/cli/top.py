@@ -26,7 +26,7 @@ def command(target: Target) -> None:
     """
     if target.as_json or not sys.stdout.isatty():
         glance = target.run(_once)
-        target.show(glance, as_text(glance))
+        target.show(glance, *as_text(glance))
         return
     target.run(_watch)
 

@@ -151,7 +151,7 @@ def _granted(reply: TraceReply) -> str:
 def _deliver(target: Target, trace: Trace, out: Path | None) -> None:
     if out:
         save_trace(trace, out)
-    target.show(trace.header, "\n".join(_summary(trace)))
+    target.show(trace.header, *_summary(trace))
 
 
 def _summary(trace: Trace) -> list[str]:

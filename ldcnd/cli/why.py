@@ -20,6 +20,6 @@ def command(target: Target, axis: str) -> None:
             lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
     if reply.first_fault:
         lines.append(f"  first fault since the last reset: {reply.first_fault}")
-    target.show(reply, "\n".join(lines))
+    target.show(reply, *lines)
     if not reply.can_move:
         sys.exit(1)

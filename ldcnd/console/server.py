@@ -18,6 +18,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from ldcnd.console.commands import command_routes
+from ldcnd.console.connections import HANDSHAKE_TIME_S, BoundedH11
 from ldcnd.console.control import control_routes
 from ldcnd.console.feed import Feed
 from ldcnd.console.gate import Gate
@@ -103,6 +104,21 @@ class _Server(uvicorn.Server):
         """Serve no longer than `END_TIME_S` from now on."""
         self.should_exit = True
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen as uvicorn does, with a bound on the TLS handshake, for which it has no setting."""
+        config, loop = self.config, asyncio.get_running_loop()
+
+        def protocol() -> asyncio.Protocol:
+            return BoundedH11(config, self.server_state, self.lifespan.state)
+
+        await self.lifespan.startup()
+        bound_s = HANDSHAKE_TIME_S if config.ssl else None
+        self.servers = [
+            await loop.create_server(protocol, sock=each, ssl=config.ssl, ssl_handshake_timeout=bound_s)
+            for each in sockets or ()
+        ]
+        self.started = True
+
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Capture none."""
@@ -112,7 +128,7 @@ class _Server(uvicorn.Server):
 def _config(app: ASGIApp, settings: ConsoleSettings) -> uvicorn.Config:
     config = uvicorn.Config(
         app,
-        http="h11",
+        http=BoundedH11,
         ws="websockets-sansio",
         ws_max_size=LONGEST_MESSAGE_BYTES,
         ws_per_message_deflate=False,

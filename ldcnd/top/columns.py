@@ -70,11 +70,11 @@ def _verdict(glance: RigGlance) -> str:
     return "nothing is wrong"
 
 
-def as_text(glance: RigGlance) -> str:
-    """Return everything as plain text, for a terminal that is none."""
+def as_text(glance: RigGlance) -> tuple[str, ...]:
+    """Return everything as lines of plain text, for a terminal that is none."""
     axes = _table(AXIS_TITLES, [axis_cells(row) for row in glance.axes])
     buses = _table(BUS_TITLES, [bus_cells(row) for row in glance.buses])
-    return "\n".join((headline(glance), "", *axes, "", *buses))
+    return (headline(glance), "", *axes, "", *buses)
 
 
 def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:

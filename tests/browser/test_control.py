@@ -14,6 +14,7 @@ expect = playwright.expect
 
 pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
 
+SOON_S = 12.0
 LEASES_LONG = 7.0
 """Longer than a lease of the console, and longer than an unanswered ping."""
 
@@ -30,19 +31,21 @@ async def jogging(house, desk):
     await desk.button("Take control").click()
     await desk.button("Enable").click()
     await house.sim.until("x", lambda state: state.enabled)
+    away = "2" if await house.sim.position("x") < 0 else "-2"
     await desk.panel("Move").get_by_label("Move", exact=True).select_option("move_velocity")
-    await desk.panel("Move").get_by_label("Velocity mm/s").fill("2")
+    await desk.panel("Move").get_by_label("Velocity mm/s").fill(away)
     await desk.button("Move").click()
     await house.sim.until("x", lambda state: state.moving == "yes")
 
 
 async def halted(house):
-    """Wait until x stands without a latch and without a holder."""
-    state = await house.sim.until("x", lambda state: state.moving == "no")
-    assert not state.stop_latched
-    async with asyncio.timeout(20):
+    """Wait until x stands without a latch and without a holder, long before it would end by itself."""
+    async with asyncio.timeout(SOON_S):
+        state = await house.sim.until("x", lambda state: state.moving == "no")
         while await holder(house, "x"):
             await asyncio.sleep(0.05)
+    assert not state.stop_latched
+    assert abs(await house.sim.position("x")) < 90
 
 
 async def test_closing_the_page_halts_what_it_moved(house):

@@ -58,7 +58,7 @@ async def test_a_move_shows_where_it_goes_and_who_has_control():
         (x,) = [row for row in moving.axes if row.axis == "x"]
 
     assert (x.state, x.moving, x.target) == (AxisState.DISCRETE_MOTION, Moving.YES, 20.0)
-    assert "20.000" in as_text(moving)
+    assert "20.000" in "\n".join(as_text(moving))
 
 
 async def test_an_axis_without_trouble_shows_how_its_last_command_ended():
@@ -81,7 +81,7 @@ async def test_a_drive_that_lost_power_comes_first_and_says_so():
         shown = await until(glance, lambda now: now.axes[0].severity is Severity.WRONG)
 
     assert (shown.axes[0].axis, shown.axes[0].link, shown.axes[0].moving) == ("c", LinkState.DOWN, Moving.UNKNOWN)
-    assert "the drive does not answer" in as_text(shown)
+    assert "the drive does not answer" in "\n".join(as_text(shown))
     assert headline(shown).endswith("not working: 1")
 
 
