@@ -1,41 +1,45 @@
 """`ldcnd axis`: look at axes and move them."""
 
-import asyncio
-import sys
-
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.derived import derived
+from ldcnd.cli.jog import jog
+from ldcnd.cli.names import axis_of
+from ldcnd.cli.numbers import Finite
+from ldcnd.cli.quantities import decimals, number, sample_text, seconds, state_word
+from ldcnd.cli.rig import stop_rig
+from ldcnd.cli.sending import Sender, commanding
 from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import NotSupported
 from ldcnd.model.commands import (
-    AxisCommand,
     BufferMode,
     CommandReply,
     Halt,
     Home,
     HomeMethod,
     MoveAbsolute,
+    MoveAnalog,
     MoveRelative,
     MoveVelocity,
+    PlanReply,
     Power,
+    Preview,
+    QuickStop,
     Reset,
+    SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
+    Track,
+    Verb,
 )
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.parameters import (
-    ClearCounter,
-    CounterName,
-    ReadAlarms,
-    ReadProfile,
-)
-from ldcnd.model.samples import (
-    AdcSample,
-    FaultSample,
-    PositionSample,
-    Sample,
-    StateSample,
-    TelemetryItem,
-    VelocitySample,
-)
+from ldcnd.model.parameters import AlarmReport, ClearCounter, CounterName, DriveProfile, ReadAlarms, ReadProfile
+from ldcnd.model.samples import MonitorName, MonitorSample, PositionSample, Sample, StateSample, TelemetryItem
+
+WAIT = click.option("--wait", is_flag=True, help="Return when it has ended; Ctrl-C halts the axis.")
+LEAVE = click.option("--leave-running", is_flag=True, help="With --wait: Ctrl-C ends the wait only, the axis moves on.")
 
 
 @click.group()
@@ -55,8 +59,8 @@ def list_axes(target: Target) -> None:
         ]
 
     for axis, state, position in target.run(work):
-        where = f"{position.value:12.4f} {position.unit}" if isinstance(position, PositionSample) else "           ?"
-        what = f"{state.state}{' (stop latched)' if state.stop_latched else ''}" if state else "unknown"
+        where = f"{position.value:12.{decimals(axis)}f} {axis.unit}" if isinstance(position, PositionSample) else "?"
+        what = state_word(state) if state else "unknown"
         target.show(axis, f"{axis.axis:8} {axis.model:14} {axis.bus}/{axis.address:<4} {where:20} {what}")
 
 
@@ -69,10 +73,12 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
     """Show the telemetry of AXIS (or of all) as it comes."""
 
     async def work(client: RigClient) -> None:
+        if axis != "*":
+            await axis_of(client, axis)
         seen = 0
         async with client.samples(axis, item or "*") as samples:
             async for name, sample in samples:
-                target.show(sample, f"{name:8} {_text(sample)}")
+                target.show(sample, f"{name:8} {sample_text(sample)}")
                 seen += 1
                 if seen == count:
                     return
@@ -83,29 +89,30 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
 @command.command()
 @click.argument("axis")
 @click.argument("switch", type=click.Choice(["on", "off"]))
-@with_target
-def power(target: Target, axis: str, switch: str) -> None:
+@commanding
+def power(sender: Sender, axis: str, switch: str) -> None:
     """Close (on) or open (off) the position loop of AXIS; nothing moves."""
-    _send(target, axis, Power(on=switch == "on"))
+    sender.send(axis, Power(on=switch == "on"))
 
 
 @command.command(context_settings={"ignore_unknown_options": True})
 @click.argument("axis")
-@click.argument("value", type=float)
+@click.argument("value", type=Finite())
 @click.option("--relative", is_flag=True, help="VALUE is a distance.")
-@click.option("--at-velocity", is_flag=True, help="VALUE is a velocity: move until told otherwise.")
-@click.option("--velocity", type=float, help="Units a second; the axis default when missing.")
-@click.option("--acceleration", type=float, help="Units a second squared; the axis default when missing.")
+@click.option("--at-velocity", is_flag=True, help="VALUE is a velocity: run until stopped or to the soft limit.")
+@click.option("--velocity", type=Finite(), help="Units a second; the axis default when missing.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
 @click.option(
     "--buffer-mode",
     type=click.Choice([mode.value for mode in BufferMode]),
     default=BufferMode.REFUSE.value,
     help="What happens if the axis moves already.",
 )
-@click.option("--wait", is_flag=True, help="Return when the move has ended.")
-@with_target
+@WAIT
+@LEAVE
+@commanding
 def move(
-    target: Target,
+    sender: Sender,
     axis: str,
     value: float,
     velocity: float | None,
@@ -115,35 +122,45 @@ def move(
     relative: bool,
     at_velocity: bool,
     wait: bool,
+    leave_running: bool,
 ) -> None:
     """Move AXIS to the position VALUE."""
-    request: AxisCommand[CommandReply]
     if relative and at_velocity:
         raise click.UsageError("--relative and --at-velocity exclude each other")
+    given = {"acceleration": acceleration, "buffer_mode": buffer_mode}
+    request: MoveVelocity | MoveRelative | MoveAbsolute
     if at_velocity:
         if velocity is not None:
             raise click.UsageError("with --at-velocity, VALUE is the velocity; leave --velocity out")
-        request = MoveVelocity(velocity=value, acceleration=acceleration)
+        request = of_options(MoveVelocity, velocity=value, **given)
     elif relative:
-        request = MoveRelative(distance=value, velocity=velocity, acceleration=acceleration)
+        request = of_options(MoveRelative, distance=value, velocity=velocity, **given)
     else:
-        request = MoveAbsolute(position=value, velocity=velocity, acceleration=acceleration)
-    _send(target, axis, request.model_copy(update={"buffer_mode": BufferMode(buffer_mode)}), wait=wait)
+        request = of_options(MoveAbsolute, position=value, velocity=velocity, **given)
+    sender.send(axis, request, wait=wait, leave_running=leave_running)
 
 
 @command.command()
 @click.argument("axis")
 @click.option("--method", type=click.Choice([method.value for method in HomeMethod]), help="What marks the position.")
-@click.option("--velocity", type=float, help="Search velocity, signed; units a second.")
-@click.option("--position", type=float, help="What the position is called there.")
-@click.option("--wait", is_flag=True, help="Return when the search has ended.")
-@with_target
+@click.option("--velocity", type=Finite(), help="Search velocity, signed; units a second.")
+@click.option("--position", type=Finite(), help="What the position is called there.")
+@WAIT
+@LEAVE
+@commanding
 def home(
-    target: Target, axis: str, method: str | None, velocity: float | None, position: float | None, *, wait: bool
+    sender: Sender,
+    axis: str,
+    method: str | None,
+    velocity: float | None,
+    position: float | None,
+    *,
+    wait: bool,
+    leave_running: bool,
 ) -> None:
     """Search the reference position of AXIS, as configured unless said otherwise."""
-    request = Home(method=HomeMethod(method) if method else None, velocity=velocity, position=position)
-    _send(target, axis, request, wait=wait)
+    request = of_options(Home, method=method, velocity=velocity, position=position)
+    sender.send(axis, request, wait=wait, leave_running=leave_running)
 
 
 @command.command()
@@ -151,43 +168,82 @@ def home(
 @with_target
 def stop(target: Target, axis: str | None) -> None:
     """Stop AXIS, or the whole rig, and latch: nothing moves again before reset."""
-    reply = target.run(lambda client: client.stop(axis))
-    unconfirmed = sorted(set(reply.axes) - set(reply.confirmed))
-    target.show(reply, f"stopped: {', '.join(reply.confirmed) or 'none'}")
-    if unconfirmed:
-        print(f"not confirmed: {', '.join(unconfirmed)}; what takes a stop is latched all the same", file=sys.stderr)
-        sys.exit(1)
+    stop_rig(target, axis)
 
 
 @command.command()
 @click.argument("axis")
-@with_target
-def halt(target: Target, axis: str) -> None:
+@commanding
+def halt(sender: Sender, axis: str) -> None:
     """Bring AXIS to rest; another command may follow."""
-    _send(target, axis, Halt())
+    sender.send(axis, Halt())
 
 
 @command.command()
 @click.argument("axis")
-@with_target
-def reset(target: Target, axis: str) -> None:
+@commanding
+def reset(sender: Sender, axis: str) -> None:
     """Clear the stop latch and the faults of AXIS; nothing moves."""
-    _send(target, axis, Reset())
+    sender.send(axis, Reset())
+
+
+command.add_command(jog)
+for each in (
+    derived("quick-stop", QuickStop),
+    derived("set-position", SetPosition, "position"),
+    derived("gains", SetGains),
+    derived("pwm", SetPwm, "duty", "duration_s", moves=True),
+    derived("track", Track, "position", moves=True),
+    derived("move-analog", MoveAnalog, "target", moves=True),
+    derived("outputs", SetOutputs),
+):
+    command.add_command(each)
+
+
+@command.command()
+@click.argument("axis")
+@click.option("--position", type=Finite(), help="A move to this position.")
+@click.option("--distance", type=Finite(), help="A move by this distance.")
+@click.option("--velocity", type=Finite(), help="Speed of the move; alone: a motion at this velocity, signed.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
+@with_target
+def preview(
+    target: Target,
+    axis: str,
+    position: float | None,
+    distance: float | None,
+    velocity: float | None,
+    acceleration: float | None,
+) -> None:
+    """Show what a motion of AXIS would do; nothing is sent to its drive."""
+    asked = of_options(Preview, position=position, distance=distance, velocity=velocity, acceleration=acceleration)
+
+    async def work(client: RigClient) -> tuple[AxisInfo, PlanReply]:
+        return await axis_of(client, axis), await client.plan(axis, asked)
+
+    info, reply = target.run(work)
+    target.show(reply, *_previewed(info, reply))
 
 
 @command.command()
 @click.argument("axis")
 @with_target
 def profile(target: Target, axis: str) -> None:
-    """Show how the drive of AXIS is taken to behave, assumptions with their verification."""
-    reply = target.run(lambda client: client.command(axis, ReadProfile()))
+    """Show how the drive of AXIS is taken to behave, with what was verified and what is assumed."""
+
+    async def work(client: RigClient) -> CommandReply:
+        await axis_of(client, axis)
+        return await client.command(axis, Verb.READ_PROFILE, ReadProfile())
+
+    reply = target.run(work)
+    if not isinstance(reply, DriveProfile):
+        raise NotSupported(f"axis {axis} has no profile", axis=axis)
     hearing = ", HEARS ITSELF: nothing is written" if reply.self_hearing else ""
-    target.show(reply, f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}")
-    if target.as_json:
-        return
+    lines = [f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}"]
     for each in reply.assumptions:
         setting = f" = {each.setting}" if each.setting else ""
-        print(f"  {each.verification:14} [{each.confidence:6}] {each.key}{setting}: {each.question}")
+        lines.append(f"  {each.verification:14} [{each.confidence:6}] {each.key}{setting}: {each.question}")
+    target.show(reply, *lines)
 
 
 @command.command()
@@ -195,7 +251,14 @@ def profile(target: Target, axis: str) -> None:
 @with_target
 def monitors(target: Target, axis: str) -> None:
     """Show the last values of the monitors of AXIS."""
-    for name, sample in target.run(lambda client: client.monitors(axis)).items():
+
+    async def work(client: RigClient) -> dict[MonitorName, MonitorSample]:
+        info = await axis_of(client, axis)
+        if not info.monitors:
+            raise NotSupported(f"axis {axis} has no monitors: its drive is a {info.model}", axis=axis)
+        return await client.monitors(axis)
+
+    for name, sample in target.run(work).items():
         high = f"  high: {', '.join(sample.high)}" if sample.high else ""
         target.show(sample, f"{name:22} {sample.value:8d} {sample.unit:14} {sample.title}{high}  ({sample.quality})")
 
@@ -205,7 +268,12 @@ def monitors(target: Target, axis: str) -> None:
 @with_target
 def alarms(target: Target, axis: str) -> None:
     """Show the present alarm of AXIS and the history that its drive keeps."""
-    reply = target.run(lambda client: client.command(axis, Verb.READ_ALARMS, ReadAlarms(), timeout_s=30.0))
+
+    async def work(client: RigClient) -> CommandReply:
+        await axis_of(client, axis)
+        return await client.command(axis, Verb.READ_ALARMS, ReadAlarms(), ReadAlarms.answer_s)
+
+    reply = target.run(work)
     if not isinstance(reply, AlarmReport):
         raise NotSupported(f"axis {axis} keeps no alarms", axis=axis)
     past = (f"  {entry.code:04X}H {entry.text}" for entry in reply.history)
@@ -215,68 +283,33 @@ def alarms(target: Target, axis: str) -> None:
 @command.command("clear-counter")
 @click.argument("axis")
 @click.argument("counter", type=click.Choice([name.value for name in CounterName]))
-@with_target
-def clear_counter(target: Target, axis: str, counter: str) -> None:
-    """Set a pulse counter of AXIS to 0; command pulses must be stopped, and the motor must stand."""
-    request = ClearCounter(counter=CounterName(counter))
-    reply = target.run(lambda client: client.command(axis, request))
-    remarks = "".join(f"; {remark}" for remark in reply.remarks)
-    target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
+@commanding
+def clear_counter(sender: Sender, axis: str, counter: str) -> None:
+    """Set a pulse counter of AXIS to 0; its motor must stand."""
+    sender.send(axis, ClearCounter(counter=CounterName(counter)))
 
 
-def _send(target: Target, axis: str, command: AxisCommand[CommandReply], *, wait: bool = False) -> None:
-    async def work(client: RigClient) -> tuple[CommandReply, StateSample | None]:
-        reply = await client.command(axis, command)
-        target.show(reply, f"{axis}: {command.verb} accepted{_values(reply)}")
-        return reply, await _follow(client, reply) if wait else None
-
-    async def _follow(client: RigClient, reply: CommandReply) -> StateSample:
-        """Show where the axis is while it moves, on a terminal."""
-        async with client.samples(axis, TelemetryItem.POSITION) as positions, asyncio.TaskGroup() as group:
-            progress = group.create_task(_show(positions), name="progress")
-            try:
-                return await client.wait_for_end(axis, reply.command_id)
-            finally:
-                progress.cancel()
-
-    async def _show(positions: object) -> None:
-        if sys.stderr.isatty() and hasattr(positions, "__aiter__"):
-            async for _, sample in positions:
-                print(f"\r{axis}: {_text(sample)}\x1b[K", end="", file=sys.stderr, flush=True)
-
-    _, state = target.run(work)
-    if state is None:
-        return
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
-    failed = state.last_error is not None
-    target.show(state, f"{axis}: {state.state}{f', {state.last_error}' if failed else ''}")
-    if failed:
-        sys.exit(1)
+def _previewed(info: AxisInfo, reply: PlanReply) -> list[str]:
+    if reply.refusal:
+        lines = [f"{info.axis}: would be refused: {reply.refusal.message} [{reply.refusal.code}]"]
+        if reply.refusal.nearest is not None:
+            lines.append(f"  the nearest value that would be accepted is {reply.refusal.nearest:g}")
+        return lines
+    end = "runs until stopped or to the soft limit"
+    if reply.position is not None:
+        end = f"ends at {number(reply.position, info)}"
+    time = f", in {seconds(reply.duration_s)} without settling" if reply.duration_s is not None else ""
+    lines = [
+        f"{info.axis}: {end}{time}",
+        f"  velocity     {_held(reply.velocity, reply.velocity_error)} {info.unit}/s",
+        f"  acceleration {_held(reply.acceleration, reply.acceleration_error)} {info.unit}/s²",
+    ]
+    if reply.bus_s is not None:
+        lines.append(f"  {len(reply.packets)} packets, {seconds(reply.bus_s)} on the line at most")
+    return [*lines, *(f"  now in the way: {obstacle}" for obstacle in reply.obstacles)]
 
 
-def _values(reply: CommandReply) -> str:
-    parts = (
-        ("to", reply.position),
-        ("at", reply.velocity),
-        ("with acceleration", reply.acceleration),
-        ("in s", reply.duration_s),
-    )
-    return "".join(f" {name} {value:g}" for name, value in parts if value is not None)
-
-
-def _text(sample: Sample) -> str:
-    match sample:
-        case PositionSample():
-            return f"position {sample.value:12.4f} {sample.unit}  ({sample.quality})"
-        case VelocitySample():
-            return f"velocity {sample.value:12.4f} {sample.unit}  ({sample.quality})"
-        case AdcSample():
-            return f"adc      {sample.counts:5d} of {sample.full_scale}, {sample.volts:.3f} V  ({sample.quality})"
-        case StateSample():
-            latched = ", stop latched" if sample.stop_latched else ""
-            return f"state    {sample.state}, moving: {sample.moving}, link {sample.link}{latched}"
-        case FaultSample():
-            return "fault    " + ("; ".join(f"{fault.code}: {fault.text}" for fault in sample.active) or "none")
-        case _:
-            return sample.model_dump_json()
+def _held(value: float | None, error: float | None) -> str:
+    if value is None:
+        return "unknown"
+    return f"{value:.6g}" + (f" ({error:+.2g} by rounding)" if error else "")

@@ -8,6 +8,7 @@ import click
 
 from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.numbers import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
@@ -67,7 +68,7 @@ def list_buses(target: Target) -> None:
 @click.argument("bus")
 @click.option(
     "--seconds",
-    type=click.FloatRange(0, 86_400, min_open=True),
+    type=Finite(0, 86_400, min_open=True),
     default=10.0,
     show_default=True,
     help="How far back.",

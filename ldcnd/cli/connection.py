@@ -8,18 +8,36 @@ from pathlib import Path
 from typing import TypeVar
 
 import click
+from pydantic import ValidationError
 
+from ldcnd.cli.output import show_lines
 from ldcnd.client.connecting import open_rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.frozen import Frozen
-from ldcnd.printable import printable
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ResultT = TypeVar("ResultT")
+ModelT = TypeVar("ModelT", bound=Frozen)
 CommandT = TypeVar("CommandT", bound=Callable[..., object])
+
+
+def of_options(model: type[ModelT], **values: object) -> ModelT:
+    """Return a model of what was typed.
+
+    Raises:
+        click.BadParameter: a value is none that the model takes, such as nan; names the option.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)[0]
+        name = ".".join(map(str, wrong["loc"])) or "value"
+        raise click.BadParameter(
+            f"{wrong['msg'][:1].lower()}{wrong['msg'][1:]}, not {wrong['input']!r}", param_hint=name.replace("_", "-")
+        ) from None
 
 
 class TargetOption(click.Option):
@@ -64,11 +82,11 @@ class Target:
 
     def show(self, model: Frozen, *lines: str) -> None:
         """Print one result: as a line of JSON, or as these lines."""
-        shown = (model.model_dump_json(),) if self.as_json else lines
-        print("\n".join(map(printable, shown)), flush=True)
+        show_lines(*((model.model_dump_json(),) if self.as_json else lines))
 
     def _settings(self) -> ZenohSettings:
-        endpoints = self.connect or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))
+        named = tuple(each if "/" in each else f"tcp/{each}" for each in self.connect)
+        endpoints = named or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))
         return ZenohSettings(
             mode="client" if endpoints else None if self.config else "peer",
             connect=endpoints,
@@ -90,7 +108,7 @@ def _target_options(command: CommandT) -> CommandT:
             "-e",
             multiple=True,
             envvar="LDCND_CONNECT",
-            help=f"Zenoh endpoint of the daemon [$LDCND_CONNECT, or {DEFAULT_ENDPOINT}].",
+            help=f"Zenoh endpoint of the daemon, or HOST:PORT [$LDCND_CONNECT, or {DEFAULT_ENDPOINT}].",
         ),
     ):
         command = given(command)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.numbers import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import WrongState
 from ldcnd.model.commands import MoveVelocity, Power
@@ -27,7 +28,7 @@ def _moving(work: Callable[..., None]) -> Callable[..., None]:
     """Give a drill the axis and the velocity at which it is caught."""
     for option in (
         click.confirmation_option("--yes", prompt="The axis will move. Go on?"),
-        click.option("--velocity", type=float, required=True, help="Units a second, signed."),
+        click.option("--velocity", type=Finite(), required=True, help="Units a second, signed."),
         click.argument("axis"),
     ):
         work = option(work)
@@ -36,7 +37,7 @@ def _moving(work: Callable[..., None]) -> Callable[..., None]:
 
 @command.command("client-loss")
 @_moving
-@click.option("--lease", "lease_s", type=float, default=1.0, show_default=True, help="Length of the lease, seconds.")
+@click.option("--lease", "lease_s", type=Finite(), default=1.0, show_default=True, help="Length of the lease, seconds.")
 @with_target
 def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> None:
     """Take control, jog, and disappear: how long until the axis reacts, and until it stands?"""

@@ -5,13 +5,14 @@ import asyncio
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.numbers import Finite
 from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.errors import SessionError
 from ldcnd.messaging.session import Session
 
 
 @click.command()
-@click.option("--watch", type=click.FloatRange(min=0.5, max=3600), help="Show it again every so many seconds.")
+@click.option("--watch", type=Finite(min=0.5, max=3600), help="Show it again every so many seconds.")
 @with_target
 def command(target: Target, watch: float | None) -> None:
     """Show every rig across routers: its daemon, its lines and axes, and what is wrong with them.

@@ -6,21 +6,20 @@ from typing import NoReturn
 
 import click
 
-from ldcnd.errors import ConfigError, LdcndError, SessionError
-
-EXIT_FAILED = 1
-"""The daemon refused, or something failed; the message says what."""
-EXIT_UNREACHABLE = 3
-"""No daemon answered."""
-EXIT_CONFIG = 78
-"""The configuration cannot work (EX_CONFIG)."""
+from ldcnd.cli.output import DONE, exit_code
+from ldcnd.errors import LdcndError
 
 COMMANDS = {
     "run": ("ldcnd.cli.run", "Run the daemon."),
     "check-config": ("ldcnd.cli.check_config", "Validate a configuration without opening anything."),
     "plan": ("ldcnd.cli.plan", "Show what the lines of a configuration promise, before any hardware is there."),
     "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
+    "stop": ("ldcnd.cli.rig:stop", "Stop every axis of a rig, or one, and latch."),
+    "reset": ("ldcnd.cli.rig:reset", "Clear stop latches and faults of all axes."),
+    "power": ("ldcnd.cli.rig:power", "Close or open the position loops of all axes."),
     "axis": ("ldcnd.cli.axis", "List, watch, move, stop and home axes of a running daemon."),
+    "group": ("ldcnd.cli.rig:group", "Move several axes together."),
+    "lease": ("ldcnd.cli.rig:lease", "See who controls which axis; hold control."),
     "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
     "why": ("ldcnd.cli.why", "Tell why an axis cannot move, and what would clear that."),
     "fleet": ("ldcnd.cli.fleet", "Show every rig, axis, version and health that can be reached."),
@@ -52,8 +51,9 @@ class LazyGroup(click.Group):
         """Import the command's module and return its `command`."""
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(COMMANDS[cmd_name][0])
-        command = module.command
+        module_name, _, name = COMMANDS[cmd_name][0].partition(":")
+        module = importlib.import_module(module_name)
+        command = getattr(module, name or "command")
         if not isinstance(command, click.Command):
             raise TypeError(f"{module.__name__}.command is not a command")
         return command
@@ -69,7 +69,7 @@ class LazyGroup(click.Group):
 def cli() -> None:
     """Own RS-485 servo lines and expose their drives over Zenoh.
 
-    Exit codes: 0 done; 1 refused or failed; 2 wrong usage; 3 no daemon answers; 78 wrong configuration.
+    Exit codes: 0 done; 1 refused or failed; 2 wrong usage; 3 no daemon answers; 78 wrong configuration; 130 Ctrl-C.
     """
 
 
@@ -77,21 +77,14 @@ def main() -> NoReturn:
     """Run the command line and exit with a documented code."""
     try:
         cli.main(standalone_mode=False)
-    except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        sys.exit(130)
-    except ConfigError as error:
-        print(error.message, file=sys.stderr)
-        if error.remedy:
-            print(f"  {error.remedy}", file=sys.stderr)
-        sys.exit(EXIT_CONFIG)
-    except LdcndError as error:
-        print(f"{error.message} [{error.code}]", file=sys.stderr)
-        if error.remedy:
-            print(f"  {error.remedy}", file=sys.stderr)
-        if page := error.page:
-            print(f"  more: ldcnd fault {page.rpartition('/')[2]}", file=sys.stderr)
-        sys.exit(EXIT_UNREACHABLE if isinstance(error, SessionError) else EXIT_FAILED)
-    sys.exit(0)
+        sys.stdout.flush()
+    except (
+        click.ClickException,
+        click.Abort,
+        KeyboardInterrupt,
+        BrokenPipeError,
+        LdcndError,
+        BaseExceptionGroup,
+    ) as error:
+        sys.exit(exit_code(error))
+    sys.exit(DONE)

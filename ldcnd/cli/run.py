@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from ldcnd.cli.ending import Terminal
 from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.daemon.process.assembly import open_daemon
 from ldcnd.daemon.process.daemon import Daemon
@@ -39,7 +40,8 @@ def command(
 ) -> None:
     """Own the lines of a rig and serve its drives until SIGTERM or SIGINT; moving axes are stopped first.
 
-    SIGHUP reads CONFIG again: limits, default speeds and rates change at once, the log names what needs a restart.
+    SIGHUP reads CONFIG again: limits, default speeds and rates change at once, the log names what needs a restart. When
+    the terminal on which it was started is closed, the daemon ends as at SIGTERM.
     Options, the log level among them, keep their values.
     """
     configure_logging(json=log_json, level=log_level)
@@ -67,7 +69,12 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
     """Serve one rig until a signal asks to end; SIGHUP has its configuration read again."""
     async with open_daemon(rig) as daemon:
         service = Service(daemon, Notifier(), load)
-        handlers = {signal.SIGTERM: service.end, signal.SIGINT: service.end, signal.SIGHUP: service.reload}
+        terminal = Terminal()
+
+        def hang_up() -> None:
+            (service.end if terminal.has_gone else service.reload)()
+
+        handlers = {signal.SIGTERM: service.end, signal.SIGINT: service.end, signal.SIGHUP: hang_up}
         loop = asyncio.get_running_loop()
         for number, handler in handlers.items():
             loop.add_signal_handler(number, handler)

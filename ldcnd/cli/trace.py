@@ -8,6 +8,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.numbers import Finite
 from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
@@ -74,7 +75,7 @@ def command() -> None:
 @click.option("--samples", type=click.IntRange(2, MOST_SAMPLES), default=500, help="How many samples [500].")
 @click.option("--pre", type=click.IntRange(0), default=0, help="So many of them before the trigger [0].")
 @click.option("--trigger", callback=_trigger, help="CHANNEL:KIND:LEVEL; kinds: rising, falling, either, above, below.")
-@click.option("--timeout", type=click.FloatRange(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")
+@click.option("--timeout", type=Finite(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")
 @out_option
 @with_target
 def take(

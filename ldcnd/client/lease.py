@@ -24,11 +24,13 @@ class Control:
     Attributes:
         lease: as acquired.
         lost: why it does not hold any more; None while it does.
+        over: is set when it does not.
     """
 
     def __init__(self, client: RigClient, lease: LeaseReply) -> None:
         self.lease = lease
         self.lost: LdcndError | None = None
+        self.over = asyncio.Event()
         self._client = client
         self._sequence = count(1)
 
@@ -67,6 +69,7 @@ class Control:
                     self.lost = LeaseExpired(f"it could not be renewed for {lease_s:g} s: {error.message}")
             else:
                 until_s = asked_at_s + lease_s
+        self.over.set()
 
     async def release(self) -> None:
         """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told."""

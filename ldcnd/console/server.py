@@ -66,7 +66,7 @@ def build_app(
 
 
 async def serve(settings: ConsoleSettings) -> None:
-    """Serve until SIGTERM or SIGINT; SIGUSR1 prints another link.
+    """Serve until SIGTERM, SIGINT or the end of the terminal; SIGUSR1 prints another link.
 
     Raises:
         ConfigError: the address, the certificate or what was said about Zenoh cannot be used.
@@ -85,7 +85,7 @@ async def serve(settings: ConsoleSettings) -> None:
 
     async with Feed(values, time.time_ns) as feed, asyncio.TaskGroup() as group:
         server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link), settings))
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, server.end)
         loop.add_signal_handler(signal.SIGUSR1, lambda: _print(new_link(), settings))
         watching = [

@@ -1,0 +1,58 @@
+"""Commands of the command line that are made of the class of what they send: its fields, their texts and limits."""
+
+from enum import Enum
+from types import NoneType
+from typing import Any, get_args
+
+import click
+
+from ldcnd.cli.connection import of_options
+from ldcnd.cli.numbers import Finite
+from ldcnd.cli.sending import Sender, Sent, commanding
+from ldcnd.model.commands import AxisCommand
+from ldcnd.model.frozen import attribute_docstrings
+
+
+def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False) -> click.Command:
+    """Return a command that sends one class to an axis.
+
+    Args:
+        name: what it is called.
+        command: what it sends.
+        arguments: the fields that are given by their place; the others are options.
+        moves: it moves the axis, so it can be waited for.
+    """
+
+    @commanding
+    def callback(sender: Sender, /, axis: str, *, wait: bool = False, **given: Any) -> None:  # noqa: ANN401 - click's own
+        sender.send(axis, of_options(command, **given), wait=wait)
+
+    params: list[click.Parameter] = [click.Argument(["axis"])]
+    texts = attribute_docstrings(command)
+    for field, described in command.model_fields.items():
+        if field in AxisCommand.model_fields:
+            continue
+        kind = _kind(described.annotation)
+        if field in arguments:
+            params.append(click.Argument([field], type=kind))
+        else:
+            params.append(click.Option([f"--{field.replace('_', '-')}"], type=kind, help=texts.get(field)))
+    if moves:
+        params.append(click.Option(["--wait"], is_flag=True, help="Return when it has ended; Ctrl-C halts the axis."))
+    target = getattr(callback, "__click_params__", [])
+    return click.Command(
+        name,
+        params=[*params, *reversed(target)],
+        callback=callback,
+        help=command.summary(),
+        context_settings={"ignore_unknown_options": True},  # a value may be negative
+    )
+
+
+def _kind(annotation: object) -> click.ParamType[Any]:
+    """Return how a field is written on the command line."""
+    kinds = [each for each in get_args(annotation) or (annotation,) if each is not NoneType]
+    kind = kinds[0]
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return click.Choice([each.value for each in kind])
+    return click.INT if kind is int else Finite()

@@ -1,0 +1,105 @@
+"""`ldcnd axis jog`: run an axis for a time, or for as long as a key is held; then it is halted, whatever happens."""
+
+import asyncio
+import sys
+import termios
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import click
+
+from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.names import axis_of
+from ldcnd.cli.numbers import Finite
+from ldcnd.cli.output import show_lines
+from ldcnd.cli.quantities import rounded
+from ldcnd.cli.sending import NAME, halted, halting
+from ldcnd.client.lease import Control, control
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import ConfigError
+from ldcnd.model.commands import MoveVelocity, Verb
+from ldcnd.model.meta import AxisInfo
+
+LEASE_S = 1.0
+"""The daemon applies `loss.client` so soon when this program disappears."""
+FIRST_REPEAT_S = 0.8
+"""A keyboard begins to repeat a key that is held within this time."""
+NEXT_REPEAT_S = 0.25
+"""And repeats it at least so often; after a longer silence the key counts as released."""
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.argument("axis")
+@click.argument("velocity", type=Finite())
+@click.option("--for", "for_s", type=Finite(0, 3600, min_open=True), help="Run for so many seconds.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
+@click.option("--force", is_flag=True, help="Take control from its holder.")
+@with_target
+def jog(
+    target: Target, axis: str, velocity: float, for_s: float | None, acceleration: float | None, *, force: bool
+) -> None:
+    """Run AXIS at VELOCITY (units a second, signed) while the space bar is held, or with --for for a time.
+
+    The axis is under control of this command meanwhile. It is halted when the key is released, when the time is over,
+    at Ctrl-C and when the terminal goes; if this program dies, the daemon does what `loss.client` says within a second.
+    """
+    command = of_options(MoveVelocity, velocity=velocity, acceleration=acceleration)
+    if for_s is None and not sys.stdin.isatty():
+        raise ConfigError("there is no keyboard here", remedy="say how long to run with --for SECONDS")
+
+    async def work(client: RigClient) -> str:
+        info = await axis_of(client, axis)
+        async with (
+            control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force) as held,
+            halting(client, info),
+        ):
+            if for_s is None:
+                await _while_held(client, info, held, command)
+            else:
+                reply = await held.command(axis, Verb.MOVE_VELOCITY, command)
+                show_lines(f"{axis}: runs at {rounded(reply.velocity or velocity)} {info.unit}/s for {for_s:g} s")
+                await asyncio.sleep(for_s)
+            return await halted(client, info)
+
+    end_as_interrupted()
+    show_lines(target.run(work))
+
+
+async def _while_held(client: RigClient, info: AxisInfo, held: Control, command: MoveVelocity) -> None:
+    """Run the axis whenever the space bar is held, until another key is pressed."""
+    with _keys() as pressed:
+        show_lines("hold the space bar to run, any other key ends", err=True)
+        while await pressed.get() == " ":
+            await held.command(info.axis, Verb.MOVE_VELOCITY, command)
+            await _released(pressed)
+            show_lines(await halted(client, info), err=True)
+
+
+async def _released(pressed: "asyncio.Queue[str]") -> None:
+    """Return when the key that was pressed is not repeated any more."""
+    within_s = FIRST_REPEAT_S
+    try:
+        while True:
+            async with asyncio.timeout(within_s):
+                if await pressed.get() != " ":
+                    return
+            within_s = NEXT_REPEAT_S
+    except TimeoutError:
+        return
+
+
+@contextmanager
+def _keys() -> "Iterator[asyncio.Queue[str]]":
+    """Yield the keys that are pressed, one by one, as they come."""
+    pressed: asyncio.Queue[str] = asyncio.Queue()
+    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+    tty.setcbreak(terminal)
+    loop.add_reader(terminal, lambda: pressed.put_nowait(sys.stdin.read(1)))
+    try:
+        yield pressed
+    finally:
+        loop.remove_reader(terminal)
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)

@@ -1,0 +1,101 @@
+"""Values in words: with their units, and no more digits than one encoder count is worth."""
+
+import math
+
+from ldcnd.model.commands import CommandReply, Verb
+from ldcnd.model.meta import AxisInfo
+from ldcnd.model.samples import (
+    AdcSample,
+    AxisState,
+    FaultSample,
+    Moving,
+    PositionSample,
+    Sample,
+    StateSample,
+    VelocitySample,
+)
+
+MOST_DECIMALS = 6
+
+
+def decimals(info: AxisInfo) -> int:
+    """Return how many decimals show one encoder count of an axis."""
+    scale = info.counts_per_unit
+    return min(MOST_DECIMALS, max(0, math.ceil(math.log10(scale)))) if scale else 0
+
+
+def number(value: float, info: AxisInfo, per: str = "") -> str:
+    """Return a value of an axis with its unit; `per` is what follows the unit, such as `/s`."""
+    return f"{value:.{decimals(info)}f} {info.unit}{per}"
+
+
+def seconds(value: float) -> str:
+    """Return a time in the unit that fits."""
+    return f"{value * 1e3:.0f} ms" if value < 1 else f"{value:.2f} s"
+
+
+def values_of(reply: CommandReply, info: AxisInfo) -> str:
+    """Return what the drive's registers make of a command."""
+    parts = []
+    if reply.position is not None:
+        parts.append(f"to {number(reply.position, info)}")
+    if reply.target is not None:
+        parts.append(f"to A/D count {reply.target}")
+    if reply.duty is not None:
+        parts.append(f"duty {reply.duty:.1%}")
+    if reply.velocity is not None:
+        parts.append(f"at {rounded(reply.velocity)} {info.unit}/s")
+    if reply.acceleration is not None:
+        parts.append(f"with {rounded(reply.acceleration)} {info.unit}/s²")
+    if reply.duration_s is not None:
+        parts.append(f"in {seconds(reply.duration_s)}")
+    return f": {', '.join(parts)}" if parts else ""
+
+
+def rounded(value: float) -> str:
+    """Return a value that a register rounds, to four digits."""
+    return f"{value:.4g}"
+
+
+def outcome(axis: str, verb: str, state: StateSample) -> str:
+    """Return how a command that was waited for has ended."""
+    if state.last_error is not None:
+        return f"{axis}: {state_word(state)}: {state.last_error}"
+    done = "homed" if verb == Verb.HOME else "done"
+    return f"{axis}: {done}, {state_word(state)}"
+
+
+STATE_WORDS = {
+    AxisState.DISCRETE_MOTION: "moving",
+    AxisState.CONTINUOUS_MOTION: "running",
+    AxisState.ERROR_STOP: "error stop",
+}
+
+
+def state_word(state: StateSample) -> str:
+    """Return the state of an axis in the console's words."""
+    word = STATE_WORDS.get(state.state, state.state.value.replace("_", " "))
+    return f"{word}, stop latched" if state.stop_latched else word
+
+
+def sample_text(sample: Sample) -> str:
+    """Return one sample of telemetry."""
+    match sample:
+        case PositionSample():
+            return f"position {sample.value:14.4f} {sample.unit}{_worth(sample)}"
+        case VelocitySample():
+            return f"velocity {sample.value:14.4f} {sample.unit}{_worth(sample)}"
+        case AdcSample():
+            return f"adc      {sample.volts:10.3f} V ({sample.counts} of {sample.full_scale}){_worth(sample)}"
+        case StateSample():
+            moving = "" if sample.moving is not Moving.UNKNOWN else ", moving: unknown"
+            link = "" if sample.link == "up" else f", link {sample.link}"
+            return f"state    {state_word(sample)}{moving}{link}"
+        case FaultSample():
+            return "fault    " + ("; ".join(f"{fault.code}: {fault.text}" for fault in sample.active) or "none")
+        case _:
+            return sample.model_dump_json()
+
+
+def _worth(sample: Sample) -> str:
+    return "" if sample.quality == "good" else f"  ({sample.quality})"

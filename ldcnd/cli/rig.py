@@ -1,0 +1,179 @@
+"""What concerns a whole rig: stop, reset and power, several axes at once, and who controls what."""
+
+import asyncio
+import os
+import shlex
+import sys
+
+import click
+
+from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.names import axis_of
+from ldcnd.cli.numbers import Finite
+from ldcnd.cli.output import FAILED, show_lines
+from ldcnd.cli.quantities import outcome, values_of
+from ldcnd.cli.sending import NAME, Sender, commanding, halted
+from ldcnd.client.lease import control
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import LeaseExpired
+from ldcnd.model.commands import Power, Reset, StopReply
+from ldcnd.model.rig_commands import AxisMove, HolderList, ListHolders, MoveTogether, MoveTogetherReply
+from ldcnd.model.verbs import HOLDERS, MOVE_TOGETHER
+
+GROUP_TIME_S = 10.0
+
+
+def stop_rig(target: Target, axis: str | None) -> None:
+    """Stop one axis or all, and say which drives have confirmed it."""
+
+    async def work(client: RigClient) -> StopReply:
+        return await client.stop(axis, client=NAME)
+
+    # a rig that is named is not looked for first: the stop is what reaches it first
+    rig = target.rig
+    reply = target.run_session(lambda session: work(RigClient(session, rig))) if rig else target.run(work)
+    unconfirmed = sorted(set(reply.axes) - set(reply.confirmed))
+    target.show(reply, f"stopped and latched: {', '.join(reply.confirmed) or 'none'}")
+    if unconfirmed:
+        show_lines(
+            f"NOT confirmed: {', '.join(unconfirmed)}; the latch holds, look at the machine, use its emergency stop",
+            err=True,
+        )
+        sys.exit(FAILED)
+
+
+@click.command()
+@click.argument("axis", required=False)
+@with_target
+def stop(target: Target, axis: str | None) -> None:
+    """Stop AXIS, or every axis of the rig, and latch: nothing moves again before `ldcnd reset`.
+
+    It needs no lease and works in any state. It is no emergency stop.
+    """
+    stop_rig(target, axis)
+
+
+@click.command()
+@click.argument("axes", nargs=-1, metavar="[AXIS]...")
+@commanding
+def reset(sender: Sender, axes: tuple[str, ...]) -> None:
+    """Clear stop latches and faults of each AXIS, or of all axes; nothing moves."""
+    sender.send_to_all(axes, Reset())
+
+
+@click.command()
+@click.argument("switch", type=click.Choice(["on", "off"]))
+@click.argument("axes", nargs=-1, metavar="[AXIS]...")
+@commanding
+def power(sender: Sender, switch: str, axes: tuple[str, ...]) -> None:
+    """Close (on) or open (off) the position loops of each AXIS, or of all axes; nothing moves."""
+    sender.send_to_all(axes, Power(on=switch == "on"))
+
+
+@click.group()
+def group() -> None:
+    """Move several axes that start in the same servo cycle."""
+
+
+@group.command("move", context_settings={"ignore_unknown_options": True})
+@click.argument("moves", nargs=-1, required=True, metavar="AXIS=POSITION...")
+@click.option("--velocity", type=Finite(), help="Units a second, for each axis; the axis defaults when missing.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis defaults when missing.")
+@click.option("--wait", is_flag=True, help="Return when all have ended; Ctrl-C halts them.")
+@commanding
+def group_move(
+    sender: Sender, moves: tuple[str, ...], velocity: float | None, acceleration: float | None, *, wait: bool
+) -> None:
+    """Start absolute moves of all members of a configured group together, or none of them: `x=10 y=20`."""
+    wanted = []
+    for each in moves:
+        axis, _, position = each.partition("=")
+        values = {"axis": axis, "position": position, "velocity": velocity, "acceleration": acceleration}
+        wanted.append(of_options(AxisMove, **values, lease=sender.lease, client=None if sender.lease else NAME))
+    request = of_options(MoveTogether, moves=tuple(wanted))
+    if wait:
+        end_as_interrupted()
+
+    async def work(client: RigClient) -> list[str]:
+        infos = [await axis_of(client, move.axis) for move in wanted]
+
+        async def follow(reply: MoveTogetherReply) -> list[str]:
+            states = [await client.wait_for_end(each.axis, each.command_id) for each in reply.replies]
+            failed = [each.axis for each, state in zip(reply.replies, states, strict=True) if state.last_error]
+            for each, state in zip(reply.replies, states, strict=True):
+                sender.target.show(state, outcome(each.axis, each.verb, state))
+            return failed
+
+        reply = await client.rig_command(MOVE_TOGETHER, request, MoveTogetherReply, GROUP_TIME_S)
+        lines = [
+            f"{each.axis}: accepted{values_of(each, info)}" for each, info in zip(reply.replies, infos, strict=True)
+        ]
+        sender.target.show(reply, *lines)
+        if not wait:
+            return []
+        try:
+            return await follow(reply)
+        except asyncio.CancelledError:
+            show_lines(*[await halted(client, info) for info in infos], err=True)
+            raise
+
+    if sender.target.run(work):
+        sys.exit(FAILED)
+
+
+@click.group()
+def lease() -> None:
+    """See who controls which axis, and take control."""
+
+
+@lease.command("list")
+@with_target
+def list_holders(target: Target) -> None:
+    """Show who controls each axis."""
+    reply = target.run(lambda client: client.rig_command(HOLDERS, ListHolders(), HolderList))
+    needed = "a motion needs control" if reply.required else "an axis that is not controlled is open to all"
+    lines = [f"{each.axis:8} {each.client or 'not controlled'}" for each in reply.holders]
+    target.show(reply, *lines, f"({needed})")
+
+
+@lease.command(context_settings={"allow_interspersed_args": False})
+@click.option("--axis", "axes", multiple=True, help="This axis; may be repeated. All axes when missing.")
+@click.option("--name", default=NAME, show_default=True, help="Who holds it, for people.")
+@click.option(
+    "--seconds",
+    "lease_s",
+    type=Finite(0.2, 60),
+    default=2.0,
+    show_default=True,
+    help="The daemon applies `loss.client` so soon when this program disappears.",
+)
+@click.option("--force", is_flag=True, help="Take control from its holder.")
+@click.argument("program", nargs=-1, metavar="[-- PROGRAM...]")
+@with_target
+def hold(
+    target: Target, axes: tuple[str, ...], name: str, lease_s: float, program: tuple[str, ...], *, force: bool
+) -> None:
+    """Hold control until Ctrl-C, or for as long as PROGRAM runs.
+
+    The lease is printed, and in $LDCND_LEASE of PROGRAM, where all commands of ldcnd find it.
+    """
+
+    async def work(client: RigClient) -> int:
+        for axis in axes:
+            await axis_of(client, axis)
+        async with control(client, name, *axes, lease_s=lease_s, force=force) as held:
+            if program:
+                environment = {**os.environ, "LDCND_LEASE": held.lease.lease}
+                running = await asyncio.create_subprocess_exec(*program, env=environment)
+                return await running.wait()
+            target.show(held.lease, f"{held.lease.lease}  controls {', '.join(held.lease.axes)}; Ctrl-C releases it")
+            await held.over.wait()
+            why = f": {held.lost.message}" if held.lost else ""
+            raise LeaseExpired(f"control is lost{why}", remedy="hold it again")
+
+    try:
+        code = target.run(work)
+    except FileNotFoundError as error:
+        raise click.UsageError(f"{shlex.join(program)}: {error.strerror}") from error
+    sys.exit(code)

@@ -1,0 +1,154 @@
+"""How commands reach axes: checked names, one lease, the reply in units, and a wait whose end halts what was begun."""
+
+import asyncio
+import sys
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, nullcontext, suppress
+from functools import wraps
+from typing import Any
+
+import click
+
+from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.names import axis_of
+from ldcnd.cli.output import FAILED, show_lines
+from ldcnd.cli.quantities import number, outcome, values_of
+from ldcnd.client.rig_client import RigClient, Samples
+from ldcnd.errors import LdcndError
+from ldcnd.model.commands import AxisCommand, CommandReply, Halt, Verb
+from ldcnd.model.meta import AxisInfo
+from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
+
+HALT_TIME_S = 3.0
+NAME = "ldcnd"
+"""Under this name the command line is found in events unless a lease says another."""
+
+Sent = AxisCommand[CommandReply]
+
+
+def commanding(work: Callable[..., None]) -> Callable[..., None]:
+    """Give a command its options for finding the daemon, and one for the lease under which it is sent."""
+
+    @click.option("--lease", envvar="LDCND_LEASE", help="Send it under this lease, as `ldcnd lease hold` prints it.")
+    @with_target
+    @wraps(work)
+    def command(target: Target, /, *, lease: str | None, **options: Any) -> None:  # noqa: ANN401 - click's own values
+        work(Sender(target, lease or None), **options)
+
+    return command
+
+
+class Sender:
+    """Sends the commands of one call of the command line.
+
+    Args:
+        target: where the daemon is.
+        lease: under which lease; None without one.
+    """
+
+    def __init__(self, target: Target, lease: str | None) -> None:
+        self.target = target
+        self.lease = lease
+
+    def send(self, axis: str, command: Sent, *, wait: bool = False, leave_running: bool = False) -> None:
+        """Send one command and show its reply; with `wait` return when it has ended.
+
+        Ctrl-C, SIGTERM and the end of the terminal halt an axis that is waited for, unless it is to be left running.
+        """
+        if wait:
+            end_as_interrupted()
+
+        async def work(client: RigClient) -> StateSample | None:
+            info = await axis_of(client, axis)
+            async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
+                reply = await self.command(client, axis, command)
+                words = command.verb.replace("_", " ")
+                self.target.show(reply, f"{axis}: {words} accepted{values_of(reply, info)}")
+                return await _follow(client, info, reply) if wait else None
+
+        state = self.target.run(work)
+        if state is None:
+            return
+        self.target.show(state, outcome(axis, command.verb, state))
+        if state.last_error is not None:
+            sys.exit(FAILED)
+
+    def send_to_all(self, axes: Sequence[str], command: Sent) -> None:
+        """Send one command to several axes, all that take it when none is named; tell how it went with each."""
+
+        async def work(client: RigClient) -> list[CommandReply | LdcndError]:
+            known = [info for info in await client.axes() if Verb(command.verb) in info.capabilities]
+            for axis in axes:
+                await axis_of(client, axis)
+            wanted = axes or [info.axis for info in known]
+            async with asyncio.TaskGroup() as group:
+                tasks = [group.create_task(self._outcome(client, axis, command), name=axis) for axis in wanted]
+            return [task.result() for task in tasks]
+
+        outcomes = self.target.run(work)
+        for each in outcomes:
+            if isinstance(each, LdcndError):
+                show_lines(f"{each.message} [{each.code}]", err=True)
+            else:
+                self.target.show(each, f"{each.axis}: {each.verb.replace('_', ' ')} done")
+        if any(isinstance(each, LdcndError) for each in outcomes):
+            sys.exit(FAILED)
+
+    async def command(self, client: RigClient, axis: str, command: Sent) -> CommandReply:
+        """Send one command, under the lease if there is one."""
+        named = command.model_copy(update={"lease": self.lease, "client": None if self.lease else NAME})
+        return await client.command(axis, Verb(command.verb), named, command.answer_s)
+
+    async def _outcome(self, client: RigClient, axis: str, command: Sent) -> CommandReply | LdcndError:
+        try:
+            return await self.command(client, axis, command)
+        except LdcndError as error:
+            return error
+
+
+@asynccontextmanager
+async def halting(client: RigClient, info: AxisInfo, *, leave_running: bool = False) -> AsyncIterator[None]:
+    """Halt an axis, and say so, if the context is cut short by Ctrl-C; or say that it is left running."""
+    axis = info.axis
+    try:
+        yield
+    except asyncio.CancelledError:
+        said = f"{axis} is left running; `ldcnd axis halt {axis}` halts it" if leave_running else None
+        said = said or await halted(client, info)
+        with suppress(OSError):  # the terminal may be what has gone
+            show_lines(said, err=True)
+        raise
+
+
+async def halted(client: RigClient, info: AxisInfo) -> str:
+    """Halt an axis and wait until it stands; return in words how that went."""
+    try:
+        async with asyncio.timeout(HALT_TIME_S):
+            reply = await client.command(info.axis, Verb.HALT, Halt(client=NAME), HALT_TIME_S)
+            await client.wait_for_end(info.axis, reply.command_id)
+            position = await client.last(info.axis, TelemetryItem.POSITION)
+    except (TimeoutError, LdcndError) as error:
+        return f"{info.axis}: NOT confirmed at rest: {str(error) or 'it still moves'}; `ldcnd stop` stops every axis"
+    at = f" at {number(position.value, info)}" if isinstance(position, PositionSample) else ""
+    return f"{info.axis}: halted{at}"
+
+
+async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> StateSample:
+    """Return the state after a command; on a terminal show where the axis is meanwhile."""
+    async with client.samples(info.axis, TelemetryItem.POSITION) as positions, asyncio.TaskGroup() as group:
+        showing = group.create_task(_show(info, positions), name="progress")
+        try:
+            return await client.wait_for_end(info.axis, reply.command_id)
+        finally:
+            showing.cancel()
+            if sys.stderr.isatty():
+                with suppress(OSError):
+                    print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+async def _show(info: AxisInfo, positions: Samples) -> None:
+    if sys.stderr.isatty():
+        async for _, sample in positions:
+            if isinstance(sample, PositionSample):
+                print(f"\r{info.axis}: {number(sample.value, info)}\x1b[K", end="", file=sys.stderr, flush=True)
