@@ -14,7 +14,6 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import NotSupported
 from ldcnd.model.commands import (
     BufferMode,
-    CommandReply,
     Halt,
     Home,
     HomeMethod,
@@ -32,10 +31,17 @@ from ldcnd.model.commands import (
     SetPosition,
     SetPwm,
     Track,
-    Verb,
 )
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.parameters import AlarmReport, ClearCounter, CounterName, DriveProfile, ReadAlarms, ReadProfile
+from ldcnd.model.parameters import (
+    AlarmReport,
+    ClearCounter,
+    CounterName,
+    CounterReply,
+    DriveProfile,
+    ReadAlarms,
+    ReadProfile,
+)
 from ldcnd.model.samples import MonitorName, MonitorSample, PositionSample, Sample, StateSample, TelemetryItem
 
 WAIT = click.option("--wait", is_flag=True, help="Return when it has ended; Ctrl-C halts the axis.")
@@ -231,13 +237,11 @@ def preview(
 def profile(target: Target, axis: str) -> None:
     """Show how the drive of AXIS is taken to behave, with what was verified and what is assumed."""
 
-    async def work(client: RigClient) -> CommandReply:
+    async def work(client: RigClient) -> DriveProfile:
         await axis_of(client, axis)
-        return await client.command(axis, Verb.READ_PROFILE, ReadProfile())
+        return await client.command(axis, ReadProfile())
 
     reply = target.run(work)
-    if not isinstance(reply, DriveProfile):
-        raise NotSupported(f"axis {axis} has no profile", axis=axis)
     hearing = ", HEARS ITSELF: nothing is written" if reply.self_hearing else ""
     lines = [f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}"]
     for each in reply.assumptions:
@@ -269,24 +273,29 @@ def monitors(target: Target, axis: str) -> None:
 def alarms(target: Target, axis: str) -> None:
     """Show the present alarm of AXIS and the history that its drive keeps."""
 
-    async def work(client: RigClient) -> CommandReply:
+    async def work(client: RigClient) -> AlarmReport:
         await axis_of(client, axis)
-        return await client.command(axis, Verb.READ_ALARMS, ReadAlarms(), ReadAlarms.answer_s)
+        return await client.command(axis, ReadAlarms())
 
     reply = target.run(work)
-    if not isinstance(reply, AlarmReport):
-        raise NotSupported(f"axis {axis} keeps no alarms", axis=axis)
-    past = (f"  {entry.code:04X}H {entry.text}" for entry in reply.history)
+    past = (f"  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
     target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}", *past)
 
 
 @command.command("clear-counter")
 @click.argument("axis")
 @click.argument("counter", type=click.Choice([name.value for name in CounterName]))
-@commanding
-def clear_counter(sender: Sender, axis: str, counter: str) -> None:
-    """Set a pulse counter of AXIS to 0; its motor must stand."""
-    sender.send(axis, ClearCounter(counter=CounterName(counter)))
+@with_target
+def clear_counter(target: Target, axis: str, counter: str) -> None:
+    """Set a pulse counter of AXIS to 0; command pulses must be stopped, and the motor must stand."""
+
+    async def work(client: RigClient) -> CounterReply:
+        await axis_of(client, axis)
+        return await client.command(axis, ClearCounter(counter=CounterName(counter)))
+
+    reply = target.run(work)
+    remarks = "".join(f"; {remark}" for remark in reply.remarks)
+    target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
 
 
 def _previewed(info: AxisInfo, reply: PlanReply) -> list[str]:

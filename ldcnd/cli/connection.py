@@ -82,7 +82,7 @@ class Target:
 
     def show(self, model: Frozen, *lines: str) -> None:
         """Print one result: as a line of JSON, or as these lines."""
-        show_lines(*((model.model_dump_json(),) if self.as_json else lines))
+        show_lines(*((model.model_dump_json(ensure_ascii=True),) if self.as_json else lines))
 
     def _settings(self) -> ZenohSettings:
         named = tuple(each if "/" in each else f"tcp/{each}" for each in self.connect)

@@ -19,7 +19,7 @@ from ldcnd.cli.sending import NAME, halted, halting
 from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
-from ldcnd.model.commands import MoveVelocity, Verb
+from ldcnd.model.commands import MoveVelocity
 from ldcnd.model.meta import AxisInfo
 
 LEASE_S = 1.0
@@ -58,7 +58,7 @@ def jog(
             if for_s is None:
                 await _while_held(client, info, held, command)
             else:
-                reply = await held.command(axis, Verb.MOVE_VELOCITY, command)
+                reply = await held.command(axis, command)
                 show_lines(f"{axis}: runs at {rounded(reply.velocity or velocity)} {info.unit}/s for {for_s:g} s")
                 await asyncio.sleep(for_s)
             return await halted(client, info)
@@ -72,7 +72,7 @@ async def _while_held(client: RigClient, info: AxisInfo, held: Control, command:
     with _keys() as pressed:
         show_lines("hold the space bar to run, any other key ends", err=True)
         while await pressed.get() == " ":
-            await held.command(info.axis, Verb.MOVE_VELOCITY, command)
+            await held.command(info.axis, command)
             await _released(pressed)
             show_lines(await halted(client, info), err=True)
 

@@ -18,8 +18,7 @@ from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LeaseExpired
 from ldcnd.model.commands import Power, Reset, StopReply
-from ldcnd.model.rig_commands import AxisMove, HolderList, ListHolders, MoveTogether, MoveTogetherReply
-from ldcnd.model.verbs import HOLDERS, MOVE_TOGETHER
+from ldcnd.model.rig_commands import AxisMove, ListHolders, MoveTogether, MoveTogetherReply
 
 GROUP_TIME_S = 10.0
 
@@ -105,7 +104,7 @@ def group_move(
                 sender.target.show(state, outcome(each.axis, each.verb, state))
             return failed
 
-        reply = await client.rig_command(MOVE_TOGETHER, request, MoveTogetherReply, GROUP_TIME_S)
+        reply = await client.ask(request, timeout_s=GROUP_TIME_S)
         lines = [
             f"{each.axis}: accepted{values_of(each, info)}" for each, info in zip(reply.replies, infos, strict=True)
         ]
@@ -131,7 +130,7 @@ def lease() -> None:
 @with_target
 def list_holders(target: Target) -> None:
     """Show who controls each axis."""
-    reply = target.run(lambda client: client.rig_command(HOLDERS, ListHolders(), HolderList))
+    reply = target.run(lambda client: client.ask(ListHolders()))
     needed = "a motion needs control" if reply.required else "an axis that is not controlled is open to all"
     lines = [f"{each.axis:8} {each.client or 'not controlled'}" for each in reply.holders]
     target.show(reply, *lines, f"({needed})")

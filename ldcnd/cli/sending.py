@@ -98,7 +98,7 @@ class Sender:
     async def command(self, client: RigClient, axis: str, command: Sent) -> CommandReply:
         """Send one command, under the lease if there is one."""
         named = command.model_copy(update={"lease": self.lease, "client": None if self.lease else NAME})
-        return await client.command(axis, Verb(command.verb), named, command.answer_s)
+        return await client.command(axis, named)
 
     async def _outcome(self, client: RigClient, axis: str, command: Sent) -> CommandReply | LdcndError:
         try:
@@ -125,7 +125,7 @@ async def halted(client: RigClient, info: AxisInfo) -> str:
     """Halt an axis and wait until it stands; return in words how that went."""
     try:
         async with asyncio.timeout(HALT_TIME_S):
-            reply = await client.command(info.axis, Verb.HALT, Halt(client=NAME), HALT_TIME_S)
+            reply = await client.command(info.axis, Halt(client=NAME), HALT_TIME_S)
             await client.wait_for_end(info.axis, reply.command_id)
             position = await client.last(info.axis, TelemetryItem.POSITION)
     except (TimeoutError, LdcndError) as error:

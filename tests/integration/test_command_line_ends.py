@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 import pytest_asyncio
 
-from ldcnd.model.commands import Halt, Power, SetPosition, Verb
+from ldcnd.model.commands import Halt, Power, SetPosition
 from tests.support.process import LDCND, ROOT, answering, client, daemon, free_port
 
 pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="module"), pytest.mark.timeout(200)]
@@ -35,10 +35,10 @@ async def served():
 
 
 async def standing(rig, axis):
-    await rig.command(axis, Verb.HALT, Halt())
+    await rig.command(axis, Halt())
     await until(rig, axis, lambda state: state.moving == "no")
-    await rig.command(axis, Verb.POWER, Power(on=True))
-    await rig.command(axis, Verb.SET_POSITION, SetPosition(position=0.0))
+    await rig.command(axis, Power(on=True))
+    await rig.command(axis, SetPosition(position=0.0))
 
 
 async def until(rig, axis, wanted):
