@@ -3,6 +3,8 @@
 import asyncio
 import os
 import pty
+import re
+import tomllib
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -164,6 +166,13 @@ def test_direction_control_is_for_ports_of_this_machine():
     for port in ("socket://there:7", "sim:line0"):
         with pytest.raises(ValueError, match="rs485: only a serial port of this machine has RTS"):
             rig_with(port=port, rs485={})
+
+
+def test_direction_control_of_the_page_is_valid():
+    page = (SIMULATED.parents[1] / "docs" / "how-to" / "choose-an-adapter.md").read_text(encoding="utf-8")
+    (line,) = tomllib.loads(re.findall(r"(?ms)^```toml\n(.*?)^```$", page)[0])["bus"]
+
+    assert rig_with(**line).bus[0].transmitter == Rs485(after_ms=1)
 
 
 def test_place_where_nothing_can_be_written_is_refused_before_anything_is_opened(tmp_path: Path, monkeypatch):

@@ -39,6 +39,16 @@ NOT_RUN = {
     ("docs/how-to/console.md", "openssl rand -hex 32 > token; chmod 600 token"): (
         "test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls"
     ),
+    ("docs/how-to/confirm-on-hardware.md", "ldcnd accept /dev/ldcn-FT4ABCDE-00 --out acceptance"): (
+        "test_drives_that_are_as_the_documents_say_confirm_every_assumption_that_reading_can"
+    ),
+    (
+        "docs/how-to/confirm-on-hardware.md",
+        "ldcnd accept /dev/ldcn-FT4ABCDE-00 --out acceptance --move 1 --gains 350,3000,400,400,250,4000 --counts 2000",
+    ): "test_trial_move_confirms_the_rest_and_leaves_the_loop_open",
+    ("docs/how-to/choose-an-adapter.md", "ldcnd doctor ldcn --config rig.toml --bus line0"): (
+        "test_command_prints_findings_as_json_lines"
+    ),
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",
     ("docs/how-to/secure-a-rig.md", "ldcnd axis move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (

@@ -1,0 +1,130 @@
+"""The sequence that tries real drives, on simulated ones that are as the documents say, or are not."""
+
+import asyncio
+from dataclasses import replace
+
+import pytest
+from click.testing import CliRunner
+
+from ldcnd.cli.accept import command
+from ldcnd.daemon.line.acceptance import ASSUMPTIONS, TrialMove, accept, capture_of, replayed, trial_bus
+from ldcnd.drivers.driver import Gains
+from ldcnd.model.health import Finding, Verdict
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.wirelog.capture import Capture
+from tests.support.chain_rig import drive, rig_on, simulated_config
+from tests.support.plugged_rig import MODELS
+from tests.support.serial_adapter import Plug
+
+GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, el=4000, cl=0, sr=1, deadband=0)
+MOVE = TrialMove(1, GAINS, 2000, 4000.0, 40_000.0)
+MOVING = {"loop", "forward", "move_done", "smooth_stop"}
+
+
+async def addressed(chain: Chain) -> Chain:
+    async with rig_on(chain, simulated_config()) as rig:
+        await rig.kill()
+    return chain
+
+
+def fresh() -> Chain:
+    return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
+
+
+async def tried(chain: Chain, move: TrialMove | None = None, held=lambda: True) -> tuple[list[Finding], Capture]:
+    bus = trial_bus(Plug(chain).open)
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name="bus")
+        await bus.wait_opened()
+        found = [finding async for finding in accept(bus, move, held)]
+        owner.cancel()
+    return found, capture_of(bus, "/dev/ttyUSB0", 0)
+
+
+async def test_drives_that_are_as_the_documents_say_confirm_every_assumption_that_reading_can():
+    chain = await addressed(fresh())
+
+    found, _ = await tried(chain)
+
+    assert {finding.verdict for finding in found} == {Verdict.FINE}
+    assert {finding.verifies for finding in found} == {each.key for each in ASSUMPTIONS} - MOVING
+    assert {finding.axis for finding in found} == {"1", "2", "3", "4"}
+    assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [False] * 4
+    assert [drive(chain, address).loop.position for address in (1, 2, 3, 4)] == [0] * 4
+
+
+async def test_trial_move_confirms_the_rest_and_leaves_the_loop_open():
+    chain = await addressed(fresh())
+
+    found, _ = await tried(chain, MOVE)
+
+    moved = {finding.what: finding for finding in found if finding.what in MOVING}
+    assert {finding.verdict for finding in moved.values()} == {Verdict.FINE}, moved
+    assert set(moved) == MOVING
+    assert not drive(chain, 1).loop.servo_on
+    assert 0 < drive(chain, 1).loop.position < 2000
+
+
+async def test_drive_is_stopped_and_switched_off_when_the_dead_man_is_released():
+    chain = await addressed(fresh())
+    loop = asyncio.get_running_loop()
+    released_at_s: list[float] = []
+
+    def held() -> bool:
+        started = drive(chain, 1).loop.position > 100
+        if started:
+            released_at_s.append(loop.time())
+        return not started
+
+    found, _ = await tried(chain, replace(MOVE, counts=50_000), held)
+
+    assert found[-1].text == "ended: the dead-man was released"
+    assert loop.time() - released_at_s[0] < 1.0
+    assert not drive(chain, 1).loop.servo_on
+    assert drive(chain, 1).loop.position < 2000
+
+
+@pytest.mark.parametrize(("address", "counts"), [(9, 100), (1, 1_000_000), (1, 0)])
+async def test_move_out_of_bounds_is_not_begun(address: int, counts: int):
+    chain = await addressed(fresh())
+
+    found, _ = await tried(chain, replace(MOVE, address=address, counts=counts))
+
+    assert (found[-1].what, found[-1].verdict) == ("move", Verdict.WRONG)
+    assert not drive(chain, 1).loop.servo_on
+
+
+async def test_drives_without_addresses_are_left_as_they_are():
+    chain = fresh()
+
+    found, _ = await tried(chain)
+
+    assert [finding.what for finding in found] == ["drives"]
+    assert "no address yet" in found[0].text
+    assert [module.address for module in chain.modules] == [0] * 4
+
+
+def test_capture_of_a_trial_plays_back_to_the_same_findings():
+    async def trial() -> tuple[list[Finding], Capture]:
+        return await tried(await addressed(fresh()))
+
+    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+        found, capture = runner.run(trial())
+
+    assert list(replayed(capture)) == found
+
+
+def test_assumptions_are_listed_without_a_port():
+    done = CliRunner().invoke(command, ["--list"])
+
+    assert done.exit_code == 0
+    assert done.output.count("confirmed_by") == len(ASSUMPTIONS)
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["/dev/x", "--move", "1"], ["/dev/x", "--move", "1", "--gains", "1,2,3,4,5,6"]]
+)
+def test_command_refuses_to_move_without_gains_or_a_dead_man(arguments: list[str]):
+    assert CliRunner().invoke(command, arguments).exit_code == 2
