@@ -15,6 +15,8 @@ class FaultKind(StrEnum):
     REPLY_LOST = "reply_lost"
     REPLY_BYTE_LOST = "reply_byte_lost"
     REPLY_BIT_FLIPPED = "reply_bit_flipped"
+    REPLY_FALSIFIED = "reply_falsified"
+    """Two bytes of a reply change so that its checksum, the sum of the bytes before it, holds."""
     REPLY_DELAYED = "reply_delayed"
     REPLY_DUPLICATED = "reply_duplicated"
     UNPLUGGED = "unplugged"
@@ -104,6 +106,8 @@ class FaultInjector:
             return FaultyReply(b"")
         if FaultKind.REPLY_BIT_FLIPPED in struck:
             data = self._flip(data)
+        if FaultKind.REPLY_FALSIFIED in struck and len(data) > 1:
+            data = self._falsify(data)
         if FaultKind.REPLY_BYTE_LOST in struck:
             lost = self._dice.randrange(len(data))
             data = data[:lost] + data[lost + 1 :]
@@ -117,6 +121,13 @@ class FaultInjector:
             for fault in self._faults
             if fault.from_s <= at_s < fault.until_s and self._dice.random() < fault.probability
         }
+
+    def _falsify(self, data: bytes) -> bytes:
+        """Change one byte, and the last one, the checksum, by as much."""
+        falsified, by = bytearray(data), self._dice.randrange(1, 256)
+        for at in (self._dice.randrange(len(data) - 1), -1):
+            falsified[at] = (falsified[at] + by) % 256
+        return bytes(falsified)
 
     def _flip(self, data: bytes) -> bytes:
         bit = self._dice.randrange(8 * len(data))

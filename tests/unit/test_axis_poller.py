@@ -21,7 +21,7 @@ POSITION, VELOCITY, ADC, STATE = (
 def poller(rates_hz: dict[TelemetryItem, float], start_at_s: float = 0.0) -> AxisPoller:
     """A poller whose exchanges are the items that they ask for."""
     driver = SimpleNamespace(spec=SimpleNamespace(address=1), reading=lambda items: items)
-    return AxisPoller(driver, rates_hz, start_at_s, lambda *_: None, lambda _: None)
+    return AxisPoller(driver, rates_hz, start_at_s, lambda *_: False, lambda _: None, lambda _: None)
 
 
 def polls(axis: AxisPoller, until_s: float, late_s: float = 0.0) -> list[tuple[float, frozenset[TelemetryItem]]]:

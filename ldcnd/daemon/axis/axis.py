@@ -19,6 +19,7 @@ from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.motion import AxisMotion, preview
 from ldcnd.daemon.axis.parameters import Parameters
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right
+from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.state import AxisTracker, Ended, ObservedTracker
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
@@ -29,7 +30,7 @@ from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import BusError, LdcndError, NotSupported, TooManyRequests
+from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.commands import (
@@ -44,7 +45,7 @@ from ldcnd.model.commands import (
     Stop,
     Verb,
 )
-from ldcnd.model.samples import Moving, TelemetryItem
+from ldcnd.model.samples import LinkState, Moving, TelemetryItem
 
 log = get_logger("axis")
 
@@ -174,6 +175,7 @@ class AxisService:
         self._next_command_id = next_command_id
         self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
         self._commands = AxisCommands(self._motion)
+        self._plausibility = PlausibilityGate(config, self.scale)
         self._turns = AxisTurns(config.name)
         self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
@@ -208,6 +210,7 @@ class AxisService:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
         self.config = config
         self._motion.reconfigure(config)
+        self._plausibility.reconfigure(config)
 
     def connected(self, *, referenced: bool) -> None:
         """The line came up; `referenced` when the drive's position is known to be right."""
@@ -218,11 +221,28 @@ class AxisService:
     def disconnected(self) -> None:
         """The line is gone."""
         self.traces.disconnected()
+        self._plausibility.forget()
         self.tracker.disconnected(self._clock.now_ns())
         self.telemetry.stale(self._clock.now_ns())
 
+    def judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
+        """Take a reading if the drive can have got there; true when it has to be asked again first."""
+        tracker, gate = self.tracker, self._plausibility
+        verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
+        if verdict is Verdict.BELIEVED:
+            if gate.jumped and tracker.command is None:
+                log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
+                tracker.jumped()
+            if gate.confirmed:  # what only the first of two readings was asked for is true as well
+                first, first_timing = gate.confirmed
+                self.observed(first, first.asked - asked, first_timing)
+            self.observed(reading, asked, timing)
+        elif verdict is Verdict.LOST:
+            self.missed(BadReply(f"axis {self.config.name}: its readings contradict each other", axis=self.config.name))
+        return verdict is Verdict.ASK_AGAIN
+
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        """Take a reading from the poller."""
+        """Digest a reading that is believed."""
         was_referenced = self.tracker.referenced
         self.tracker.observed(reading, timing, self._clock.now_ns())
         if was_referenced and not self.tracker.referenced:
@@ -240,6 +260,8 @@ class AxisService:
         self.tracker.missed(self._clock.now_ns())
         if self.tracker.link is not before:
             log.warning("drive does not answer", axis=self.config.name, link=self.tracker.link.value)
+            if self.tracker.link is LinkState.DOWN:
+                self._plausibility.forget()
             self.telemetry.stale(self._clock.now_ns())
 
     def monitored(self, value: MonitorValue, timing: Timing) -> None:
@@ -383,8 +405,24 @@ class AxisService:
         guards.check_reachable(self.tracker.view())
 
     async def _read(self) -> AxisReading:
-        """Read the drive's state out of turn."""
-        return await self._bus.execute(self.driver.reading(frozenset()))
+        """Read the drive's state out of turn, until two readings agree.
+
+        Raises:
+            BadReply: they do not.
+            BusError: the line failed.
+        """
+        exchange = self.driver.reading(frozenset())
+        before = await self._bus.execute(exchange)
+        for _ in range(ROUNDS):
+            reading = await self._bus.execute(exchange)
+            if agree(before, reading):
+                return reading
+            before = reading
+        raise BadReply(
+            f"axis {self.config.name}: its readings contradict each other; nothing was started",
+            axis=self.config.name,
+            remedy="check the line for noise, then send it again",
+        )
 
     async def _step(self) -> None:
         """Let the procedure under way take its step, if one is due."""

@@ -75,7 +75,7 @@ class AxisCommands:
             case MoveVelocity():
                 return await self._move_velocity(turn, request)
             case SetPosition():
-                return self._set_position(turn, request.position)
+                return await self._set_position(turn, request.position)
             case SetGains():
                 return await self._set_gains(turn, request)
             case SetOutputs():
@@ -256,6 +256,11 @@ class AxisCommands:
 
     async def _move_relative(self, turn: Turn, request: MoveRelative) -> CommandReply:
         guards.check_may_move(self._tracker.view())
+        if self._motion.target_counts is None:
+            here = (await self._motion.read()).position_counts  # one reading alone may be wrong
+            turn.still_wanted()
+            guards.check_may_move(self._tracker.view())
+            return await self._move(turn, self._plan_relative(request, here), AxisState.DISCRETE_MOTION)
         return await self._move(turn, self._plan_relative(request), AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
@@ -268,9 +273,11 @@ class AxisCommands:
         guards.check_referenced(self._tracker.view())
         return self._motion.plan_to(request.position, request.velocity, request.acceleration)
 
-    def _plan_relative(self, request: MoveRelative) -> MotionPlan:
+    def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
         motion = self._motion
-        from_counts = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
+        from_counts = here_counts if motion.target_counts is None else motion.target_counts
+        if from_counts is None:
+            from_counts = motion.latest().position_counts
         position = motion.telemetry.position(from_counts) + request.distance
         return motion.plan_to(position, request.velocity, request.acceleration)
 
@@ -305,13 +312,16 @@ class AxisCommands:
 
     # -- registers ---------------------------------------------------------------------------------------------------
 
-    def _set_position(self, turn: Turn, position: float) -> CommandReply:
+    async def _set_position(self, turn: Turn, position: float) -> CommandReply:
         motion = self._motion
         view = self._tracker.view()
         guards.check_reachable(view)
         guards.check_stands(view)
         guards.check_position_kept(view)
-        motion.telemetry.origin_counts = motion.latest().position_counts - motion.scale.to_counts(position)
+        here = await motion.read()  # one reading alone may be wrong
+        turn.still_wanted()
+        guards.check_position_kept(self._tracker.view())
+        motion.telemetry.origin_counts = here.position_counts - motion.scale.to_counts(position)
         self._tracker.referenced = True
         motion.publish_state()
         return motion.reply(turn).model_copy(update={"position": position})

@@ -9,8 +9,13 @@ from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.model.samples import TelemetryItem
 
-Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], None]
+Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], bool]
+"""Takes a reading; true when it is not believed before the drive was asked again."""
 Missed = Callable[[BusError], None]
+
+
+AGAIN_S = 0.001
+"""What is asked again goes before polls whose deadline is later than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +47,10 @@ class AxisPoller(Poller[AxisReading]):
         start_at_s: float,
         deliver: Deliver,
         missed: Missed,
+        reschedule: Callable[["AxisPoller"], None],
     ) -> None:
+        self._reschedule = reschedule
+        self._again: _Turn | None = None
         self.node = driver.spec.address
         self.rates_hz = rates_hz
         self._driver = driver
@@ -65,8 +73,12 @@ class AxisPoller(Poller[AxisReading]):
         self._prepared = self._turn_at(at_s)
 
     def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
-        """See `Poller`."""
+        """Return what is due, or what has to be asked again."""
         turn, self._prepared = self._prepared, None
+        if self._again:
+            turn, self._again = self._again, None
+            self.due_at_s, self.deadline_at_s = turn.due_at_s, turn.due_at_s + self._period_s
+            return turn.exchange
         if turn is None or turn.due_at_s <= now_s:
             turn = self._turn_at(now_s)
         self.due_at_s, self._slower_due_s = turn.due_at_s, turn.slower_due_s
@@ -86,8 +98,18 @@ class AxisPoller(Poller[AxisReading]):
         return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
-        """See `Poller`."""
-        self._deliver(reply, reply.asked, timing)
+        """Hand a reading over, and ask again at once if that is wanted."""
+        again = self._deliver(reply, reply.asked, timing)
+        if not again and self._again is None:
+            return
+        if self._again:
+            self.due_at_s, self._again = self._again.due_at_s, None
+            self.deadline_at_s = self.due_at_s + self._period_s
+        if again:
+            self._again = _Turn(self._driver.reading(reply.asked), self.due_at_s, self._slower_due_s)
+            self.due_at_s = timing.received_at_s
+            self.deadline_at_s = timing.received_at_s + AGAIN_S
+        self._reschedule(self)
 
     def missed(self, error: BusError) -> None:
         """See `Poller`."""

@@ -24,6 +24,13 @@ MOST_REST_S = 2.0
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
 LOOP_OPENED = Fault("loop_opened", "the drive opened its position loop by itself; find out why, then send reset")
 
+JUMPED = Fault(
+    "position_jump",
+    "the position has changed by more than the axis can have moved; check the encoder, its cable and the coupling,"
+    " then send reset and home",
+    loses_position=True,
+)
+
 
 class Completion(Enum):
     """When a command is done."""
@@ -141,6 +148,7 @@ class AxisTracker:
         self.active_faults: tuple[FaultEntry, ...] = ()
         self.first_fault: FaultEntry | None = None
         self._failure: str | None = None
+        self._jumped = False
         self._misses = 0
         self._effective_from_s = 0.0
         self._rest = RestJudge()
@@ -199,7 +207,7 @@ class AxisTracker:
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
         """Digest a reading; `now_ns` stamps the faults that it brings up."""
-        faults = reading.faults
+        faults = (*reading.faults, JUMPED) if self._jumped else reading.faults
         self._misses = 0
         self.link = LinkState.UP
         if faults or self.active_faults:
@@ -237,6 +245,10 @@ class AxisTracker:
             case _:
                 pass
 
+    def jumped(self) -> None:
+        """The next reading shows a position that no motion has led to: a fault until reset."""
+        self._jumped = True
+
     def missed(self, now_ns: int) -> None:
         """Count a poll that brought nothing."""
         self._misses += 1
@@ -264,7 +276,7 @@ class AxisTracker:
                 code=fault.code,
                 text=fault.text,
                 since=now_ns,
-                source="daemon" if fault in (LINK_LOST, LOOP_OPENED) else "drive",
+                source="daemon" if fault in (LINK_LOST, LOOP_OPENED, JUMPED) else "drive",
                 stops=fault.stops,
                 page=page_of(fault.code),
             )
@@ -337,7 +349,7 @@ class AxisTracker:
         """Reset: latch and first cause are forgotten; the next readings tell what stands."""
         self._effective_from_s = now_s
         self.stop_latched = False
-        self.position_lost = False
+        self.position_lost = self._jumped = False
         self.active_faults = ()
         self.first_fault = None
         self.last_error = None

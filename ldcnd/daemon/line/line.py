@@ -199,7 +199,7 @@ class BusService:
             self.bus.remove_poller(previous)
         own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed))
         rates_hz = wanted_rates_hz(axis.config.rates, adc=bool(axis.driver.adc_full_scale))
-        poller = own or AxisPoller(axis.driver, rates_hz, now_s, axis.observed, axis.missed)
+        poller = own or AxisPoller(axis.driver, rates_hz, now_s, axis.judged, axis.missed, self.bus.add_poller)
         poller.priority = Priority[axis.config.priority.upper()]
         self._pollers[axis.config.name] = poller
         self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)

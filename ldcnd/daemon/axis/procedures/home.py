@@ -137,6 +137,7 @@ class HomeSequence(Procedure):
             guards.check_position(view, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
         off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
+        self.turn.still_wanted()  # a stop that came meanwhile has disarmed nothing yet
         await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.SEARCH)
         return motion.reply(self.turn).model_copy(
             update={"position": search.position, "velocity": plan.velocity, "acceleration": plan.acceleration}

@@ -1,0 +1,165 @@
+"""Whether a reading can be true, given the one before it. Pure; time is an input.
+
+A reply has a checksum of one byte: of replies that noise has changed, one in some hundreds passes it. So what the
+drive cannot have done since the last reading that was believed is asked again, before anyone acts on it: a position
+that is not where the velocities lead, another velocity than the axis can have by now, any change of the status. A
+change that is true costs one exchange; one that is not never leaves this module.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from ldcnd.config.axis import AxisConfig
+from ldcnd.drivers.driver import AxisReading
+from ldcnd.drivers.scaling import Scale
+from ldcnd.exchange import Timing
+
+NOISE_COUNTS = 16
+"""A closed loop hunts by some counts around its target."""
+ACCELERATIONS = 2.0
+"""An axis accelerates so many times as fast as it may, at most, before a reading is asked for again."""
+JUMP_SPEEDS = 2.0
+"""No closed loop moves faster than so many times the highest velocity of its axis."""
+OPEN_LOOP_SPEEDS = 8.0
+"""The same for a shaft that is turned by hand, or by a load."""
+APART_S = 0.1
+"""Two readings that were asked for one after the other are not further apart, unless commands hold the line up."""
+ROUNDS = 4
+"""So many readings in a row that contradict each other count as one lost reply."""
+
+_COUNTER = 1 << 32
+
+
+class Verdict(Enum):
+    """What a reading is worth."""
+
+    BELIEVED = "believed"
+    ASK_AGAIN = "ask_again"
+    LOST = "lost"
+    """It was asked again several times, and each reading contradicts the others."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A reading, and when it was true."""
+
+    reading: AxisReading
+    timing: Timing
+
+
+class PlausibilityGate:
+    """Judges the readings of one axis, in the order in which they were taken.
+
+    Attributes:
+        jumped: the reading that was believed last is where no motion can have led since the one before.
+        confirmed: the reading that the one that was believed last has confirmed, and when; None if it needed no other.
+        withheld: readings that were not believed, so far.
+    """
+
+    def __init__(self, config: AxisConfig, scale: Scale) -> None:
+        self.jumped = False
+        self.confirmed: tuple[AxisReading, Timing] | None = None
+        self.withheld = 0
+        self._known: _Seen | None = None
+        self._doubtful: _Seen | None = None
+        self._rounds = 0
+        self._sure = False  # the first reading after a gap is believed as it is, and nothing has jumped away from it
+        self._scale = scale
+        self.reconfigure(config)
+
+    def reconfigure(self, config: AxisConfig) -> None:
+        """Judge by other limits."""
+        counts, limits = self._scale.counts_per_unit, config.limits
+        self._speed = counts * max(config.velocity, limits.velocity or 0.0)
+        self._acceleration = ACCELERATIONS * counts * max(config.acceleration, limits.acceleration or 0.0)
+        self._following = config.gains.el if config.gains else 0
+
+    def forget(self) -> None:
+        """Begin anew: the drive was out of reach, and may have done anything meanwhile."""
+        self._known = self._doubtful = None
+        self._rounds, self._sure = 0, False
+
+    def judge(self, reading: AxisReading, timing: Timing, *, standing: bool) -> Verdict:
+        """Judge a reading.
+
+        Args:
+            reading: what the drive said.
+            timing: when.
+            standing: the axis was at rest, and nothing was commanded since.
+        """
+        known = self._known
+        self.jumped, self.confirmed = False, None
+        if known is None:
+            return self._believe(reading, timing)
+        if self._follows(known, reading, timing, NOISE_COUNTS if standing else None):
+            if self._doubtful:
+                self.withheld += self._rounds
+            self._sure = True
+            return self._believe(reading, timing)
+        if self._doubtful and self._follows(self._doubtful, reading, timing, None):
+            self.jumped = self._sure and self._is_jump(known, reading, timing)
+            self._sure = True
+            self.confirmed = self._doubtful.reading, self._doubtful.timing
+            return self._believe(reading, timing)
+        self._doubtful = _Seen(reading, timing)
+        self._rounds += 1
+        if self._rounds < ROUNDS:
+            return Verdict.ASK_AGAIN
+        self.withheld += self._rounds
+        self._doubtful, self._rounds = None, 0
+        return Verdict.LOST
+
+    def _believe(self, reading: AxisReading, timing: Timing) -> Verdict:
+        self._known = _Seen(reading, timing)
+        self._doubtful, self._rounds = None, 0
+        return Verdict.BELIEVED
+
+    def _follows(self, seen: _Seen, reading: AxisReading, timing: Timing, within_counts: int | None) -> bool:
+        """Tell whether a drive that gave the one reading can give the other by now.
+
+        Args:
+            seen: the one.
+            reading: the other.
+            timing: when it was true.
+            within_counts: how far apart they may be; worked out from both velocities when missing.
+        """
+        before = seen.reading
+        if (
+            reading.enabled is not before.enabled
+            or reading.profile_done is not before.profile_done
+            or reading.homing is not before.homing
+            or reading.reverse_limit is not before.reverse_limit
+            or reading.forward_limit is not before.forward_limit
+            or reading.faults != before.faults
+        ):
+            return False
+        passed_s = timing.true_until_s - seen.timing.true_from_s
+        velocity, resolution = reading.velocity_counts_per_s, reading.velocity_resolution_counts_per_s
+        changed = abs(velocity - before.velocity_counts_per_s)
+        if changed > self._acceleration * passed_s + 2 * resolution:
+            return False
+        way = _way(before, reading)
+        if within_counts is not None:
+            return abs(way) <= within_counts
+        expected = (velocity + before.velocity_counts_per_s) / 2 * passed_s
+        reach = NOISE_COUNTS + 2 * resolution * passed_s + self._acceleration * passed_s * passed_s / 4
+        return abs(way - expected) <= reach
+
+    def _is_jump(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
+        """Tell whether an axis cannot have come from the one reading to the other by moving."""
+        speeds = JUMP_SPEEDS if reading.enabled else OPEN_LOOP_SPEEDS
+        reach = speeds * self._speed * (timing.true_until_s - seen.timing.true_from_s) + self._following + NOISE_COUNTS
+        return abs(_way(seen.reading, reading)) > reach
+
+
+def agree(one: AxisReading, other: AxisReading) -> bool:
+    """Tell whether two readings, one directly after the other, show the same, but for what the velocity explains."""
+    resolution = other.velocity_resolution_counts_per_s
+    speed = max(abs(one.velocity_counts_per_s), abs(other.velocity_counts_per_s))
+    moving_counts = (speed + resolution) * APART_S if speed > resolution else 0.0
+    return abs(_way(one, other)) <= NOISE_COUNTS + moving_counts and one.faults == other.faults
+
+
+def _way(before: AxisReading, after: AxisReading) -> int:
+    """Return the shortest way between two counts, which wrap."""
+    return (after.position_counts - before.position_counts + _COUNTER // 2) % _COUNTER - _COUNTER // 2

@@ -1,0 +1,167 @@
+"""Readings that a drive cannot have given after the one before are not believed before a second one agrees."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ldcnd.config.axis import AxisConfig
+from ldcnd.daemon.axis.plausibility import NOISE_COUNTS, ROUNDS, PlausibilityGate, Verdict, agree
+from ldcnd.drivers.driver import AxisReading, Fault
+from ldcnd.drivers.scaling import Scale
+from ldcnd.exchange import Timing
+
+CONFIG = AxisConfig.model_validate(
+    {
+        "name": "x", "address": 1, "model": "ls-182ap", "unit": "mm", "counts_per_unit": 1000,
+        "velocity": 20, "acceleration": 200, "limits": {"velocity": 50, "acceleration": 1000},
+        "gains": {"kp": 350, "kd": 3000, "el": 4000},
+    }
+)  # fmt: skip
+RESTING = AxisReading(
+    position_counts=1000, following_error_counts=0, velocity_counts_per_s=0.0, velocity_resolution_counts_per_s=1953.0,
+    adc_counts=None, enabled=True, profile_done=True, homing=False, faults=(), reverse_limit=False, forward_limit=False,
+)  # fmt: skip
+POLL_S, EXCHANGE_S = 0.05, 0.002
+OVERCURRENT = Fault("overcurrent", "the drive has switched off")
+
+
+class Axis:
+    """A gate that has believed a reading, and the clock of its line."""
+
+    def __init__(self, reading: AxisReading = RESTING) -> None:
+        self.gate = PlausibilityGate(CONFIG, Scale(1000.0))
+        self.now_s = 0.0
+        self.read(reading)
+        moved = reading.position_counts + round(reading.velocity_counts_per_s * EXCHANGE_S)
+        self.position_counts = moved
+        assert self.read(replace(reading, position_counts=moved), standing=False) is Verdict.BELIEVED
+
+    def read(self, reading: AxisReading, after_s: float = EXCHANGE_S, *, standing: bool = True) -> Verdict:
+        self.now_s += after_s
+        timing = Timing(self.now_s - 0.001, self.now_s - 0.0006, self.now_s - 0.0005, self.now_s)
+        return self.gate.judge(reading, timing, standing=standing)
+
+
+def at(counts: int, velocity: float = 0.0) -> AxisReading:
+    return replace(RESTING, position_counts=counts, velocity_counts_per_s=velocity)
+
+
+def test_the_first_reading_is_believed_but_nothing_has_jumped_away_from_it():
+    gate = PlausibilityGate(CONFIG, Scale(1000.0))
+
+    verdicts = [
+        gate.judge(reading, Timing(now_s, now_s, now_s, now_s), standing=False)
+        for now_s, reading in ((0.0, at(999_999)), (0.05, RESTING), (0.052, RESTING))
+    ]
+
+    assert verdicts == [Verdict.BELIEVED, Verdict.ASK_AGAIN, Verdict.BELIEVED]
+    assert not gate.jumped
+
+
+@given(st.integers(-(2**31), 2**31 - 1))
+def test_any_other_position_of_a_standing_axis_is_asked_again(counts: int):
+    axis = Axis()
+
+    verdict = axis.read(at(counts), POLL_S)
+
+    assert (verdict is Verdict.BELIEVED) == (abs(counts - 1000) <= NOISE_COUNTS)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"enabled": False}, {"profile_done": False}, {"homing": True}, {"reverse_limit": True}, {"forward_limit": True},
+        {"faults": (OVERCURRENT,)},
+    ],
+)  # fmt: skip
+def test_any_change_of_the_status_is_asked_again_and_believed_when_it_stands(changed: dict[str, object]):
+    axis = Axis()
+    other = replace(RESTING, **changed)  # type: ignore[arg-type]
+
+    assert axis.read(other, POLL_S) is Verdict.ASK_AGAIN
+    assert axis.read(other) is Verdict.BELIEVED
+    assert axis.gate.confirmed
+    assert axis.gate.confirmed[0] is other
+
+
+def test_a_reading_that_the_next_one_contradicts_is_forgotten_and_counted():
+    axis = Axis()
+
+    axis.read(replace(RESTING, faults=(OVERCURRENT,)), POLL_S)
+
+    assert axis.read(RESTING) is Verdict.BELIEVED
+    assert (axis.gate.confirmed, axis.gate.withheld, axis.gate.jumped) == (None, 1, False)
+
+
+def test_readings_that_contradict_each_other_count_as_a_lost_reply():
+    axis = Axis()
+
+    verdicts = [axis.read(at(100_000 * (number + 1))) for number in range(ROUNDS)]
+
+    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.LOST]
+
+
+@given(
+    velocity=st.floats(-50_000, 50_000),
+    acceleration=st.floats(-1_000_000, 1_000_000),
+    dt_s=st.floats(0.001, 0.5),
+)
+def test_a_motion_within_the_limits_of_the_axis_is_believed_at_once(velocity: float, acceleration: float, dt_s: float):
+    """The velocity of a status packet has no fraction."""
+    end = max(-50_000.0, min(50_000.0, velocity + acceleration * dt_s))
+    turn_s = abs(end - velocity) / 1_000_000 if abs(acceleration) > 0 else 0.0
+    way = (velocity + end) / 2 * turn_s + end * (dt_s - turn_s)
+
+    def told(value: float) -> float:
+        return int(value / 1953.0) * 1953.0
+
+    moving = replace(at(0, told(velocity)), profile_done=False)
+    axis = Axis(moving)
+
+    # between two readings the instants are known to a servo cycle
+    later = replace(moving, position_counts=axis.position_counts + round(way), velocity_counts_per_s=told(end))
+
+    assert axis.read(later, dt_s, standing=False) is Verdict.BELIEVED
+
+
+@pytest.mark.parametrize(("counts", "jumped"), [(1000 + 20_000, True), (1000 - 20_000, True), (1000 + 3000, False)])
+def test_a_confirmed_position_that_no_motion_leads_to_is_a_jump(*, counts: int, jumped: bool):
+    axis = Axis()
+
+    axis.read(at(counts), POLL_S)
+    axis.read(at(counts))
+
+    assert axis.gate.jumped is jumped
+
+
+def test_a_shaft_that_is_turned_by_hand_has_not_jumped():
+    open_loop = replace(RESTING, enabled=False)
+    axis = Axis(open_loop)
+
+    for counts in range(1000, 20_000, 2000):  # 40 mm/s
+        axis.read(replace(open_loop, position_counts=counts), POLL_S, standing=False)
+        axis.read(replace(open_loop, position_counts=counts), standing=False)
+        assert not axis.gate.jumped
+
+
+def test_a_counter_that_wraps_has_not_jumped():
+    axis = Axis(at(2**31 - 3))
+
+    assert axis.read(at(-(2**31) + 4), POLL_S) is Verdict.BELIEVED
+
+
+def test_after_a_gap_nothing_is_compared():
+    axis = Axis()
+    axis.gate.forget()
+
+    assert axis.read(at(0)) is Verdict.BELIEVED
+    assert not axis.gate.jumped
+
+
+def test_readings_agree_within_what_the_axis_moves_meanwhile():
+    assert agree(RESTING, at(1000 + NOISE_COUNTS))
+    assert not agree(RESTING, at(1000 + NOISE_COUNTS + 1))
+    assert agree(at(0, 50_000.0), at(100, 50_000.0))
+    assert not agree(RESTING, replace(RESTING, faults=(OVERCURRENT,)))
