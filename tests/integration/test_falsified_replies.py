@@ -8,7 +8,7 @@ import pytest
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.exchange import Timing
-from ldcnd.model.commands import MoveRelative, Power, Verb
+from ldcnd.model.commands import MoveRelative, Power
 from ldcnd.model.samples import AxisState, FaultSample, PositionSample, TelemetryItem
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import Chain, ChainSpec, ModuleSpec, build_chain
@@ -37,7 +37,7 @@ async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_publish
         async with rig.client.samples("x", TelemetryItem.POSITION) as positions, asyncio.timeout(300):
             for axis in "xyzc":
                 await rig.until(axis, lambda _: True)
-                await rig.client.command(axis, Verb.POWER, Power(on=True))
+                await rig.client.command(axis, Power(on=True))
             while len(published) < 1000:
                 _, sample = await anext(positions)
                 assert isinstance(sample, PositionSample)
@@ -55,12 +55,12 @@ async def test_relative_moves_go_as_far_as_they_are_told():
     async with running_rig(rig_config(), {"line0": chain(3)}) as rig:
         line = rig.daemon.rig.axis("x")
         await rig.until("x", lambda _: True)
-        await rig.client.command("x", Verb.POWER, Power(on=True))
+        await rig.client.command("x", Power(on=True))
         await asyncio.sleep(FALSE_FROM_S)
         came: list[float] = []
         for number in range(1, 16):
             line._motion.target_counts = None  # as after a stop: it plans from where the axis is
-            await rig.client.command("x", Verb.MOVE_RELATIVE, MoveRelative(distance=1.0))
+            await rig.client.command("x", MoveRelative(distance=1.0))
             await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
             await asyncio.sleep(0.5)
             last = await rig.client.last("x", TelemetryItem.POSITION)
