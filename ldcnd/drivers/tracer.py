@@ -1,12 +1,22 @@
 """The contract between the daemon and whatever records a trace: a drive's own recorder, or the host that polls it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from ldcnd.errors import DriveFault, ValueOutOfRange
-from ldcnd.model.traces import DriveTraceInfo, TakeTrace, TraceChannel, TracePhase, TraceSource
+from ldcnd.errors import DriveFault, NotSupported, ValueOutOfRange
+from ldcnd.model.traces import (
+    DriveTraceInfo,
+    TakeTrace,
+    TraceChannel,
+    TracePhase,
+    TraceSource,
+    TraceTrigger,
+    TriggerKind,
+)
 
+SIGNAL_LEVEL = 0.5
+"""Between the two values of a signal."""
 Progress = Callable[[TracePhase], None]
 """Told of each new phase of a trace; does not wait."""
 
@@ -33,6 +43,26 @@ def require_channels(axis: str, request: TakeTrace, known: tuple[str, ...]) -> N
             f"axis {axis}: the trigger watches {request.trigger.channel!r}, which is not recorded",
             axis=axis,
             value=request.trigger.channel,
+        )
+
+
+def require_no_full_scale(axis: str, request: TakeTrace, asked: Iterable[str]) -> None:
+    """Refuse a full scale that is not there to be set.
+
+    Args:
+        axis: the axis.
+        request: of the trace.
+        asked: the channels whose full scale cannot be set.
+
+    Raises:
+        NotSupported: there is one among them.
+    """
+    for name in asked:
+        raise NotSupported(
+            f"axis {axis}: the full scale of {name!r} cannot be set",
+            axis=axis,
+            value=request.full_scale[name],
+            remedy="leave full_scale out",
         )
 
 
@@ -65,7 +95,8 @@ class Recorded:
         zero_from_s: the zero instant is not earlier than this, in loop time, and not later than `zero_until_s`.
         values: a column for each channel.
         raw: a column for each raw column.
-        trigger_index: the sample that fired the trigger; None without one.
+        trigger_index: the sample at which the trigger was detected; None without one.
+        trigger_late_s: the condition was met at most so long before.
         missed: polls that brought no sample.
         drive: settings and assumptions of a drive's own recorder.
         problems: why the values are uncertain; empty when they are good.
@@ -77,9 +108,47 @@ class Recorded:
     values: tuple[tuple[float | None, ...], ...]
     raw: tuple[tuple[int | float | None, ...], ...]
     trigger_index: int | None = None
+    trigger_late_s: float = 0.0
     missed: int = 0
     drive: DriveTraceInfo | None = None
     problems: tuple[str, ...] = ()
+
+
+class TriggerWatch:
+    """Decides at which sample of the watched channel a trace by the host is triggered."""
+
+    def __init__(self, trigger: TraceTrigger, *, signal: bool) -> None:
+        self._kind = trigger.kind
+        self._level = SIGNAL_LEVEL if signal else trigger.level
+        self._before: float | None = None  # of the last sample that had a value
+
+    def fires(self, value: float | None, *, ready: bool) -> bool:
+        """Take the next sample and tell whether the trigger fires on it.
+
+        Args:
+            value: of the channel; None where the drive did not say, which never fires.
+            ready: enough samples precede it; what comes earlier is passed over.
+        """
+        if value is None:
+            return False
+        before, self._before = self._before, value
+        above = value >= self._level
+        rose = before is not None and before < self._level <= value
+        fell = before is not None and value < self._level <= before
+        match self._kind:
+            case TriggerKind.RISING:
+                met = rose
+            case TriggerKind.FALLING:
+                met = fell
+            case TriggerKind.EITHER:
+                met = rose or fell
+            case TriggerKind.CHANGE:
+                met = before is not None and value != before
+            case TriggerKind.ABOVE:
+                met = above
+            case TriggerKind.BELOW:
+                met = not above
+        return ready and met
 
 
 class ArmedTrace(ABC):

@@ -4,6 +4,7 @@ A trace is published as a header on `tele/<axis>/trace`, again whenever its phas
 `tele/<axis>/trace/<n>` once it is complete. The last trace stays there for `get`.
 """
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Literal
 
@@ -31,7 +32,9 @@ class TriggerKind(StrEnum):
     FALLING = "falling"
     """The channel comes from the level or above and drops below it; a signal goes from 1 to 0."""
     EITHER = "either"
-    """Rising or falling."""
+    """Rising or falling through the level."""
+    CHANGE = "change"
+    """The channel differs from its previous sample; the level is not used."""
     ABOVE = "above"
     """The channel is at the level or above it, from the first sample on."""
     BELOW = "below"
@@ -128,7 +131,7 @@ class DriveTraceInfo(Frozen):
     string_count_unit: str
     """What the count of a string was taken to count."""
     trigger_word_source: str
-    """Where the bits of 5004H come from: none or configured."""
+    """Where the trigger comes from: none, configured (the drive's, bits of 5004H), or host (polled, then started)."""
     command_pulse_gear: str
     """Which way command pulses were taken to be geared."""
     assumptions: tuple[AssumptionInfo, ...]
@@ -159,7 +162,10 @@ class TraceHeader(Sample):
     trigger: TraceTrigger | None = None
     """What it waits or has waited for."""
     trigger_index: int | None = None
-    """The sample at which the trigger fired."""
+    """The sample at which the trigger was detected."""
+    trigger_late_s: float = Field(default=0.0, ge=0)
+    """The trigger condition was met at most so long before it was detected, in seconds: 2 ms by a drive's recorder; by
+    the host, whose trace begins after it, the time from one poll to the first sample."""
     missed: int = 0
     """Polls of a trace by the host that brought no sample."""
     chunks: int = Field(default=0, ge=0)
@@ -226,6 +232,9 @@ class TakeTrace(AxisCommand[TraceReply]):
     """How many samples; a drive's own recorder always takes as many as it has room for."""
     pre_trigger: int = Field(default=0, ge=0)
     """So many of them before the trigger; ignored without one."""
+    full_scale: Mapping[str, Annotated[float, Field(gt=0)]] = {}
+    """Largest magnitude expected of a channel, in its unit: a drive's recorder that can resolves it finer. Put back
+    after the trace."""
     trigger: TraceTrigger | None = None
     """What to wait for; a missing one starts at once."""
     timeout_s: float = Field(default=30.0, gt=0, le=LONGEST_WAIT_S)

@@ -93,12 +93,12 @@ def test_io_trigger_watches_the_selected_trace(selected, point):
     assert values(recorder)[recorder.read(TRGADR)] == point
 
 
-def test_either_edge_triggers_when_both_are_enabled():
+def test_any_change_triggers_when_both_edges_are_enabled():
     recorder = recorder_with(word=BENCH_TRIGGER_MAP.trace2 | RISING | FALLING, level=0x10000 - 600)
 
     run(recorder)
 
-    assert values(recorder, 1)[recorder.read(TRGADR)] == -601
+    assert recorder.read(TRGADR) == 1
 
 
 def test_level_never_crossed_waits_for_ever():

@@ -4,14 +4,32 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum, TriggerWordSource
-from ldcnd.drivers.smartstep.trace import TraceUpload
-from ldcnd.errors import BadReply, BusError, ByteCountRefused, DriveFault, ValueOutOfRange, WrongState
+from ldcnd.drivers.smartstep.parameters import PN202, PN203
+from ldcnd.drivers.smartstep.profiles import (
+    SMARTSTEP,
+    CountUnit,
+    SmartStepProfile,
+    StringChecksum,
+    TraceWordLayout,
+    TriggerWordSource,
+    Verification,
+)
+from ldcnd.drivers.smartstep.trace_upload import TraceUpload
+from ldcnd.errors import (
+    BadReply,
+    BusError,
+    ByteCountRefused,
+    DriveFault,
+    NotSupported,
+    ValueOutOfRange,
+    WrongState,
+)
 from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 from ldcnd.wirelog.recorder import WireEvent
-from tests.support.smartstep_line import executes_in_a_fresh_mode_only, simulated, smartstep_line
+from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
 
 RAMP = [(7 * point) & 0xFFFF for point in range(500)]
 
@@ -192,3 +210,180 @@ async def test_a_bad_line_gives_the_true_trace_or_an_error_and_executes_in_a_fre
     assert drive.drive.mode == 0
     if recorded:
         assert list(recorded.raw[0]) == drive.drive.recorder.rings[0]
+
+
+def running(variant: SimulatedVariant | None = None, pulses: float = 3000.0, **stored) -> SimulatedUnit:
+    """A drive whose motor turns with its pulses since long before the line opened."""
+    unit = simulated(1, variant, **stored)
+    unit.drive.set_run(0.0, on=True)
+    unit.drive.set_pulse_rate(pulses, 0.0)
+    unit.drive.motor.deviation = pulses * unit.drive.motor.gear / unit.drive.motor.gain
+    unit.drive.motor.speed = pulses * unit.drive.motor.gear
+    return unit
+
+
+async def taken(line, **request):
+    """Take a trace on an open line."""
+    armed = await line.axis("u1").tracer.arm(TakeTrace(**request))
+    return await armed.record(ignore)
+
+
+@pytest.mark.parametrize("lost", [("request",), ("reply",), ("request", "reply", "request")])
+async def test_a_lost_execute_starts_the_trace_within_seconds(lost):
+    unit = losing_once(1, b"W112001", *lost)
+    async with smartstep_line([unit]) as line:
+        async with asyncio.timeout(20.0):
+            recorded = await taken(line, channels=("run",))
+
+        assert executes_in_a_fresh_mode_only(frames(line))
+        assert list(recorded.raw[0]) == unit.drive.recorder.rings[0]
+
+
+async def test_a_triggered_trace_whose_execute_got_lost_waits_in_a_drive_that_has_started():
+    unit = losing_once(1, b"W112001", "request")
+    unit.drive.set_run(0.0, on=True)
+    async with smartstep_line([unit], profile=TRIGGERED) as line:
+        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=100.0)
+        armed = await line.axis("u1").tracer.arm(
+            TakeTrace(channels=("speed_feedback",), trigger=trigger, timeout_s=600)
+        )
+        unit.drive.set_pulse_rate(8000.0, asyncio.get_running_loop().time())
+        async with asyncio.timeout(20.0):
+            recorded = await armed.record(ignore)
+
+        assert recorded.trigger_index == 0
+
+
+@pytest.mark.parametrize("layout", [TraceWordLayout.LSB_IO_SHIFT, TraceWordLayout.LSB_IO_MASK])
+async def test_words_that_contradict_the_monitors_make_a_trace_uncertain(layout):
+    async with smartstep_line([running(SimulatedVariant(trace_word_layout=layout))]) as line:
+        recorded = await taken(line, channels=("speed_feedback", "bkir"), interval_s=0.004)
+
+        assert "monitor 800" in recorded.problems[0]
+
+
+async def test_words_that_agree_with_the_monitors_verify_the_layout():
+    async with smartstep_line([running()]) as line:
+        recorded = await taken(line, channels=("speed_feedback", "bkir"), interval_s=0.004)
+
+        assumptions = {each.key: each.verification for each in recorded.drive.assumptions}
+        assert recorded.problems == ()
+        assert assumptions["trace_word_layout"] == "verified"
+        assert recorded.values[0][250] == pytest.approx(90.0, abs=0.4)
+
+
+async def test_a_layout_that_no_reading_tells_apart_is_marked():
+    async with smartstep_line([running()]) as line:
+        short = await taken(line, channels=("speed_feedback",))  # over before a monitor can be read beside it
+
+    verified = SMARTSTEP.verified("trace_word_layout", Verification.VERIFIED)
+    verified = verified.verified("trace_byte_order", Verification.VERIFIED)
+    async with smartstep_line([running()], profile=verified) as line:
+        configured = await taken(line, channels=("speed_feedback",))
+
+    assert "not verified" in short.problems[0]
+    assert configured.problems == ()
+
+
+async def test_what_a_long_trace_has_verified_holds_for_short_ones_until_the_drive_may_be_another():
+    async with smartstep_line([running()]) as line:
+        tracer = line.axis("u1").tracer
+        await taken(line, channels=("speed_feedback", "bkir"), interval_s=0.004)
+        short = await taken(line, channels=("speed_feedback",))
+        tracer.forget()
+        forgotten = await taken(line, channels=("speed_feedback",))
+
+    assert short.problems == ()
+    assert forgotten.problems
+
+
+async def test_a_trace_that_was_ended_from_elsewhere_is_no_trace():
+    unit = running()
+    async with smartstep_line([unit]) as line:
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), interval_s=0.01))
+        await asyncio.sleep(0.6)
+        unit.drive.advance(asyncio.get_running_loop().time())
+        unit.drive.write(0x2000, 0)
+
+        with pytest.raises(DriveFault, match="ended early"):
+            await armed.record(ignore)
+
+
+async def test_a_triggered_trace_that_was_ended_from_elsewhere_shows_no_trigger():
+    unit = running(pulses=0.0)
+    async with smartstep_line([unit], profile=TRIGGERED) as line:
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), trigger=NEVER))
+        await asyncio.sleep(2.0)
+        unit.drive.advance(asyncio.get_running_loop().time())
+        unit.drive.write(0x2000, 0)
+        recorded = await armed.record(ignore)
+
+    assert any("trigger" in problem for problem in recorded.problems)
+
+
+async def test_the_gear_of_a_pulse_trace_is_that_of_the_eeprom():
+    unit = running(pulses=4000.0, stored={PN202: 4, PN203: 1})
+    async with smartstep_line([unit], profile=SMARTSTEP) as line:
+        unit.drive.memory.write(0x1202, 40)
+        recorded = await taken(line, channels=("command_pulse_speed",))
+
+    assert recorded.drive.gear_numerator == 4
+    assert recorded.values[0][0] == pytest.approx(120.0)
+    assert any("Pn202" in problem for problem in recorded.problems)
+
+
+async def test_the_trigger_may_have_come_two_milliseconds_before_it_was_seen():
+    unit = running(pulses=0.0)
+    async with smartstep_line([unit], profile=TRIGGERED) as line:
+        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=100.0)
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), trigger=trigger))
+        unit.drive.set_pulse_rate(8000.0, asyncio.get_running_loop().time())
+        running_at_s = armed._running_at_s
+        recorded = await armed.record(ignore)
+        after_s = 499 * armed.granted.interval_s
+
+    assert recorded.zero_from_s <= armed._running_at_s - after_s - 0.002 + 1e-9
+    assert recorded.trigger_late_s == pytest.approx(0.002)
+    assert running_at_s > 0
+
+
+async def test_a_smaller_full_scale_resolves_finer_and_is_put_back():
+    unit = running()
+    async with smartstep_line([unit]) as line:
+        recorded = await taken(line, channels=("speed_feedback",), full_scale={"speed_feedback": 450.0})
+
+        assert recorded.drive.osvelcc == 450
+        assert recorded.values[0][250] == pytest.approx(90.0, abs=0.04)
+        assert (await line.axis("u1").words.read(0x8702)) == 4500
+
+
+async def test_a_full_scale_that_the_drive_does_not_take_is_said():
+    unit = running(SimulatedVariant(full_scale_settable=False))
+    async with smartstep_line([unit]) as line:
+        with pytest.raises(NotSupported, match="8702H"):
+            await line.axis("u1").tracer.arm(
+                TakeTrace(channels=("speed_feedback",), full_scale={"speed_feedback": 450})
+            )
+
+        assert unit.drive.mode == 0
+
+
+async def test_either_edge_of_a_value_is_refused_because_the_drive_would_take_any_change():
+    async with smartstep_line([simulated(1)], profile=TRIGGERED) as line:
+        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.EITHER, level=100.0)
+
+        with pytest.raises(NotSupported, match="any change"):
+            await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), trigger=trigger))
+
+
+async def test_a_change_of_a_value_triggers_by_both_edges():
+    unit = running(pulses=0.0)
+    async with smartstep_line([unit], profile=TRIGGERED) as line:
+        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.CHANGE)
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), trigger=trigger))
+        await asyncio.sleep(1.0)
+        unit.drive.set_pulse_rate(100.0, asyncio.get_running_loop().time())
+        recorded = await armed.record(ignore)
+
+    assert recorded.values[0][0] != 0.0
+    assert max(recorded.values[0]) < 4.0

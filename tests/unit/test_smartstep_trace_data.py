@@ -28,7 +28,6 @@ from ldcnd.drivers.smartstep.trace_data import (
     no_trigger,
     object_word,
     period_s,
-    raw_trigger_word,
     require_pre_trigger,
     sampling_interval,
     scale,
@@ -183,6 +182,9 @@ def test_no_trigger_is_zero():
     assert no_trigger() == TriggerWord(0, TriggerWordSource.NONE)
 
 
+CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500, gear_numerator=4, gear_denominator=1)
+
+
 @pytest.mark.parametrize(
     ("watched", "edge", "word"),
     [
@@ -198,16 +200,6 @@ def test_trigger_word_comes_from_the_configured_map(watched, edge, word):
 def test_without_a_map_there_is_no_trigger():
     with pytest.raises(NotSupported):
         trigger_word(SMARTSTEP, TriggerObject.IO, Edge.RISING)
-
-
-def test_raw_trigger_word_needs_the_profiles_leave():
-    profile = SmartStepProfile(trigger_word=TriggerWordSource.RAW)
-
-    assert raw_trigger_word(profile, 0x0102).source is TriggerWordSource.RAW
-    with pytest.raises(NotSupported):
-        raw_trigger_word(SMARTSTEP, 0x0102)
-    with pytest.raises(ValueOutOfRange):
-        raw_trigger_word(profile, 0x10000)
 
 
 CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500, gear_numerator=4, gear_denominator=1)

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.daemon.trace.host_tracer import TriggerWatch
+from ldcnd.drivers.tracer import TriggerWatch
 from ldcnd.model.traces import TraceTrigger, TriggerKind
 
 
@@ -16,6 +16,7 @@ def first_firing(kind, values, *, level=10.0, signal=False, ready_from=0):
         (TriggerKind.RISING, 3),
         (TriggerKind.FALLING, 1),
         (TriggerKind.EITHER, 1),
+        (TriggerKind.CHANGE, 1),
         (TriggerKind.ABOVE, 0),
         (TriggerKind.BELOW, 1),
     ],
@@ -24,7 +25,7 @@ def test_each_kind_fires_at_its_place(kind, place):
     assert first_firing(kind, [11.0, 9.0, 9.9, 10.0, 8.0]) == place
 
 
-@pytest.mark.parametrize("kind", [TriggerKind.RISING, TriggerKind.FALLING, TriggerKind.EITHER])
+@pytest.mark.parametrize("kind", [TriggerKind.RISING, TriggerKind.FALLING, TriggerKind.EITHER, TriggerKind.CHANGE])
 def test_first_sample_is_no_edge(kind):
     assert first_firing(kind, [50.0]) is None
     assert first_firing(kind, [-50.0]) is None

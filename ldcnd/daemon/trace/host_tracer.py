@@ -13,14 +13,22 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority, next_on_grid
 from ldcnd.drivers.driver import AxisDriver, AxisReading
 from ldcnd.drivers.scaling import Scale
-from ldcnd.drivers.tracer import ArmedTrace, Granted, Progress, Recorded, Tracer, TraceTimedOut, require_channels
+from ldcnd.drivers.tracer import (
+    ArmedTrace,
+    Granted,
+    Progress,
+    Recorded,
+    Tracer,
+    TraceTimedOut,
+    TriggerWatch,
+    require_channels,
+    require_no_full_scale,
+)
 from ldcnd.errors import BusDown, BusError, ValueOutOfRange
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.traces import TakeTrace, TraceChannel, TracePhase, TraceSource, TraceTrigger, TriggerKind
+from ldcnd.model.traces import TakeTrace, TraceChannel, TracePhase, TraceSource, TraceTrigger
 
-SIGNAL_LEVEL = 0.5
-"""Between the two values of a signal."""
 GRACE_S = 10.0
 SLACK = 10.0
 """A busy line may stretch a trace so much before it is given up."""
@@ -147,40 +155,6 @@ class HostCapture(Poller[AxisReading]):
         return self._wanted.fires is not None and self._wanted.fires(values, self.filled.is_set())
 
 
-class TriggerWatch:
-    """Sees every sample of the watched channel in turn."""
-
-    def __init__(self, trigger: TraceTrigger, *, signal: bool) -> None:
-        self._kind = trigger.kind
-        self._level = SIGNAL_LEVEL if signal else trigger.level
-        self._was_above: bool | None = None  # of the last sample that had a value
-
-    def fires(self, value: float | None, *, ready: bool) -> bool:
-        """Take the next sample and tell whether the trigger fires on it.
-
-        Args:
-            value: of the channel; None where the drive did not say, which never fires.
-            ready: enough samples precede it; what comes earlier is passed over.
-        """
-        if value is None:
-            return False
-        above = value >= self._level
-        before, self._was_above = self._was_above, above
-        rose, fell = before is False and above, before is True and not above
-        match self._kind:
-            case TriggerKind.RISING:
-                met = rose
-            case TriggerKind.FALLING:
-                met = fell
-            case TriggerKind.EITHER:
-                met = rose or fell
-            case TriggerKind.ABOVE:
-                met = above
-            case TriggerKind.BELOW:
-                met = not above
-        return ready and met
-
-
 @dataclass(frozen=True, slots=True)
 class HostChannel:
     """How a channel is read.
@@ -261,6 +235,7 @@ class HostTracer(Tracer):
         """See `Tracer`."""
         axis = self._driver.spec.name
         require_channels(axis, request, self.channels)
+        require_no_full_scale(axis, request, request.full_scale)
         chosen = tuple(self._known[name] for name in request.channels)
         pre_trigger = request.pre_trigger if request.trigger else 0
         if pre_trigger >= request.samples:

@@ -228,6 +228,7 @@ class TraceRecorder:
             "problem": "; ".join(recorded.problems) or None,
             "samples": len(recorded.offsets_ns),
             "trigger_index": recorded.trigger_index,
+            "trigger_late_s": recorded.trigger_late_s,
             "missed": recorded.missed,
             "chunks": len(firsts),
             "drive": recorded.drive,

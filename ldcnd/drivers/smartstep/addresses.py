@@ -46,7 +46,11 @@ class Register(IntEnum):
 
 
 class TraceRegister(IntEnum):
-    """What may be set for a trace: all of it before Data Trace Mode is entered."""
+    """What may be set for a trace: all of it before Data Trace Mode is entered.
+
+    The manual speaks of MAXTRQC and OSVELCC as settings that raise the resolution of a trace, and lists them among
+    constants: whether a drive takes them is an assumption.
+    """
 
     TRACE_1_OBJECT = Register.TRACE_1_OBJECT
     TRACE_2_OBJECT = Register.TRACE_2_OBJECT
@@ -54,6 +58,8 @@ class TraceRegister(IntEnum):
     PTRGNO = Register.PTRGNO
     TRGC1 = Register.TRGC1
     TRGC2 = Register.TRGC2
+    MAXTRQC = Register.MAXTRQC
+    OSVELCC = Register.OSVELCC
 
 
 class OperatingMode(IntEnum):

@@ -120,8 +120,8 @@ class SmartStepUnitConfig(Frozen):
 
     monitors: Mapping[MonitorName, float] = {}
     """Monitors to publish, with their rates in Hz."""
-    eeprom_write: EepromWrite = EepromWrite.CONFIRM
-    """deny forbids it; otherwise EEPROM is written when a request names it."""
+    eeprom_write: EepromWrite = EepromWrite.ALLOW
+    """deny forbids it; allow: EEPROM is written when a request names it."""
     eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
     """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
     planned_response_s: float = Field(default=0.02, ge=0, le=5)
@@ -146,6 +146,8 @@ class SmartStepUnitConfig(Frozen):
     def _renamed(cls, document: object) -> object:
         if isinstance(document, dict) and "settled" in document:
             raise ValueError('settled: the key is called verified now, and its value "bench_verified" is "verified"')
+        if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
+            raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
         return document
 
     @model_validator(mode="after")

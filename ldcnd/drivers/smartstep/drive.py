@@ -81,7 +81,7 @@ class SmartStepAxis(ReadOnlyAxis):
         self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
         self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
         self._parameters = UnitParameters(self.words, spec.profile, spec.eeprom, others, self._cleared)
-        self.tracer = SmartStepTracer(bus, self.words, spec.profile)
+        self.tracer = self._tracer = SmartStepTracer(bus, self.words, spec.profile)
         self._rates_hz = spec.rates_hz
         self._bus = bus
         self._poller: UnitPoller | None = None
@@ -93,6 +93,7 @@ class SmartStepAxis(ReadOnlyAxis):
 
     def identified(self, type_word: int, version: int) -> None:
         """Take driver type (8800H) and software version (8518H); both types of the manual have one word."""
+        self._tracer.forget()
         known = driver_type(type_word)
         title = "R7D-APL or R7D-APH" if known is DriverType.R7D_AP else f"unlisted type {type_word:04X}H"
         self.identity = f"SmartStep {title} (version {version:04X}H)"

@@ -56,14 +56,12 @@ class Echo(StrEnum):
 
     NONE = "none"
     EXPECT = "expect"
-    PROBE = "probe"
 
 
 class EepromWrite(StrEnum):
-    """What a write to EEPROM needs; it endures 10,000 of them (manual 2.2, note)."""
+    """Whether EEPROM may be written where a request names it; it endures 10,000 writes (manual 2.2, note)."""
 
     DENY = "deny"
-    CONFIRM = "confirm"
     ALLOW = "allow"
 
 
@@ -102,11 +100,12 @@ class ByteOrder(StrEnum):
 
 
 class TriggerWordSource(StrEnum):
-    """Where the trigger condition word of a trace comes from; its bit positions are lost from the manual (4, 7))."""
+    """Where the trigger of a trace comes from; the bit positions of the drive's are lost from the manual (4, 7))."""
 
     NONE = "none"
     CONFIGURED = "configured"
-    RAW = "raw"
+    HOST = "host"
+    """The host polls, and starts the trace when the condition is met."""
 
 
 class CommandPulseGear(StrEnum):
@@ -162,7 +161,9 @@ ASSUMPTIONS: tuple[Assumption, ...] = (
     Assumption("trace_byte_order", "the high byte comes first", Confidence.INFERRED_HIGH),
     Assumption("trigger_word", "0000H means no trigger; other bits unknown", Confidence.INFERRED_HIGH),
     Assumption("command_pulse_gear", "numerator over denominator", Confidence.INFERRED_MEDIUM),
-    Assumption("encoder_counts_per_rev", "8000, from the printed speed formula", Confidence.STATED),
+    Assumption("encoder_counts_per_rev", "8000, the divisor of the printed speed formula", Confidence.INFERRED_HIGH),
+    Assumption("trace_full_scale", "8701H and 8702H take settings", Confidence.INFERRED_LOW),
+    Assumption("alarm_91_92", "91 and 92 are warnings unless /ALM is active", Confidence.INFERRED_MEDIUM),
     Assumption("run_active_low", "RUN is on while its bit is 0", Confidence.INFERRED_MEDIUM),
     Assumption("reset_active_low", "RESET is on while its bit is 0", Confidence.INFERRED_MEDIUM),
     Assumption("alarm_output_high", "/ALM is 1 in alarm", Confidence.INFERRED_MEDIUM),
@@ -190,8 +191,6 @@ class SmartStepProfile:
         attempts: how often a repeatable command is sent in all; like `gap_s` and `quiet_s` it is for the line's owner.
         trace_chunk_bytes: 2 to 1000, even.
         trace_verify: read each chunk twice; the string checksum may not cover the data.
-        atomic_counter: read both halves of a counter by one string reference.
-        eeprom_changes_ram: None: unknown, so both addresses are read after a write.
     """
 
     framing: Framing = Framing.SEVEN_EVEN
@@ -201,7 +200,7 @@ class SmartStepProfile:
     gap_s: float = 0.06
     quiet_s: float = 0.005
     attempts: int = 3
-    eeprom_write: EepromWrite = EepromWrite.CONFIRM
+    eeprom_write: EepromWrite = EepromWrite.ALLOW
     string_checksum: StringChecksum = StringChecksum.AUTO
     string_count_unit: CountUnit = CountUnit.BYTES
     trace_chunk_bytes: int = 200
@@ -215,8 +214,6 @@ class SmartStepProfile:
     run_active_low: bool = True
     reset_active_low: bool = True
     alarm_output_high: bool = True
-    atomic_counter: bool = False
-    eeprom_changes_ram: bool | None = None
     assumptions: tuple[Assumption, ...] = ASSUMPTIONS
 
     def verified(self, key: str, verification: Verification) -> "SmartStepProfile":
@@ -232,6 +229,10 @@ class SmartStepProfile:
             replace(each, verification=verification) if each.key == key else each for each in self.assumptions
         )
         return replace(self, assumptions=assumptions)
+
+    def is_verified(self, key: str) -> bool:
+        """Tell whether a test on the drive has confirmed what this profile says about an assumption."""
+        return any(each.key == key and each.verification is Verification.VERIFIED for each in self.assumptions)
 
 
 SMARTSTEP = SmartStepProfile()

@@ -278,20 +278,6 @@ def trigger_word(profile: SmartStepProfile, watched: TriggerObject, edge: Edge) 
     return TriggerWord(word, TriggerWordSource.CONFIGURED)
 
 
-def raw_trigger_word(profile: SmartStepProfile, word: int) -> TriggerWord:
-    """Return a trigger condition that the caller knows by number.
-
-    Raises:
-        NotSupported: the profile does not allow it.
-        ValueOutOfRange: it does not fit 16 bits.
-    """
-    if profile.trigger_word is not TriggerWordSource.RAW:
-        raise NotSupported("the profile does not allow a raw trigger word", value=word)
-    if not 0 <= word <= 0xFFFF:  # noqa: PLR2004 - one register
-        raise ValueOutOfRange(f"trigger word {word} does not fit 16 bits", value=word, limit=0xFFFF)
-    return TriggerWord(word, TriggerWordSource.RAW)
-
-
 def no_trigger() -> TriggerWord:
     """Return the condition that is never waited for."""
     return TriggerWord(NO_TRIGGER, TriggerWordSource.NONE)

@@ -48,7 +48,12 @@ SIGNALS: Mapping[str, IoObject] = MappingProxyType({each.name.lower(): each for 
 CHANNELS = (*DATA, *SIGNALS)
 
 _EDGES: Mapping[TriggerKind, Edge] = MappingProxyType(
-    {TriggerKind.RISING: Edge.RISING, TriggerKind.FALLING: Edge.FALLING, TriggerKind.EITHER: Edge.BOTH}
+    {
+        TriggerKind.RISING: Edge.RISING,
+        TriggerKind.FALLING: Edge.FALLING,
+        TriggerKind.EITHER: Edge.BOTH,
+        TriggerKind.CHANGE: Edge.BOTH,
+    }
 )
 
 
@@ -116,10 +121,17 @@ def trigger_condition(
             f"axis {axis}: the drive triggers on edges only, not on {trigger.kind.value!r}",
             axis=axis,
             value=trigger.kind.value,
-            remedy="use rising, falling or either",
+            remedy="use rising, falling or change",
         )
     if trigger.channel in SIGNALS:
         watched = TriggerObject.IO
+    elif trigger.kind is TriggerKind.EITHER:
+        raise NotSupported(
+            f"axis {axis}: with both edges of a value the drive triggers on any change, whatever the level",
+            axis=axis,
+            value=trigger.kind.value,
+            remedy="use rising, falling or change",
+        )
     else:
         watched = (TriggerObject.TRACE_1, TriggerObject.TRACE_2)[assignment.memory(trigger.channel)]
     return trigger_word(profile, watched, _EDGES[trigger.kind])
@@ -150,6 +162,7 @@ BEARING = (
     "command_pulse_gear",
     "encoder_counts_per_rev",
     "untriggered_start",
+    "trace_full_scale",
 )
 """The assumptions that bear on a trace."""
 
@@ -171,6 +184,10 @@ class TraceMemory:
     trigger_address: int | None
     string_checksum: StringChecksum
     trigger_word_source: TriggerWordSource
+
+    def in_order(self) -> tuple[tuple[int, ...], ...]:
+        """Return the words in order of time."""
+        return tuple(unwrap(ring, self.first) for ring in self.rings)
 
 
 def granted_channels(
@@ -200,9 +217,9 @@ def recorded(
     assignment: Assignment,
     settings: Mapping[TraceRegister, int],
     memory: TraceMemory,
-    ended_s: tuple[float, float],
+    first_s: tuple[float, float],
 ) -> Recorded:
-    """Put a trace together.
+    """Put a trace together; whether its values are right is for trace_check.py to say.
 
     Args:
         profile: how the drive is taken to behave.
@@ -210,17 +227,16 @@ def recorded(
         assignment: which channel is in which memory.
         settings: of the recorder.
         memory: what was read.
-        ended_s: the last point was taken between these instants, in loop time.
+        first_s: the first sample was taken between these instants, in loop time.
     """
-    words = tuple(unwrap(ring, memory.first) for ring in memory.rings)
+    words = memory.in_order()
     points = tuple(tuple(decode_word(word, profile.trace_word_layout) for word in column) for column in words)
     zero = settings[TraceRegister.PTRGNO]
     interval_s = period_s(settings[TraceRegister.SMPTMS], constants.cyclec_us)
-    after_s = (POINTS - 1 - zero) * interval_s
     return Recorded(
         offsets_ns=tuple(round((k - zero) * interval_s * 1e9) for k in range(POINTS)),
-        zero_from_s=ended_s[0] - after_s,
-        zero_until_s=ended_s[1] - after_s,
+        zero_from_s=first_s[0] + zero * interval_s,
+        zero_until_s=first_s[1] + zero * interval_s,
         values=tuple(
             _column(profile, constants, DATA.get(name), points[assignment.memory(name)]) for name in assignment.channels
         ),

@@ -37,6 +37,7 @@ from ldcnd.drivers.smartstep.parameters import (
     Parameter,
     unit_number,
 )
+from ldcnd.drivers.smartstep.profiles import CommandPulseGear
 from ldcnd.drivers.smartstep.trace_data import FULL_SCALE, DataObject, IoObject, TracePoint
 from ldcnd.sim.smartstep.recorder import SimulatedRecorder
 from ldcnd.sim.smartstep.variant import SimulatedVariant
@@ -324,8 +325,6 @@ class SimulatedDrive:
             Register.AUTO_TUNING_RESULT: 100,
             Register.SOFTWARE_VERSION: self.variant.software_version,
             Register.CYCLEC: self.variant.cyclec_us,
-            Register.MAXTRQC: self.variant.maxtrqc,
-            Register.OSVELCC: self.variant.osvelcc,
             Register.DRIVER_TYPE: DriverType.R7D_AP,
         }
         return constants.get(address, self.recorder.read(address))
@@ -427,15 +426,26 @@ class SimulatedDrive:
         )
         return round(words[address - 0x8000])
 
+    @property
+    def _pulse_gear(self) -> float:
+        """Motor counts for one traced pulse, by the variant's way of gearing."""
+        match self.variant.command_pulse_gear:
+            case CommandPulseGear.NUM_DEN:
+                return self.motor.gear
+            case CommandPulseGear.DEN_NUM:
+                return 1.0 / self.motor.gear
+            case CommandPulseGear.NONE:
+                return 1.0
+
     def _trace_point(self, data: DataObject, io: IoObject) -> TracePoint:
         motor = self.motor
         match data:
             case DataObject.TORQUE_REFERENCE:
-                value = self._torque * FULL_SCALE / self.variant.maxtrqc
+                value = self._torque * FULL_SCALE / (self.recorder.read(Register.MAXTRQC) or 1)
             case DataObject.SPEED_FEEDBACK:
-                value = motor.rpm(motor.speed) * FULL_SCALE / self.variant.osvelcc
+                value = motor.rpm(motor.speed) * FULL_SCALE / (self.recorder.read(Register.OSVELCC) or 1)
             case DataObject.COMMAND_PULSE_SPEED:
-                value = motor.pulse_rate * 2 * self.variant.cyclec_us * 1e-6
+                value = motor.reference_speed / self._pulse_gear * 2 * self.variant.cyclec_us * 1e-6
             case DataObject.POSITION_DEVIATION:
                 value = self._deviation_units
         levels = {

@@ -35,16 +35,21 @@ class _Trigger:
     falling: bool
 
     def is_met(self, before: Sequence[TracePoint], now: Sequence[TracePoint]) -> bool:
+        if self.rising and self.falling:  # manual 4 (7): "when the data is changed from its previous value"
+            return self._watched(before) != self._watched(now)
         past, present = self._above(before), self._above(now)
         return (self.rising and present and not past) or (self.falling and past and not present)
 
-    def _above(self, points: Sequence[TracePoint]) -> bool:
+    def _watched(self, points: Sequence[TracePoint]) -> int:
         point = points[self.second]
-        return bool(point.io) if self.io else point.value >= self.level
+        return bool(point.io) if self.io else point.value
+
+    def _above(self, points: Sequence[TracePoint]) -> bool:
+        return bool(self._watched(points)) if self.io else self._watched(points) >= self.level
 
 
 class SimulatedRecorder:
-    """Registers 5000H to 5006H and the trace memories.
+    """Registers 5000H to 5006H, 8701H, 8702H and the trace memories.
 
     Attributes:
         rings: the words of trace 1 and trace 2, by point.
@@ -57,6 +62,8 @@ class SimulatedRecorder:
         self._variant = variant
         self._registers = dict.fromkeys(range(Register.TRACE_1_OBJECT, Register.TRGADR + 1), 0)
         self._registers[Register.SMPTMS] = 2
+        self._registers[Register.MAXTRQC] = variant.maxtrqc
+        self._registers[Register.OSVELCC] = variant.osvelcc
         self._objects: tuple[tuple[DataObject, IoObject], ...] = ()
         self._trigger: _Trigger | None = None
         self._before: Sequence[TracePoint] = ()
@@ -70,6 +77,8 @@ class SimulatedRecorder:
     def write(self, address: int, value: int) -> bool | None:
         """Set a register; return False for a value that the drive refuses, None for an address that cannot be set."""
         if address not in self._registers or address == Register.TRGADR:
+            return None
+        if address in (Register.MAXTRQC, Register.OSVELCC) and not self._variant.full_scale_settable:
             return None
         if not self._accepts(address, value):
             return False
@@ -140,6 +149,8 @@ class SimulatedRecorder:
                 return value in {object_word(data, io) for data in DataObject for io in IoObject}
             case Register.PTRGNO:
                 return value <= HIGHEST_PRE_TRIGGER
+            case Register.MAXTRQC | Register.OSVELCC:
+                return value > 0
             case Register.TRGC1:
                 return value & ~(bits.rising | bits.falling) in (bits.trace1, bits.trace2, bits.io)
             case _:

@@ -6,7 +6,14 @@ The host's assumptions are in profiles.py; a test makes the two agree, or differ
 from dataclasses import dataclass
 
 from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, StringChecksum, TraceWordLayout, TriggerMap
+from ldcnd.drivers.smartstep.profiles import (
+    ByteOrder,
+    CommandPulseGear,
+    CountUnit,
+    StringChecksum,
+    TraceWordLayout,
+    TriggerMap,
+)
 
 BENCH_TRIGGER_MAP = TriggerMap(trace1=0x0000, trace2=0x0001, io=0x0002, rising=0x0100, falling=0x0200)
 """An invented layout: the real one is not known, and nothing outside a simulation may use this one."""
@@ -29,7 +36,9 @@ class SimulatedVariant:
         run_active_low: RUN is on at level 0, `reset_active_low` the same for RESET.
         trigger_waits: no trigger is taken before the pre-trigger points are filled.
         clear_s: how long a counter clear takes.
-        cyclec_us: 8700H; `maxtrqc` 8701H, `osvelcc` 8702H.
+        cyclec_us: 8700H; `maxtrqc` 8701H, `osvelcc` 8702H at power-on.
+        full_scale_settable: 8701H and 8702H take settings; otherwise they are address errors.
+        command_pulse_gear: by which way of gearing the traced command pulses become the motor's speed.
     """
 
     response_s: float = 0.01
@@ -51,5 +60,7 @@ class SimulatedVariant:
     cyclec_us: int = 250
     maxtrqc: int = 300
     osvelcc: int = 4500
+    full_scale_settable: bool = True
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
     software_version: int = 0x0001
     encoder_counts_per_rev: int = 8000

@@ -1,0 +1,351 @@
+"""Whether a trace says what the drive did: its words under every reading that the manual leaves open, beside monitors.
+
+The layout of a trace word, its byte order and the gear of command pulses are assumptions. While a trace is recorded,
+the monitors of its channels are read, too. The values of a trace are right when every reading of its words that agrees
+with the monitors gives the same values; otherwise they are uncertain, and the problem says why. What a test on the
+drive has verified is not varied. Pure.
+Source: manual 3, monitors 8000H to 8008H; 4, settings 3 and 7, "Unit conversion", notes on the trigger.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+
+from ldcnd.drivers.smartstep.monitors import (
+    INPUT_SIGNALS,
+    OUTPUT_SIGNALS,
+    POSITION_DEVIATION,
+    REFERENCE_PULSE_SPEED,
+    SPEED_FEEDBACK,
+    TORQUE_REFERENCE,
+    InputSignal,
+    Monitor,
+    OutputSignal,
+)
+from ldcnd.drivers.smartstep.profiles import ByteOrder, CommandPulseGear, SmartStepProfile, TraceWordLayout
+from ldcnd.drivers.smartstep.trace_data import (
+    FULL_SCALE,
+    DataObject,
+    IoObject,
+    TraceConstants,
+    decode_word,
+    scale,
+)
+from ldcnd.drivers.smartstep.trace_result import DATA, SIGNALS, Assignment
+from ldcnd.drivers.tracer import SIGNAL_LEVEL
+from ldcnd.model.traces import TraceTrigger, TriggerKind
+
+TRIGGER_LATE_S = 0.002
+"""A trigger is detected at most so late (manual 4, note 1)."""
+CLOCK_ERROR = 0.02
+"""How far the clock of a drive may be off, as a fraction; the manual gives no accuracy."""
+FEWEST_AGREEING = 2
+"""Readings of a layout that must agree with the monitors before they verify it."""
+
+_MONITORS: Mapping[DataObject, Monitor] = {
+    DataObject.TORQUE_REFERENCE: TORQUE_REFERENCE,
+    DataObject.SPEED_FEEDBACK: SPEED_FEEDBACK,
+    DataObject.COMMAND_PULSE_SPEED: REFERENCE_PULSE_SPEED,
+    DataObject.POSITION_DEVIATION: POSITION_DEVIATION,
+}
+_SIGNALS: Mapping[IoObject, tuple[Monitor, int]] = {
+    IoObject.RUN: (INPUT_SIGNALS, InputSignal.RUN),
+    IoObject.RESET: (INPUT_SIGNALS, InputSignal.RESET),
+    IoObject.ALM: (OUTPUT_SIGNALS, OutputSignal.ALM),
+    IoObject.INP: (OUTPUT_SIGNALS, OutputSignal.INP),
+    IoObject.BKIR: (OUTPUT_SIGNALS, OutputSignal.BKIR),
+}
+
+
+Words = tuple[TraceWordLayout, ByteOrder]
+"""What the words of a trace memory look like."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A monitor that shows what a channel records; for a signal one bit of it."""
+
+    channel: str
+    monitor: Monitor
+    bit: int | None = None
+
+    def value_of(self, word: int) -> float:
+        """Return what the word of the monitor says of the channel, in its unit; a signal is 0 or 1."""
+        return float(self.monitor.value_of(word)) if self.bit is None else float(bool(word & self.bit))
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What a monitor said while the trace was recorded, at an instant between two of the loop's clock."""
+
+    comparison: Comparison
+    value: float
+    from_s: float
+    until_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """The words of a trace in order of time, of each memory that was used, in the byte order of the profile.
+
+    Attributes:
+        first_from_s: the first sample was not taken before this instant, in loop time, nor after `first_until_s`.
+    """
+
+    words: tuple[tuple[int, ...], ...]
+    interval_s: float
+    first_from_s: float
+    first_until_s: float
+
+    def window(self, shown: Shown) -> range | None:
+        """Return the samples among which is what a monitor has shown; None when it may lie outside of the trace."""
+        earliest = (shown.from_s - self.first_until_s) / self.interval_s
+        latest = (shown.until_s - self.first_from_s) / self.interval_s
+        first = math.floor(earliest - CLOCK_ERROR * abs(earliest)) - 1
+        last = math.ceil(latest + CLOCK_ERROR * abs(latest)) + 1
+        if first < -2 or last > len(self.words[0]):  # noqa: PLR2004 - a sample and its rounding before the first
+            return None
+        return range(max(0, first), min(last + 1, len(self.words[0])))
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What the monitors say about a trace.
+
+    Attributes:
+        problems: why its values are uncertain; none when they are right.
+        verified: assumptions that this trace, with those before it, has verified.
+        contradicted: assumptions that it has contradicted.
+        possible: what the drive's words may look like by all traces so far.
+    """
+
+    problems: tuple[str, ...] = ()
+    verified: frozenset[str] = frozenset()
+    contradicted: frozenset[str] = frozenset()
+    possible: frozenset[Words] | None = None
+
+
+def comparisons(assignment: Assignment) -> tuple[Comparison, ...]:
+    """Return what can be read beside a trace: a monitor for each channel that was asked for."""
+    found = []
+    for name in assignment.channels:
+        if name in DATA:
+            found.append(Comparison(name, _MONITORS[DATA[name]]))
+        else:
+            found.append(Comparison(name, *_SIGNALS[SIGNALS[name]]))
+    return tuple(found)
+
+
+def judge(
+    profile: SmartStepProfile,
+    constants: TraceConstants,
+    assignment: Assignment,
+    samples: Samples,
+    shown: Sequence[Shown],
+    possible: frozenset[Words] | None = None,
+) -> Judgement:
+    """Compare a trace with what the monitors showed meanwhile.
+
+    Args:
+        profile: how the drive is taken to behave.
+        constants: what scales the values.
+        assignment: which channel is in which memory.
+        samples: the words.
+        shown: what was read of the monitors.
+        possible: what earlier traces of the same drive have left possible; None for anything.
+    """
+    if profile.trace_word_layout is TraceWordLayout.RAW:
+        return Judgement(("the words of the trace memory are published as they are, without a layout",))
+    windows = [(each, window) for each in shown if (window := samples.window(each))]
+
+    def contradiction(reading: SmartStepProfile) -> str | None:
+        for each, window in windows:
+            text = _contradiction(reading, profile.trace_byte_order, constants, assignment, samples, each, window)
+            if text:
+                return text
+        return None
+
+    everything = _readings(profile, assignment)
+    readings = [each for each in everything if possible is None or _words(each) in possible]
+    agreeing = [reading for reading in readings if contradiction(reading) is None]
+    against = contradiction(profile)
+    if against:
+        others = "; ".join(sorted({_name(reading, assignment) for reading in agreeing})) or "no layout that is known"
+        return Judgement((f"{against}; {others} agrees with the monitors",), contradicted=_varied(everything))
+    assumed = _columns(profile, profile.trace_byte_order, constants, assignment, samples)
+    different = [
+        reading
+        for reading in agreeing
+        if reading != profile
+        and not _alike(_columns(reading, profile.trace_byte_order, constants, assignment, samples), assumed)
+    ]
+    problems = _wrapped(profile, assignment, assumed)
+    if different:
+        others = "; ".join(sorted({_name(reading, assignment) for reading in different}))
+        problems.append(
+            f"not verified: words are taken as {_name(profile, assignment)}, and the monitors allow {others} as well"
+        )
+    enough = len(windows) >= FEWEST_AGREEING
+    left = frozenset(map(_words, agreeing)) if enough else possible
+    verified = _varied(everything) - _varied(agreeing if enough else readings)
+    return Judgement(tuple(problems), verified=verified, possible=left)
+
+
+def trigger_problem(
+    trigger: TraceTrigger, level: float, column: Sequence[float | None], index: int, interval_s: float
+) -> str | None:
+    """Return what is wrong when the recorded values show no trigger where the drive says that it was.
+
+    A drive whose trace was ended from elsewhere is in its normal mode, too, and says anything. The condition may have
+    been met `TRIGGER_LATE_S` before it was detected.
+
+    Args:
+        trigger: what the drive waited for.
+        level: as the drive was told, in the unit of the channel.
+        column: the values of its channel.
+        index: of the sample at which the trigger was detected.
+        interval_s: between two samples.
+    """
+    first = max(0, index - math.ceil(TRIGGER_LATE_S / interval_s) - 1)
+    near = [value for value in column[first : index + 2] if value is not None]
+    if trigger.channel in SIGNALS:
+        level = SIGNAL_LEVEL
+    edges = list(pairwise(near))
+    if index == 0:  # nothing was recorded before the trigger, so only the level after it can be seen
+        edges = [(-math.inf, near[0])] if trigger.kind is TriggerKind.RISING else [(math.inf, near[0])]
+    rose = any(before < level <= after for before, after in edges)
+    fell = any(after < level <= before for before, after in edges)
+    changed = any(before != after for before, after in edges)
+    met = {
+        TriggerKind.RISING: rose,
+        TriggerKind.FALLING: fell,
+        TriggerKind.EITHER: changed,
+        TriggerKind.CHANGE: changed,
+    }
+    if met.get(trigger.kind, True):
+        return None
+    return (
+        f"the values show no {trigger.kind.value} trigger of {trigger.channel} at sample {index}: the trace was ended"
+        " from elsewhere, or the trigger bits or the layout are wrong"
+    )
+
+
+# -- readings of a word ----------------------------------------------------------------------------------------------
+
+
+def _readings(profile: SmartStepProfile, assignment: Assignment) -> list[SmartStepProfile]:
+    """Return the profile with every combination of what is not verified about the words of a trace."""
+    layouts: list[TraceWordLayout] = [each for each in TraceWordLayout if each is not TraceWordLayout.RAW]
+    if profile.is_verified("trace_word_layout"):
+        layouts = [profile.trace_word_layout]
+    orders = [profile.trace_byte_order] if profile.is_verified("trace_byte_order") else list(ByteOrder)
+    gears, counts = [profile.command_pulse_gear], [profile.encoder_counts_per_rev]
+    if DataObject.COMMAND_PULSE_SPEED in _data(assignment):
+        if not profile.is_verified("command_pulse_gear"):
+            gears = list(CommandPulseGear)
+        if not profile.is_verified("encoder_counts_per_rev"):
+            counts = sorted({max(1, round(counts[0] * factor)) for factor in (0.25, 0.5, 1, 2, 4)})
+    return [
+        replace(
+            profile,
+            trace_word_layout=layout,
+            trace_byte_order=order,
+            command_pulse_gear=gear,
+            encoder_counts_per_rev=count,
+        )
+        for layout, order, gear, count in product(layouts, orders, gears, counts)
+    ]
+
+
+def _words(reading: SmartStepProfile) -> Words:
+    return reading.trace_word_layout, reading.trace_byte_order
+
+
+def _data(assignment: Assignment) -> tuple[DataObject, ...]:
+    return tuple(DATA[name] for name in assignment.channels if name in DATA)
+
+
+def _varied(readings: Sequence[SmartStepProfile]) -> frozenset[str]:
+    """Return the assumptions in which readings differ."""
+    keys = ("trace_word_layout", "trace_byte_order", "command_pulse_gear", "encoder_counts_per_rev")
+    return frozenset(key for key in keys if len({getattr(reading, key) for reading in readings}) > 1)
+
+
+def _name(reading: SmartStepProfile, assignment: Assignment) -> str:
+    name = f"{reading.trace_word_layout.value}, {reading.trace_byte_order.value} byte first"
+    if DataObject.COMMAND_PULSE_SPEED in _data(assignment):
+        name += f", gear {reading.command_pulse_gear.value}, {reading.encoder_counts_per_rev} counts a revolution"
+    return name
+
+
+def _decoder(
+    reading: SmartStepProfile, order: ByteOrder, constants: TraceConstants, channel: str
+) -> Callable[[int], float]:
+    """Return what a word, split in the byte order `order`, means for a channel."""
+    swapped = reading.trace_byte_order is not order
+    factor = scale(reading, constants, DATA[channel]) if channel in DATA else None
+
+    def decode(word: int) -> float:
+        point = decode_word((word >> 8 | word << 8) & 0xFFFF if swapped else word, reading.trace_word_layout)
+        return float(bool(point.io)) if factor is None else point.value * factor
+
+    return decode
+
+
+def _columns(
+    reading: SmartStepProfile, order: ByteOrder, constants: TraceConstants, assignment: Assignment, samples: Samples
+) -> list[list[float]]:
+    columns = []
+    for name in assignment.channels:
+        decode = _decoder(reading, order, constants, name)
+        columns.append([decode(word) for word in samples.words[assignment.memory(name)]])
+    return columns
+
+
+def _alike(columns: list[list[float]], others: list[list[float]]) -> bool:
+    return all(
+        math.isclose(value, other, rel_tol=1e-9, abs_tol=1e-9)
+        for column, known in zip(columns, others, strict=True)
+        for value, other in zip(column, known, strict=True)
+    )
+
+
+def _contradiction(
+    reading: SmartStepProfile,
+    order: ByteOrder,
+    constants: TraceConstants,
+    assignment: Assignment,
+    samples: Samples,
+    shown: Shown,
+    window: range,
+) -> str | None:
+    """Return how a reading of the words cannot be, by what a monitor has shown among these samples."""
+    comparison = shown.comparison
+    decode = _decoder(reading, order, constants, comparison.channel)
+    words = samples.words[assignment.memory(comparison.channel)]
+    values = [decode(words[place]) for place in window]
+    where = f"monitor {comparison.monitor.address:04X}H shows {comparison.channel} at {shown.value:g}"
+    if comparison.bit is not None:
+        if shown.value in values:
+            return None
+        return f"{where} while the words, taken as {reading.trace_word_layout.value}, say {values[0]:g}"
+    # A monitor has whole units; a value may have passed between two samples, and one layout loses its lowest bit.
+    slack = 1.0 + 2 * scale(reading, constants, DATA[comparison.channel])
+    slack += max((abs(after - before) for before, after in pairwise(values)), default=0.0)
+    if min(values) - slack <= shown.value <= max(values) + slack:
+        return None
+    return (
+        f"{where} while the words, taken as {reading.trace_word_layout.value}, say {min(values):g} to {max(values):g}"
+    )
+
+
+def _wrapped(profile: SmartStepProfile, assignment: Assignment, columns: list[list[float]]) -> list[str]:
+    """Say where a position deviation may be more than fits: what a drive records then is not known."""
+    if profile.trace_word_layout is TraceWordLayout.LSB_IO_MASK:
+        return []
+    return [
+        f"{name} goes beyond {FULL_SCALE}: what a drive records beyond 15 bits is not known"
+        for name, column in zip(assignment.channels, columns, strict=True)
+        if DATA.get(name) is DataObject.POSITION_DEVIATION and any(abs(value) > FULL_SCALE for value in column)
+    ]

@@ -1,0 +1,107 @@
+"""Reading the trace memories of one drive, piece by piece, so that polls and commands keep their turns in between.
+
+Each piece is one exchange of the background lane, sent when the polls have caught up: a poller that reads several words
+has its next one ready only a moment after the last, too late to go before a piece that waits already. So a poll waits
+for one piece at most, unless the line has no time to spare: then a piece goes all the same, but seldom. The checksum of
+a string may not cover its data, so a piece counts when two readings of it agree.
+Source: manual 2.2, data string reference command; 4, settings 9.
+"""
+
+import asyncio
+import contextlib
+from dataclasses import replace
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.queue import Lane
+from ldcnd.drivers.smartstep.commands import ChecksumPin, Refusal, StringReply, string_reference
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile, StringChecksum
+from ldcnd.drivers.smartstep.trace_data import Chunk, chunk_plan, split_words
+from ldcnd.drivers.smartstep.words import Words
+from ldcnd.errors import BadReply, ByteCountRefused, ReplyTimeout
+from ldcnd.exchange import Exchange
+
+ROUNDS = 4
+"""So often a piece is read until two readings agree, and so often the bus's own attempts may fail."""
+
+IDLE_LOOK_S = 0.005
+LONGEST_REST_S = 5.0
+"""On a line that is never idle a piece goes so often; some 700 characters in between are for others."""
+
+
+class TraceUpload:
+    """One upload; remembers what it has learnt of the drive's strings."""
+
+    def __init__(self, bus: Bus, words: Words, profile: SmartStepProfile) -> None:
+        self._bus = bus
+        self._words = words
+        self._profile = profile
+        self._pin = ChecksumPin()
+
+    @property
+    def string_checksum(self) -> StringChecksum:
+        """Which variant was found or is taken; AUTO while the replies leave a choice."""
+        if self._profile.string_checksum is StringChecksum.AUTO:
+            return self._pin.pinned
+        return self._profile.string_checksum
+
+    async def fetch(self, trace: int) -> tuple[int, ...]:
+        """Return the words of trace memory 1 or 2, in the order of the memory.
+
+        Raises:
+            BadReply: the drive's strings are not as the profile says, or no two readings agree.
+            DriveFault: the drive declined.
+            BusError: the line failed.
+        """
+        data = b""
+        for chunk in chunk_plan(trace, self._profile.trace_chunk_bytes):
+            data += await self._fetch(chunk)
+        return split_words(data, self._profile.trace_byte_order)
+
+    async def _fetch(self, chunk: Chunk) -> bytes:
+        """Return the bytes of a chunk, in smaller pieces when the drive refuses so many at once."""
+        try:
+            return await self._agreed(chunk)
+        except ByteCountRefused:
+            halves = chunk.halves()
+            if halves is None:
+                raise
+        first, second = halves
+        return await self._fetch(first) + await self._fetch(second)
+
+    async def _agreed(self, chunk: Chunk) -> bytes:
+        data = await self._read(chunk)
+        if not self._profile.trace_verify:
+            return data
+        for _ in range(ROUNDS):
+            again = await self._read(chunk)
+            if again == data:
+                return data
+            data = again
+        raise BadReply(
+            f"axis {self._words.axis}: {chunk.byte_count} bytes at {chunk.address:04X}H read differently each time"
+        )
+
+    async def _read(self, chunk: Chunk) -> bytes:
+        profile = replace(self._profile, string_checksum=self.string_checksum)
+        exchange = string_reference(self._words.unit, chunk.address, chunk.byte_count, profile)
+        for _ in range(ROUNDS - 1):
+            with contextlib.suppress(ReplyTimeout):
+                return await self._ask(exchange)
+        return await self._ask(exchange)
+
+    async def _ask(self, exchange: Exchange[StringReply | Refusal]) -> bytes:
+        await self._wait_for_idle_line()
+        reply = await self._words.ask(exchange, Lane.BACKGROUND)
+        self._pin.take(reply)
+        return reply.data
+
+    async def _wait_for_idle_line(self) -> None:
+        """Return when nothing was sent for a moment, or after the longest rest."""
+        loop = asyncio.get_running_loop()
+        at_the_latest_s = loop.time() + LONGEST_REST_S
+        statistics = self._bus.statistics
+        while loop.time() < at_the_latest_s:
+            before = statistics.exchanges
+            await asyncio.sleep(IDLE_LOOK_S)
+            if self._bus.is_idle and statistics.exchanges == before:
+                return
