@@ -1,32 +1,29 @@
-"""`ldcnd params`: the parameters of a drive, one by one or all at once, to and from TOML."""
+"""`ldcnd params`: the parameters of a drive, one by one or all at once, to and from TOML, from drive to drive."""
 
 import sys
-import tomllib
+from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
 
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.parameter_file import LARGEST, ParameterFile, as_toml, load_parameters
+from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError, LdcndError
-from ldcnd.model.commands import CommandReply
 from ldcnd.model.parameters import (
     ListParameters,
     Memory,
     ParameterDump,
-    ParameterReply,
     ParameterValue,
-    ReadAllParameters,
+    PlannedParameters,
+    PlannedWrite,
     ReadParameter,
     WriteParameter,
 )
 
-ReplyT = TypeVar("ReplyT", bound=CommandReply)
-
-PATIENCE_S = 60.0
-"""All parameters of a slow drive on a bad line."""
-LARGEST = 0xFFFF
+UNFINISHED = 1
+"""Exit code: files or memories differ, or not everything was written."""
 
 
 def _word(_context: click.Context, _parameter: click.Parameter, value: str) -> int:
@@ -42,7 +39,7 @@ def _word(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 
 @click.group()
 def command() -> None:
-    """Read, write, save and compare the parameters of a drive."""
+    """Read, write, save, compare and copy the parameters of a drive."""
 
 
 @command.command("list")
@@ -50,13 +47,13 @@ def command() -> None:
 @with_target
 def list_parameters(target: Target, axis: str) -> None:
     """Show what is known of the parameters of AXIS; ranges are hints, the drive decides."""
-    request = ListParameters()
-    reply = target.run(lambda client: client.command(axis, request))
+    reply = target.run(lambda client: client.command(axis, ListParameters()))
     for each in reply.parameters:
         limits = "-" if each.lowest is None else f"{each.lowest} to {each.highest}"
         hint = f" [{each.confidence}]" if each.confidence else ""
         cycle = ", from the next power-on" if each.power_cycle else ""
-        target.show(each, f"{each.parameter}  {limits:>14} {each.unit or '':18}{hint:6} {each.name}{cycle}")
+        digits = "".join(f"\n         .{one.digit} {one.title} [{one.confidence}]" for one in each.digit_meanings)
+        target.show(each, f"{each.parameter}  {limits:>14} {each.unit or '':18}{hint:6} {each.name}{cycle}{digits}")
 
 
 @command.command()
@@ -66,8 +63,7 @@ def list_parameters(target: Target, axis: str) -> None:
 @with_target
 def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
     """Show PARAMETER (Pn100, or its name) of AXIS in both memories."""
-    request = ReadParameter(parameter=parameter, unlisted=unlisted)
-    reply = target.run(lambda client: client.command(axis, request))
+    reply = target.run(lambda client: client.command(axis, ReadParameter(parameter=parameter, unlisted=unlisted)))
     target.show(reply, _line(reply.value))
 
 
@@ -90,7 +86,7 @@ def set_parameter(
         unlisted=unlisted,
         confirm_unit=confirm_unit,
     )
-    reply = target.run(lambda client: _write(client, axis, request))
+    reply = target.run(lambda client: client.command(axis, request))
     target.show(reply, f"{_line(reply.value)}{'' if reply.written else '  (was so already)'}")
     for remark in reply.remarks:
         print(remark, file=sys.stderr)
@@ -101,8 +97,8 @@ def set_parameter(
 @click.argument("file", type=click.Path(path_type=Path), required=False)
 @with_target
 def dump(target: Target, axis: str, file: Path | None) -> None:
-    """Write all parameters of AXIS as TOML to FILE, or to the terminal."""
-    text = as_toml(axis, target.run(lambda client: _read_all(client, axis)))
+    """Write all parameters of AXIS as TOML to FILE or the terminal: both memories, type, version, switches, date."""
+    text = as_toml(axis, target.run(lambda client: read_dump(client, axis)), datetime.now(UTC))
     if file:
         file.write_text(text, encoding="utf-8")
     else:
@@ -110,89 +106,188 @@ def dump(target: Target, axis: str, file: Path | None) -> None:
 
 
 @command.command()
-@click.argument("axis")
-@click.argument("file", type=click.Path(path_type=Path), required=False)
+@click.argument("file", type=click.Path(path_type=Path))
+def check(file: Path) -> None:
+    """Check FILE without a drive: names, ranges, digits; exits with 1 when it cannot be restored."""
+    wrong, remarks = load_parameters(file).check()
+    for text in wrong:
+        print(f"wrong: {text}")
+    for text in remarks:
+        print(text)
+    print(f"{file}: {'cannot be restored' if wrong else 'can be restored'}")
+    sys.exit(UNFINISHED if wrong else 0)
+
+
+@command.command()
+@click.argument("left")
+@click.argument("right", required=False)
 @with_target
-def diff(target: Target, axis: str, file: Path | None) -> None:
-    """Show where the memories of AXIS differ from each other, or from FILE; exits with 1 when they do."""
-    wanted = load_values(file) if file else None
-    differing = 0
-    for value in target.run(lambda client: _read_all(client, axis)).values:
-        saved = value.stored if wanted is None else wanted.get(value.parameter, value.stored)
-        if (saved, value.stored) == (value.active, value.active):
-            continue
-        differing += 1
-        of_file = "" if wanted is None else f", {saved} in the file"
-        target.show(value, f"{value.parameter}  {value.active} in use, {value.stored} stored{of_file}  {value.name}")
-    sys.exit(1 if differing else 0)
+def diff(target: Target, left: str, right: str | None) -> None:
+    """Show where LEFT and RIGHT differ, each an axis or a file; without RIGHT, the two memories of LEFT.
+
+    A name with a dot or a slash is a file. Exits with 1 when they differ.
+    """
+    differing = _memories(target, left) if right is None else _sides(target, left, right)
+    sys.exit(UNFINISHED if differing else 0)
 
 
 @command.command()
 @click.argument("axis")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--eeprom", is_flag=True, help="Write for good; the memory endures 10,000 writes.")
+@click.option("--ram", is_flag=True, help="Only try out: write RAM, and leave out what takes effect at power-on.")
+@click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
+@click.option("--any-type", is_flag=True, help="Take values of another or of an unknown type of drive.")
+@click.option("--yes", is_flag=True, help="Do not ask.")
 @with_target
-def restore(target: Target, axis: str, file: Path, *, eeprom: bool) -> None:
-    """Write what FILE says to AXIS, where it differs; Pn000 is left out, because it holds the unit number."""
-    memory = Memory.EEPROM if eeprom else Memory.RAM
-    values = {name: value for name, value in load_values(file).items() if name != "Pn000"}
-
-    async def work(client: RigClient) -> list[ParameterReply | LdcndError]:
-        outcomes: list[ParameterReply | LdcndError] = []
-        for name, value in values.items():
-            try:
-                outcomes.append(await _write(client, axis, WriteParameter(parameter=name, value=value, memory=memory)))
-            except LdcndError as error:
-                outcomes.append(error)
-        return outcomes
-
-    failed = False
-    for outcome in target.run(work):
-        if isinstance(outcome, LdcndError):
-            failed = True
-            print(f"{outcome.message} [{outcome.code}]", file=sys.stderr)
-        elif outcome.written:
-            target.show(outcome, _line(outcome.value))
-    sys.exit(1 if failed else 0)
+def restore(target: Target, axis: str, file: Path, *, ram: bool, dry_run: bool, any_type: bool, yes: bool) -> None:
+    """Make AXIS hold what FILE says; its unit number stays. Lists the writes, asks once, reads them back."""
+    source = load_parameters(file)
+    memory = Memory.RAM if ram else None
+    _transfer(
+        target, axis, source.values, source.driver_type, memory=memory, dry_run=dry_run, any_type=any_type, yes=yes
+    )
 
 
-def as_toml(axis: str, reply: ParameterDump) -> str:
-    """Return a dump as TOML: what is stored, with a remark where another value is in use."""
-    lines = [f'axis = "{axis}"', "", "[parameters]"]
-    for value in reply.values:
-        in_use = f", in use {value.active}" if value.differs else ""
-        lines.append(f"{value.parameter} = {value.stored}  # {value.name}{in_use}")
-    return "\n".join(lines) + "\n"
+@command.command()
+@click.argument("source")
+@click.argument("axis")
+@click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
+@click.option("--any-type", is_flag=True, help="Take values of another type of drive.")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@with_target
+def clone(target: Target, source: str, axis: str, *, dry_run: bool, any_type: bool, yes: bool) -> None:
+    """Make AXIS hold what SOURCE has stored; its unit number stays. As restore, from drive to drive."""
+    reply = target.run(lambda client: read_dump(client, source))
+    values = {value.parameter: value.stored for value in reply.values}
+    driver_type = reply.facts.driver_type if reply.facts else None
+    _transfer(target, axis, values, driver_type, memory=None, dry_run=dry_run, any_type=any_type, yes=yes)
 
 
-def load_values(file: Path) -> dict[str, int]:
-    """Return the values of a dump.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    try:
-        values = tomllib.loads(file.read_text(encoding="utf-8"))["parameters"]
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{file}: not a dump of parameters: {error}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{file}: [parameters] is not a table")
-    for name, value in values.items():
-        if type(value) is not int or not 0 <= value <= LARGEST:
-            raise ConfigError(f"{file}: {name}: {value!r} is not a word from 0 to {LARGEST}")
-    return values
+@command.command()
+@click.argument("axis")
+@click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@with_target
+def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
+    """Write to EEPROM what AXIS has in use, so that it outlives power-off; its unit number stays."""
+    reply = target.run(lambda client: read_dump(client, axis))
+    values = {value.parameter: value.active for value in reply.values if value.differs}
+    _transfer(target, axis, values, None, memory=Memory.EEPROM, dry_run=dry_run, any_type=True, yes=yes)
 
 
-async def _read_all(client: RigClient, axis: str) -> ParameterDump:
-    return await client.command(axis, ReadAllParameters())
+# -- transfer --------------------------------------------------------------------------------------------------------
 
 
-async def _write(client: RigClient, axis: str, request: WriteParameter) -> ParameterReply:
-    return await client.command(axis, request)
+def _transfer(
+    target: Target,
+    axis: str,
+    values: Mapping[str, int],
+    driver_type: int | None,
+    *,
+    memory: Memory | None,
+    dry_run: bool,
+    any_type: bool,
+    yes: bool,
+) -> None:
+    """Plan, show, ask, write, read back; exits with 1 unless the drive holds the values in the end."""
+
+    async def plan(client: RigClient) -> PlannedParameters:
+        return await plan_transfer(client, axis, values, driver_type, memory=memory, any_type=any_type)
+
+    planned = target.run(plan)
+    target.show(planned, "\n".join(_plan_lines(axis, planned)))
+    if planned.problems:
+        sys.exit(UNFINISHED)
+    if dry_run or not planned.writes:
+        return
+    if not yes and not click.confirm(f"Send {len(planned.writes)} writes to {axis}?", err=True):
+        raise click.Abort
+
+    def progress(place: int, write: PlannedWrite) -> None:
+        print(f"{place + 1} of {len(planned.writes)}: {_write_line(write)}", file=sys.stderr)
+
+    async def work(client: RigClient) -> tuple[Transfer, PlannedParameters]:
+        done = await carry_out(client, axis, planned, progress)
+        return done, await plan(client)
+
+    transfer, left = target.run(work)
+    for line in _report_lines(axis, transfer, left):
+        print(line)
+    sys.exit(UNFINISHED if transfer.failed or left.writes else 0)
+
+
+def _plan_lines(axis: str, plan: PlannedParameters) -> list[str]:
+    lines = [f"cannot be done: {problem}" for problem in plan.problems]
+    lines += [_write_line(write) for write in plan.writes]
+    lines += [f"      {text}" for write in plan.writes for text in write.digits]
+    lines += list(plan.remarks)
+    if not plan.writes and not plan.problems:
+        lines.append(f"{axis} holds these values already")
+    return lines
+
+
+def _write_line(write: PlannedWrite) -> str:
+    return (
+        f"{write.parameter} {write.memory.upper():6} {write.before} ({write.before:04X}H) -> {write.value}"
+        f" ({write.value:04X}H), takes effect {write.effective}  {write.name}"
+    )
+
+
+def _report_lines(axis: str, transfer: Transfer, left: PlannedParameters) -> list[str]:
+    lines = [f"{axis}: {len(transfer.done)} writes done", *transfer.remarks]
+    if transfer.failed:
+        write, error = transfer.failed
+        lines.append(f"failed: {_write_line(write)}: {error.message} [{error.code}]")
+        lines += [f"not tried: {_write_line(write)}" for write in transfer.left]
+    if left.writes:
+        names = ", ".join(dict.fromkeys(write.parameter for write in left.writes))
+        lines.append(f"read back: {names} still differ; the same command again completes it")
+    else:
+        lines.append("read back: the drive holds the values")
+    return lines
+
+
+# -- comparing -------------------------------------------------------------------------------------------------------
+
+
+def _memories(target: Target, name: str) -> int:
+    """Show where the two memories of a drive, or of a file, differ; return how many do."""
+    source = _source(target, name)
+    if isinstance(source, ParameterFile):
+        stored, active = source.named(), {**source.named(), **source.in_use}
+    else:
+        stored = {value.parameter: value.stored for value in source.values}
+        active = {value.parameter: value.active for value in source.values}
+    differing = [label for label in stored if active[label] != stored[label]]
+    for label in differing:
+        print(f"{label}  {active[label]} in use, {stored[label]} stored")
+    return len(differing)
+
+
+def _sides(target: Target, left: str, right: str) -> int:
+    """Show where what two sides have stored differs, and what only one of them has; return how many do."""
+    sides = [_stored(_source(target, name)) for name in (left, right)]
+    differing = [label for label in dict.fromkeys([*sides[0], *sides[1]]) if sides[0].get(label) != sides[1].get(label)]
+    for label in differing:
+        texts = [f"{name}: {side.get(label, 'not there')}" for name, side in zip((left, right), sides, strict=True)]
+        print(f"{label}  {', '.join(texts)}")
+    return len(differing)
+
+
+def _source(target: Target, name: str) -> ParameterFile | ParameterDump:
+    if "." in name or "/" in name:
+        return load_parameters(Path(name))
+    return target.run(lambda client: read_dump(client, name))
+
+
+def _stored(source: ParameterFile | ParameterDump) -> dict[str, int]:
+    if isinstance(source, ParameterFile):
+        return source.named()
+    return {value.parameter: value.stored for value in source.values}
 
 
 def _line(value: ParameterValue) -> str:
-    writes = "" if value.eeprom_writes is None else f", {value.eeprom_writes} EEPROM writes"
+    writes = "" if value.eeprom_writes is None else f", {value.eeprom_writes} of {value.eeprom_total} EEPROM writes"
     return (
         f"{value.parameter}  {value.active} ({value.active:04X}H) in use, {value.stored} ({value.stored:04X}H) stored"
         f"{writes}  {value.name}"

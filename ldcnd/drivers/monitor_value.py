@@ -14,6 +14,7 @@ class MonitorValue:
         value: in `unit`, with its sign; for signals and switches their documented bits.
         title: the manual's words.
         high: signals at high level, switches that are on.
+        active: signals that are on, whatever their level; None for what has no active level.
         resolved: a counter that was off by 65536 and was corrected by what it said before.
     """
 
@@ -22,4 +23,5 @@ class MonitorValue:
     unit: str
     title: str
     high: tuple[str, ...] = ()
+    active: tuple[str, ...] | None = None
     resolved: bool = False

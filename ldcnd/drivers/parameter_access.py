@@ -3,14 +3,19 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.model.parameters import (
     AlarmEntry,
     AssumptionInfo,
     CounterName,
+    DriveFacts,
     ParameterInfo,
     ParameterValue,
+    PlannedParameters,
+    PlanParameters,
     WriteParameter,
 )
+from ldcnd.model.samples import MonitorName
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +69,14 @@ class ParameterAccess(ABC):
         """Read all listed parameters that the drive has."""
 
     @abstractmethod
+    async def facts(self) -> DriveFacts:
+        """Read what the drive is: type, version, switches."""
+
+    @abstractmethod
+    async def plan(self, request: PlanParameters) -> PlannedParameters:
+        """List the writes after which the drive would hold the values of a request; only reads."""
+
+    @abstractmethod
     async def write(self, request: WriteParameter) -> Written:
         """Write one parameter unless it has the value already, and read both memories afterwards.
 
@@ -86,6 +99,10 @@ class ParameterAccess(ABC):
     @abstractmethod
     async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
         """Read the present alarm and the history."""
+
+    @abstractmethod
+    async def monitors(self, names: tuple[MonitorName, ...]) -> tuple[MonitorValue, ...]:
+        """Read monitors once, all of them where none is named; those that the drive lacks are left out."""
 
     @abstractmethod
     def assumptions(self) -> tuple[AssumptionInfo, ...]:

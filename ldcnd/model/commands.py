@@ -44,6 +44,8 @@ class Verb(StrEnum):
     CLEAR_COUNTER = "clear_counter"
     READ_ALARMS = "read_alarms"
     READ_PROFILE = "read_profile"
+    READ_MONITORS = "read_monitors"
+    PLAN_PARAMETERS = "plan_parameters"
     MOVE_ANALOG = "move_analog"
     SET_PWM = "set_pwm"
     TRACK = "track"

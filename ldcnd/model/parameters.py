@@ -1,11 +1,14 @@
 """What a drive with readable parameters says about them, about its alarms and about itself."""
 
+from collections.abc import Mapping
 from enum import StrEnum
+from typing import Annotated
 
 from pydantic import Field
 
 from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Effect, Verb
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.samples import MonitorName
 
 SLOW_S = 60.0
 """Longest wait for what takes many words with a slow drive, in seconds."""
@@ -29,6 +32,19 @@ class CounterName(StrEnum):
     """Pulses of the encoder."""
 
 
+class DigitInfo(Frozen):
+    """One of the four settings of a parameter that is read as hexadecimal digits."""
+
+    digit: int = Field(ge=0, le=3)
+    """Its place from the right: 2 is Pn000.2."""
+    title: str
+    """What it sets."""
+    values: Mapping[str, str]
+    """What its values mean, by their hexadecimal digit; empty where they are numbers or not known."""
+    confidence: str
+    """Where that comes from: S the manual, X a related drive, M recollection."""
+
+
 class ParameterInfo(Frozen):
     """One parameter of a drive: what is known of it, without its value."""
 
@@ -46,6 +62,8 @@ class ParameterInfo(Frozen):
     """Factory setting; a hint."""
     digits: bool
     """Four separate settings, to be read as hexadecimal digits."""
+    digit_meanings: tuple[DigitInfo, ...] = ()
+    """What is known of the digits."""
     power_cycle: bool | None
     """A change takes effect at the next power-on only; null where it is not known."""
     confidence: str | None
@@ -92,11 +110,65 @@ class ParameterReply(CommandReply):
     """What deserves a look."""
 
 
+class DriveFacts(Frozen):
+    """What a drive is, beside its parameters."""
+
+    driver_type: int
+    """8800H; the manual gives R7D-APL and R7D-APH the same word."""
+    software_version: int
+    """8518H."""
+    unit: int = Field(ge=0, le=15)
+    """Its unit number."""
+    gain_switch: int = Field(ge=0, le=15)
+    """Position of the gain rotary switch."""
+    switches: tuple[str, ...]
+    """Function selection switches that are on."""
+
+
 class ParameterDump(CommandReply):
     """All listed parameters of a drive, read one after the other."""
 
     values: tuple[ParameterValue, ...]
     """In the manual's order; those that the drive does not have are left out."""
+    facts: DriveFacts | None = None
+    """What the drive is."""
+
+
+class PlannedWrite(Frozen):
+    """One write of a plan."""
+
+    parameter: str
+    """Which, such as Pn100."""
+    name: str
+    """The manual's name."""
+    memory: Memory
+    """Where it goes."""
+    before: int
+    """What the memory holds now."""
+    value: int
+    """What it is to hold: for Pn000 with the unit number that the drive has."""
+    effective: str
+    """When it takes effect, as far as is known."""
+    digits: tuple[str, ...] = ()
+    """The digits that change, spelled out."""
+
+
+class PlannedParameters(Frozen):
+    """The writes after which a drive would hold certain values."""
+
+    writes: tuple[PlannedWrite, ...]
+    """In the order in which they are to be sent; none when the drive holds the values already."""
+    problems: tuple[str, ...] = ()
+    """Why they must not be sent."""
+    remarks: tuple[str, ...] = ()
+    """What deserves attention."""
+
+
+class ParameterPlan(CommandReply):
+    """What it takes to make a drive hold certain values; nothing has been written."""
+
+    plan: PlannedParameters
+    """The writes, and what speaks against them."""
 
 
 class CounterReply(CommandReply):
@@ -158,6 +230,30 @@ class DriveProfile(CommandReply):
     """All that is not certain."""
 
 
+class MonitorReading(Frozen):
+    """One monitor of a drive, read once."""
+
+    monitor: MonitorName
+    """Which."""
+    title: str
+    """The manual's words."""
+    value: int
+    """The value with its sign; for signals and switches their word."""
+    unit: str
+    """Unit of the value; empty for signals and switches."""
+    high: tuple[str, ...] = ()
+    """Signals whose level is high, switches that are on."""
+    active: tuple[str, ...] | None = None
+    """Signals that are on, by the active levels of the configuration; null for what has no active level."""
+
+
+class MonitorReport(CommandReply):
+    """Monitors of a drive, read one after the other."""
+
+    readings: tuple[MonitorReading, ...]
+    """In the order in which they were asked for; those that the drive does not have are left out."""
+
+
 class ListParameters(AxisCommand[ParameterList]):
     """List what is known of the drive's parameters; asks nothing of the drive."""
 
@@ -190,6 +286,26 @@ class ReadAllParameters(AxisCommand[ParameterDump]):
     needs_lease = False
     capability = Capability.PARAMETERS
     answer_s = SLOW_S
+
+
+class PlanParameters(AxisCommand[ParameterPlan]):
+    """List the writes after which a drive holds certain values, and what speaks against them; changes nothing."""
+
+    verb = Verb.PLAN_PARAMETERS
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+    values: Mapping[str, Annotated[int, Field(ge=0, le=0xFFFF)]]
+    """The wanted words, by number such as Pn100. The unit number in Pn000 is not taken from here."""
+    driver_type: int | None = None
+    """8800H of the drive that the values come from; with another type, or none, there is a problem."""
+    any_type: bool = False
+    """Take values of another or of an unknown type of drive."""
+    memory: Memory | None = None
+    """RAM: for trying out, without what takes effect at power-on; EEPROM: for good; null: for good, and in use at once
+    where that is possible."""
 
 
 class WriteParameter(AxisCommand[ParameterReply]):
@@ -241,13 +357,28 @@ class ReadProfile(AxisCommand[DriveProfile]):
     capability = Capability.PARAMETERS
 
 
+class ReadMonitors(AxisCommand[MonitorReport]):
+    """Read monitors once, published or not."""
+
+    verb = Verb.READ_MONITORS
+    effect = Effect.QUESTION
+    needs_lease = False
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+    monitors: tuple[MonitorName, ...] = Field(default=(), max_length=len(MonitorName))
+    """Which; none stands for all."""
+
+
 COMMANDS: tuple[type[Command[Frozen]], ...] = (
     ListParameters,
     ReadParameter,
     ReadAllParameters,
+    PlanParameters,
     WriteParameter,
     ClearCounter,
     ReadAlarms,
     ReadProfile,
+    ReadMonitors,
 )
 """The commands of this file."""

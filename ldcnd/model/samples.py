@@ -186,6 +186,7 @@ class MonitorName(StrEnum):
     FEEDBACK_COUNTER = "feedback_counter"
     GAIN_SWITCH = "gain_switch"
     FUNCTION_SWITCHES = "function_switches"
+    AUTO_TUNING_RESULT = "auto_tuning_result"
 
 
 class MonitorSample(Sample):
@@ -199,6 +200,8 @@ class MonitorSample(Sample):
     """The manual's words."""
     high: tuple[str, ...] = ()
     """For signals, those whose level is high, whatever that means; for switches, those that are on."""
+    active: tuple[str, ...] | None = None
+    """Signals that are on, by the active levels of the configuration; null for what has no active level."""
 
 
 SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {

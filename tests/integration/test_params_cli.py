@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.cli.params import load_values
+from ldcnd.cli.parameter_file import load_parameters
 from tests.support.process import LDCND, ROOT, daemon
 
 
@@ -31,11 +31,15 @@ async def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path):
         code, differences = await ldcnd("params", "diff", "feed", str(saved), *there)
         refused = await ldcnd("params", "set", "feed", "Pn100", "3000", *there)
         some = tmp_path / "some.toml"
-        some.write_text(f"[parameters]\nPn102 = {load_values(saved)['Pn102']}\n")
-        restored = await ldcnd("params", "restore", "feed", str(some), *there)
+        some.write_text("[parameters]\nPn102 = 56\n")
+        without_type = await ldcnd("params", "restore", "feed", str(some), "--yes", *there)
+        restored = await ldcnd("params", "restore", "feed", str(some), "--yes", "--any-type", *there)
+        cloned = await ldcnd("params", "clone", "feed", "spool", "--dry-run", *there)
 
-    assert load_values(saved)["Pn102"] == 55
-    assert (code, "Pn102  40 in use, 55 stored" in differences) == (1, True)
+    assert load_parameters(saved).values["Pn102"] == 55
+    assert (code, differences) == (0, "")
+    assert (without_type[0], "driver" in without_type[1] or "type" in without_type[1]) == (1, True)
+    assert (cloned[0], "Pn102 EEPROM 40 (0028H) -> 56 (0038H)" in cloned[1]) == (0, True)
     assert (refused[0], "[data_error]" in refused[1]) == (1, True)
-    assert (restored[0], "Pn102  55" in restored[1]) == (0, True)
-    assert '"Pn102": 1' in (tmp_path / "eeprom-writes.json").read_text()
+    assert (restored[0], "read back: the drive holds the values" in restored[1]) == (0, True)
+    assert '"Pn102": 2' in (tmp_path / "eeprom-writes.json").read_text()

@@ -10,11 +10,16 @@ from ldcnd.model.parameters import (
     CounterReply,
     DriveProfile,
     ListParameters,
+    MonitorReading,
+    MonitorReport,
     ParameterDump,
     ParameterList,
+    ParameterPlan,
     ParameterReply,
+    PlanParameters,
     ReadAlarms,
     ReadAllParameters,
+    ReadMonitors,
     ReadParameter,
     ReadProfile,
     WriteParameter,
@@ -44,8 +49,24 @@ class Parameters:
                 value = await access.read(command.parameter, unlisted=command.unlisted)
                 return ParameterReply(command_id=command_id, axis=axis, verb=verb, value=value)
             case ReadAllParameters():
-                values = await access.read_all()
-                return ParameterDump(command_id=command_id, axis=axis, verb=verb, values=values)
+                values, facts = await access.read_all(), await access.facts()
+                return ParameterDump(command_id=command_id, axis=axis, verb=verb, values=values, facts=facts)
+            case PlanParameters():
+                return ParameterPlan(command_id=command_id, axis=axis, verb=verb, plan=await access.plan(command))
+            case ReadMonitors(monitors=names):
+                read = await access.monitors(names)
+                readings = tuple(
+                    MonitorReading(
+                        monitor=each.name,
+                        title=each.title,
+                        value=each.value,
+                        unit=each.unit,
+                        high=each.high,
+                        active=each.active,
+                    )
+                    for each in read
+                )
+                return MonitorReport(command_id=command_id, axis=axis, verb=verb, readings=readings)
             case WriteParameter():
                 done = await access.write(command)
                 return ParameterReply(

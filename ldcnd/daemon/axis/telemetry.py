@@ -149,6 +149,7 @@ class AxisTelemetry:
                 unit=value.unit,
                 title=value.title,
                 high=value.high,
+                active=value.active,
             )
         )
 

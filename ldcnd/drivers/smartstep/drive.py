@@ -123,7 +123,8 @@ class SmartStepAxis(ReadOnlyAxis):
         counts_per_s_per_rpm = self.profile.encoder_counts_per_rev / 60.0
         present = alarm(words[Register.PRESENT_ALARM])
         out = alarm_is_out(self.profile, output_levels(words[OUTPUT_SIGNALS.address]))
-        stops = present.kind is AlarmKind.ALARM or (present.kind is AlarmKind.UNKNOWN and out)
+        # 91 and 92 are titled alarms: whether they stop the motor is what /ALM says (manual 3, alarm and output tables)
+        stops = present.kind is AlarmKind.ALARM or (present.kind is not AlarmKind.NONE and out)
         faults = []
         if present.code != NO_ALARM:
             faults.append(Fault(f"alarm_{present.code:04x}", f"A.{present.code:02X}: {present.text}", stops=stops))

@@ -354,6 +354,7 @@ def _is_near(last: int, raw: int) -> bool:
 
 GAIN_SWITCH = Monitor(Register.GAIN_SWITCH, "", "Gain rotary switch", "")
 FUNCTION_SWITCHES = Monitor(Register.FUNCTION_SWITCHES, "", "Function selection switches", "")
+AUTO_TUNING_RESULT = Monitor(Register.AUTO_TUNING_RESULT, "Fn007", "Auto-tuning result", "%")
 
 WORDS: Mapping[MonitorName, Monitor] = MappingProxyType(
     {
@@ -371,6 +372,7 @@ WORDS: Mapping[MonitorName, Monitor] = MappingProxyType(
         MonitorName.BRAKE_LOAD: BRAKE_LOAD,
         MonitorName.GAIN_SWITCH: GAIN_SWITCH,
         MonitorName.FUNCTION_SWITCHES: FUNCTION_SWITCHES,
+        MonitorName.AUTO_TUNING_RESULT: AUTO_TUNING_RESULT,
     }
 )
 """Monitors of one word."""
@@ -381,15 +383,20 @@ COUNTERS: Mapping[MonitorName, Counter] = MappingProxyType(
 """Monitors of two words that are read by turns."""
 
 
-def word_value(name: MonitorName, word: int) -> MonitorValue:
-    """Return what the word of a monitor says."""
+def word_value(name: MonitorName, word: int, profile: SmartStepProfile) -> MonitorValue:
+    """Return what the word of a monitor says; which level makes a signal active is an assumption of the profile."""
     monitor = WORDS[name]
     bits: IntFlag | None = None
+    active: tuple[str, ...] | None = None
     match name:
         case MonitorName.INPUT_SIGNALS:
-            bits = input_levels(word)
+            bits = inputs = input_levels(word)
+            on = {InputSignal.RUN: run_is_on(profile, inputs), InputSignal.RESET: reset_is_on(profile, inputs)}
+            active = tuple(signal.name or "" for signal in on if on[signal])
         case MonitorName.OUTPUT_SIGNALS:
             bits = output_levels(word)
+            alarm_out = (OutputSignal.ALM,) if alarm_is_out(profile, bits) else ()
+            active = tuple(signal.name or "" for signal in (*alarm_out, *(bits & ~OutputSignal.ALM)))
         case MonitorName.FUNCTION_SWITCHES:
             bits = function_switches(word)
         case MonitorName.GAIN_SWITCH:
@@ -398,7 +405,7 @@ def word_value(name: MonitorName, word: int) -> MonitorValue:
             pass
     if bits is None:
         return MonitorValue(name, monitor.value_of(word), monitor.unit, monitor.title)
-    return MonitorValue(name, int(bits), "", monitor.title, tuple(bit.name or "" for bit in bits))
+    return MonitorValue(name, int(bits), "", monitor.title, tuple(bit.name or "" for bit in bits), active)
 
 
 def counter_value(name: MonitorName, signed: int, *, resolved: bool) -> MonitorValue:

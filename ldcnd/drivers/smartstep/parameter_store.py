@@ -10,12 +10,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.parameter_access import ClearedCounter, ParameterAccess, Written
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import write_eeprom, write_ram
 from ldcnd.drivers.smartstep.ledger import EEPROM_LIFE, WARNING_WRITES, EepromLedger
-from ldcnd.drivers.smartstep.modes import clear_counter
-from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH, Counter, alarm
+from ldcnd.drivers.smartstep.modes import clear_counter, read_counter
+from ldcnd.drivers.smartstep.monitors import COUNTERS as MONITOR_COUNTERS
+from ldcnd.drivers.smartstep.monitors import (
+    HISTORY_LENGTH,
+    WORDS,
+    Counter,
+    CounterQuality,
+    alarm,
+    counter_value,
+    function_switches,
+    gain_switch,
+    word_value,
+)
 from ldcnd.drivers.smartstep.parameters import (
     PARAMETERS,
     PN000,
@@ -24,6 +36,7 @@ from ldcnd.drivers.smartstep.parameters import (
     unit_number,
 )
 from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile, assumption_info
+from ldcnd.drivers.smartstep.transfer import plan_writes
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.errors import (
     AddressRefused,
@@ -41,11 +54,16 @@ from ldcnd.model.parameters import (
     AlarmEntry,
     AssumptionInfo,
     CounterName,
+    DigitInfo,
+    DriveFacts,
     Memory,
     ParameterInfo,
     ParameterValue,
+    PlannedParameters,
+    PlanParameters,
     WriteParameter,
 )
+from ldcnd.model.samples import MonitorName
 
 log = get_logger("smartstep")
 
@@ -282,6 +300,15 @@ def parameter_info(parameter: Parameter) -> ParameterInfo:
         highest=limits.highest if limits else None,
         default=parameter.default.value if parameter.default else None,
         digits=parameter.nibbles,
+        digit_meanings=tuple(
+            DigitInfo(
+                digit=each.place,
+                title=each.title,
+                values={f"{value:X}": text for value, text in each.values.items()},
+                confidence=each.confidence.value,
+            )
+            for each in parameter.digits
+        ),
         power_cycle=parameter.power_cycle.value if parameter.power_cycle else None,
         confidence=facts[0].confidence.value if facts else None,
     )
@@ -329,6 +356,21 @@ class UnitParameters(ParameterAccess):
         """See `ParameterAccess`."""
         return await self._store.read_all()
 
+    async def facts(self) -> DriveFacts:
+        """See `ParameterAccess`."""
+        words = self._words
+        return DriveFacts(
+            driver_type=await words.read(Register.DRIVER_TYPE),
+            software_version=await words.read(Register.SOFTWARE_VERSION),
+            unit=words.unit,
+            gain_switch=gain_switch(await words.read(Register.GAIN_SWITCH)),
+            switches=tuple(each.name or "" for each in function_switches(await words.read(Register.FUNCTION_SWITCHES))),
+        )
+
+    async def plan(self, request: PlanParameters) -> PlannedParameters:
+        """See `ParameterAccess`."""
+        return plan_writes(request, await self._store.read_all(), await self.facts())
+
     async def write(self, request: WriteParameter) -> Written:
         """See `ParameterAccess`."""
         return await self._store.write(request)
@@ -344,6 +386,22 @@ class UnitParameters(ParameterAccess):
         present = _entry(await self._words.read(Register.PRESENT_ALARM))
         history = [_entry(await self._words.read(Register.ALARM_HISTORY + place)) for place in range(HISTORY_LENGTH)]
         return present, tuple(history)
+
+    async def monitors(self, names: tuple[MonitorName, ...]) -> tuple[MonitorValue, ...]:
+        """See `ParameterAccess`."""
+        values = []
+        for name in names or tuple(MonitorName):
+            try:
+                values.append(await self._monitor(name))
+            except AddressRefused:
+                log.info("monitor not there", axis=self._words.axis, monitor=name.value)
+        return tuple(values)
+
+    async def _monitor(self, name: MonitorName) -> MonitorValue:
+        if name in MONITOR_COUNTERS:
+            value = await read_counter(self._words, MONITOR_COUNTERS[name])
+            return counter_value(name, value.signed, resolved=value.quality is CounterQuality.RESOLVED)
+        return word_value(name, await self._words.read(WORDS[name].address), self._profile)
 
     def assumptions(self) -> tuple[AssumptionInfo, ...]:
         """See `ParameterAccess`."""

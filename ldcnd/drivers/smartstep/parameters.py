@@ -5,7 +5,8 @@ a person: the drive enforces its ranges itself (data error), so nothing here ref
 Source: manual 3, "Correspondence of addresses and user parameters for drivers"; 2.2, examples 2 and 6.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_OFFSET
@@ -15,6 +16,7 @@ from ldcnd.errors import ValueOutOfRange
 ValueT = TypeVar("ValueT")
 LONGEST_NUMBER = 3
 """Hexadecimal digits of a parameter number."""
+DIGITS = 4
 UNIT_DIGIT = 2
 """The unit number is Pn000.2: digits count from the right (INFERRED_HIGH)."""
 
@@ -36,6 +38,23 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
+class Digit:
+    """One of the four settings of a parameter that is read as hexadecimal digits.
+
+    Attributes:
+        place: from the right, 0 to 3.
+        title: what it sets.
+        values: what its values mean; empty where it is a number or not known.
+        confidence: where title and values come from.
+    """
+
+    place: int
+    title: str
+    values: Mapping[int, str] = field(default_factory=dict)
+    confidence: Confidence = Confidence.RECOLLECTED
+
+
+@dataclass(frozen=True, slots=True)
 class Parameter:
     """One Pn; a word without sign on the wire.
 
@@ -46,6 +65,7 @@ class Parameter:
         power_cycle: whether a change takes effect only at the next power-on; a RAM write of such a parameter is
             useless.
         nibbles: four separate settings, shown as hexadecimal digits.
+        digits: what is known of them.
     """
 
     number: int
@@ -55,6 +75,7 @@ class Parameter:
     default: Fact[int] | None = None
     power_cycle: Fact[bool] | None = None
     nibbles: bool = False
+    digits: tuple[Digit, ...] = field(default=(), hash=False)
 
     @property
     def label(self) -> str:
@@ -106,6 +127,21 @@ def with_digit(word: int, digit: int, value: int) -> int:
     return word & ~(0xF << 4 * digit) | (value & 0xF) << 4 * digit
 
 
+def digit_texts(parameter: Parameter, word: int) -> tuple[str, ...]:
+    """Return the digits of a word in plain text, from the right; none for a parameter that is a number."""
+    if not parameter.nibbles:
+        return ()
+    known = {each.place: each for each in parameter.digits}
+    texts = []
+    for place in range(DIGITS):
+        digit, value = known.get(place), digit_of(word, place)
+        title = digit.title if digit else "not described"
+        meaning = digit.values.get(value) if digit else None
+        mark = f" [{digit.confidence.value}]" if digit else ""
+        texts.append(f"{parameter.label}.{place} = {value:X}: {title}{f', {meaning}' if meaning else ''}{mark}")
+    return tuple(texts)
+
+
 def unit_number(basic_switch_1: int) -> int:
     """Return the unit number that Pn000 gives the drive at its next power-on."""
     return digit_of(basic_switch_1, UNIT_DIGIT)
@@ -117,8 +153,8 @@ _AT_ONCE = Fact(value=False, confidence=_M)
 _AT_ONCE_RELATED = Fact(value=False, confidence=_X)
 
 
-def _nibbles(number: int, name: str, power_cycle: Fact[bool]) -> Parameter:
-    return Parameter(number, name, power_cycle=power_cycle, nibbles=True)
+def _nibbles(number: int, name: str, *digits: Digit) -> Parameter:
+    return Parameter(number, name, power_cycle=_NEEDS_CYCLE, nibbles=True, digits=digits)
 
 
 def _range(lowest: int, highest: int, confidence: Confidence = _M) -> Fact[Limits]:
@@ -131,8 +167,22 @@ def _default(value: int, confidence: Confidence = _M) -> Fact[int]:
 
 _TIME = Fact("0.01 ms", _M)
 
-PN000 = _nibbles(0x000, "Basic switch 1", _NEEDS_CYCLE)
-PN001 = _nibbles(0x001, "Basic switch 2", _NEEDS_CYCLE)
+PN000 = _nibbles(
+    0x000,
+    "Basic switch 1",
+    Digit(0, "rotation direction", {0: "counter-clockwise is forward", 1: "clockwise is forward"}, _X),
+    Digit(1, "control mode on related drives", confidence=_X),
+    Digit(UNIT_DIGIT, "unit number", confidence=Confidence.STATED),
+)
+PN001 = _nibbles(
+    0x001,
+    "Basic switch 2",
+    Digit(
+        0,
+        "stop at servo off or alarm",
+        {0: "dynamic brake", 1: "dynamic brake, then released", 2: "coasting"},
+    ),
+)
 # The manual's example 6 states the upper end, related drives the lower one.
 PN100 = Parameter(0x100, "Speed loop gain", Fact("Hz", _X), _range(1, 2000, _X), _default(80), _AT_ONCE)
 PN101 = Parameter(
@@ -147,8 +197,33 @@ PN102 = Parameter(0x102, "Position loop gain", Fact("1/s", _X), _range(1, 2000),
 PN103 = Parameter(0x103, "Inertia rate", Fact("%", _X), _range(0, 10000, _X), _default(300), _AT_ONCE)
 PN109 = Parameter(0x109, "Feed forward amount", Fact("%", _M), _range(0, 100), _default(0), _AT_ONCE)
 PN10A = Parameter(0x10A, "Feed forward reference filter", _TIME, _range(0, 6400), _default(0), _AT_ONCE)
-PN110 = _nibbles(0x110, "Online auto-tuning setting", _NEEDS_CYCLE)
-PN200 = _nibbles(0x200, "Position control setting 1", _NEEDS_CYCLE)
+PN110 = _nibbles(
+    0x110,
+    "Online auto-tuning setting",
+    Digit(0, "online auto-tuning", {0: "after power-on only", 1: "always", 2: "never"}),
+    Digit(1, "speed feedback compensation", {0: "on", 1: "off"}),
+    Digit(2, "friction compensation", {0: "off", 1: "small", 2: "large"}),
+)
+PN200 = _nibbles(
+    0x200,
+    "Position control setting 1",
+    Digit(
+        0,
+        "command pulse form",
+        {
+            0: "pulse and direction, positive",
+            1: "forward and reverse pulses, positive",
+            2: "phase difference x1",
+            3: "phase difference x2",
+            4: "phase difference x4",
+            5: "pulse and direction, negative",
+            6: "forward and reverse pulses, negative",
+        },
+    ),
+    Digit(1, "deviation counter reset", {0: "high level", 1: "rising edge", 2: "low level", 3: "falling edge"}),
+    Digit(2, "deviation counter at alarm and servo off", {0: "reset", 1: "kept", 2: "reset at alarm only"}),
+    Digit(3, "command pulse filter", {0: "for line drivers", 1: "for open collectors"}),
+)
 PN202 = Parameter(0x202, "Electronic gear ratio G1 (numerator)", None, _range(1, 65535), _default(4), _NEEDS_CYCLE)
 PN203 = Parameter(0x203, "Electronic gear ratio G2 (denominator)", None, _range(1, 65535), _default(1), _NEEDS_CYCLE)
 PN204 = Parameter(
@@ -159,7 +234,11 @@ PN204 = Parameter(
     _default(0),
     _AT_ONCE,
 )
-PN207 = _nibbles(0x207, "Position control setting 2", _NEEDS_CYCLE)
+PN207 = _nibbles(
+    0x207,
+    "Position control setting 2",
+    Digit(0, "position reference filter", {0: "primary (Pn204)", 1: "linear (Pn208)"}),
+)
 PN208 = Parameter(
     0x208,
     "Position reference filter time constant 2 (linear acceleration/deceleration)",

@@ -240,7 +240,7 @@ class UnitPoller(Poller[int | Refusal]):
     def _finish(self, item: Item, timing: Timing) -> None:
         self._abandon()
         if isinstance(item, MonitorName):
-            self._listeners.monitored(word_value(item, self._words[WORDS[item].address]), timing)
+            self._listeners.monitored(word_value(item, self._words[WORDS[item].address], self._profile), timing)
         elif item is Basic.IDENTITY:
             self._listeners.identified(*(self._words[address] for address in BASIC_WORDS[Basic.IDENTITY]))
         else:

@@ -428,7 +428,7 @@ class ArmedSmartStep(ArmedTrace):
         try:
             async with asyncio.timeout(self._limit_s):
                 while True:
-                    if self._loop.time() >= compared_at_s + spacing_s:
+                    if self._loop.time() >= compared_at_s + spacing_s and not self._is_over():
                         compared_at_s = self._loop.time()
                         await self._compare()
                     asked_at_s = self._loop.time()
@@ -446,6 +446,11 @@ class ArmedSmartStep(ArmedTrace):
             raise TraceTimedOut(
                 f"axis {words.axis}: {waited} within {math.ceil(self._limit_s)} s", axis=words.axis
             ) from None
+
+    def _is_over(self) -> bool:
+        """Tell whether the points have been taken, where that can be foreseen: then a monitor shows what came after."""
+        ends_at_s = self._execution.sent_s + POINTS * self._setup.interval_s
+        return self._setup.trigger is None and self._loop.time() >= ends_at_s
 
     def _pause_s(self) -> float:
         """Return the time to the next look: short around the end, where it can be foreseen."""
