@@ -5,7 +5,16 @@ import pytest
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, SMARTSTEP, Assumption, SmartStepProfile, Verification
 from ldcnd.errors import ConfigError
 
-WITHOUT_SWITCH = {"unit_digit", "switches_rule", "untriggered_start", "alarm_history_order"}
+WITHOUT_SWITCH = {
+    "unit_digit",
+    "switches_rule",
+    "untriggered_start",
+    "alarm_history_order",
+    "alarm_91_92",
+    "atomic_counter",
+    "eeprom_changes_ram",
+    "trace_full_scale",
+}
 
 
 def test_every_assumption_starts_unverified_under_its_own_key():

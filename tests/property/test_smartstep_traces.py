@@ -1,0 +1,135 @@
+"""Traces of drives that behave in every way the manual leaves open: what is published as good is right."""
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ldcnd.drivers.smartstep.parameters import PN202, PN203
+from ldcnd.drivers.smartstep.profiles import (
+    ByteOrder,
+    CommandPulseGear,
+    SmartStepProfile,
+    StringChecksum,
+    TraceWordLayout,
+)
+from ldcnd.drivers.smartstep.trace_check import Samples, Shown, comparisons, judge
+from ldcnd.drivers.smartstep.trace_data import (
+    DataObject,
+    IoObject,
+    TraceConstants,
+    TracePoint,
+    decode_word,
+    encode_word,
+    scale,
+)
+from ldcnd.drivers.smartstep.trace_result import DATA, SIGNALS, assign
+from ldcnd.errors import BadReply
+from ldcnd.model.traces import TakeTrace
+from ldcnd.sim.smartstep.variant import SimulatedVariant
+from tests.support.smartstep_line import simulated, smartstep_line
+
+LAYOUTS = [TraceWordLayout.MSB_IO, TraceWordLayout.LSB_IO_SHIFT, TraceWordLayout.LSB_IO_MASK]
+CHECKSUMS = [StringChecksum.HEADER, StringChecksum.ALL, StringChecksum.TRAILER]
+
+
+def swapped(word: int) -> int:
+    return (word >> 8 | word << 8) & 0xFFFF
+
+
+@given(
+    layout=st.sampled_from(LAYOUTS),
+    order=st.sampled_from(list(ByteOrder)),
+    gear=st.sampled_from(list(CommandPulseGear)),
+    numerator=st.integers(1, 8),
+    channel=st.sampled_from(list(DATA)),
+    signal=st.sampled_from(list(SIGNALS)),
+    level=st.booleans(),
+    start=st.integers(-6000, 6000),
+    step=st.integers(-20, 20),
+    shown_at=st.lists(st.integers(10, 480), max_size=6),
+)
+@settings(max_examples=100, deadline=None)
+def test_what_a_trace_publishes_as_good_is_right(  # noqa: PLR0917 - one argument for each thing that varies
+    layout, order, gear, numerator, channel, signal, level, start, step, shown_at
+):
+    constants = TraceConstants(250, 300, 4500, numerator, 1)
+    assumed = SmartStepProfile()
+    drive = SmartStepProfile(trace_word_layout=layout, trace_byte_order=order, command_pulse_gear=gear)
+    assignment = assign("u1", (channel, signal))
+    kept = ~1 if layout is TraceWordLayout.LSB_IO_MASK else ~0
+    counts = [max(-12_000, min(12_000, start + step * place)) & kept for place in range(500)]
+    words = [encode_word(TracePoint(count, level), layout) for count in counts]
+    split = tuple(word if order is assumed.trace_byte_order else swapped(word) for word in words)
+    truth = scale(drive, constants, DATA[channel])
+    value, bit = comparisons(assignment)
+    shown = []
+    for place in shown_at:
+        at_s = place * 0.004
+        shown.append(Shown(value, float(round(counts[place] * truth)), at_s - 0.02, at_s + 0.02))
+        shown.append(Shown(bit, float(level), at_s - 0.02, at_s + 0.02))
+
+    judgement = judge(assumed, constants, assignment, Samples((split,), 0.004, 0.0, 0.004), shown)
+
+    if not judgement.problems:
+        published = [scale(assumed, constants, DATA[channel]) * read for read in decoded(assumed, split)]
+        assert published == [count * truth for count in counts]
+        assert {bool(point) for point in bits(assumed, split)} == {level}
+
+
+def decoded(profile: SmartStepProfile, words: tuple[int, ...]) -> list[int]:
+    return [decode_word(word, profile.trace_word_layout).value for word in words]
+
+
+def bits(profile: SmartStepProfile, words: tuple[int, ...]) -> list[bool | None]:
+    return [decode_word(word, profile.trace_word_layout).io for word in words]
+
+
+@given(
+    layout=st.sampled_from(LAYOUTS),
+    order=st.sampled_from(list(ByteOrder)),
+    checksum=st.sampled_from(CHECKSUMS),
+    gear=st.sampled_from(list(CommandPulseGear)),
+    pulses=st.integers(-6000, 6000),
+    run=st.booleans(),
+    channels=st.sampled_from(
+        [("speed_feedback", "bkir"), ("command_pulse_speed",), ("torque_reference", "position_deviation", "run")]
+    ),
+)
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+async def test_a_trace_over_the_line_is_right_or_marked(layout, order, checksum, gear, pulses, run, channels):
+    variant = SimulatedVariant(
+        trace_word_layout=layout, trace_byte_order=order, string_checksum=checksum, command_pulse_gear=gear
+    )
+    unit = simulated(1, variant, {PN202: 4, PN203: 1})
+    unit.drive.set_run(0.0, on=run)
+    unit.drive.set_pulse_rate(float(pulses), 0.0)
+    recorded_points: list[TracePoint] = []
+    sample = unit.drive._trace_point
+
+    def witness(data: DataObject, io: IoObject) -> TracePoint:
+        point = sample(data, io)
+        recorded_points.append(point)
+        return point
+
+    unit.drive._trace_point = witness
+    async with smartstep_line([unit], profile=SmartStepProfile(trace_chunk_bytes=1000)) as line:
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=channels, interval_s=0.004))
+        try:
+            result = await armed.record(lambda _phase: None)
+        except BadReply:
+            return
+
+    if result.problems:
+        return
+    truth = SmartStepProfile(trace_word_layout=layout, command_pulse_gear=gear)
+    constants = TraceConstants(250, 300, 4500, 4, 1)
+    for column, name in zip(result.values, channels, strict=True):
+        memory = assign("u1", channels).memory(name)
+        points = recorded_points[memory::2]
+        if name in DATA:
+            kept = ~1 if layout is TraceWordLayout.LSB_IO_MASK else ~0
+            factor = scale(truth, constants, DATA[name])
+            assert all(
+                abs(value - (point.value & kept) * factor) <= 1e-6 for value, point in zip(column, points, strict=True)
+            )
+        else:
+            assert list(column) == [float(point.io) for point in points]

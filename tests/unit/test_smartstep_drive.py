@@ -1,0 +1,49 @@
+"""One drive as the daemon sees it: what its words say together, and its monitors read once."""
+
+import pytest
+
+from ldcnd.drivers.smartstep.monitors import CounterValue
+from ldcnd.drivers.smartstep.poller import UnitWords
+from ldcnd.model.samples import MonitorName
+from tests.support.smartstep_line import simulated, smartstep_line
+
+PRESENT_ALARM, INPUTS, OUTPUTS, SPEED = 0x850A, 0x8005, 0x8006, 0x8000
+
+
+def words(alarm: int, outputs: int) -> UnitWords:
+    return UnitWords({PRESENT_ALARM: alarm, INPUTS: 0x0010, OUTPUTS: outputs, SPEED: 0}, CounterValue(0))
+
+
+@pytest.mark.parametrize("code", [0x0091, 0x0092])
+async def test_a_warning_with_an_active_alarm_output_stops(code):
+    async with smartstep_line([simulated(1)]) as line:
+        axis = line.axis("u1")
+
+        assert axis.interpret(words(code, outputs=0)).enabled
+        assert not axis.interpret(words(code, outputs=1)).enabled
+        assert axis.interpret(words(code, outputs=1)).faults[0].stops
+
+
+async def test_any_monitor_is_read_once_the_auto_tuning_result_too():
+    drive = simulated(1)
+    drive.drive.set_run(0.0, on=True)
+    async with smartstep_line([drive]) as line:
+        access = line.axis("u1").parameters
+        everything = {value.name: value for value in await access.monitors(())}
+        one = await access.monitors((MonitorName.AUTO_TUNING_RESULT,))
+
+    assert set(everything) == set(MonitorName)
+    assert [(value.value, value.unit, value.title) for value in one] == [(100, "%", "Auto-tuning result")]
+
+
+async def test_a_signal_is_active_by_the_level_of_the_profile_and_not_by_being_high():
+    drive = simulated(1)
+    drive.drive.set_run(0.0, on=True)
+    async with smartstep_line([drive]) as line:
+        inputs, outputs = await line.axis("u1").parameters.monitors(
+            (MonitorName.INPUT_SIGNALS, MonitorName.OUTPUT_SIGNALS)
+        )
+
+    assert (inputs.high, inputs.active) == (("RESET",), ("RUN",))
+    assert "ALM" not in outputs.active
+    assert "BKIR" in outputs.active
