@@ -371,7 +371,11 @@ class Home(AxisCommand[CommandReply]):
     method: HomeMethod | None = None
     """What marks the reference position."""
     velocity: float | None = None
-    """Search velocity in units a second, positive forward, not 0."""
+    """Search velocity in units a second, positive forward, not 0. On the index at most 0.75 of an index width in a \
+servo cycle: a faster search is refused with the nearest velocity."""
+    find_velocity: float | None = Field(default=None, gt=0)
+    """Speed at which a limit switch is found first, in units a second; the axis then moves off it and comes back at \
+`velocity` to take the reference over. A missing one, and any other method, searches at `velocity` alone."""
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared."""
     position: float | None = None

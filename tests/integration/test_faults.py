@@ -193,7 +193,7 @@ async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_ax
         await rig.send(Power(on=True))
         with pytest.raises(NotReferenced):
             await rig.send(FAR)
-        homed = await rig.done(Home(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
+        homed = await rig.done(Home(method=HomeMethod.INDEX, velocity=1.4, stop=HomeStop.SMOOTH))
 
         assert not state.referenced
         assert refusal.value.remedy == "send reset first"
@@ -235,7 +235,7 @@ async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dia
         await rig.until(lambda state: state.command is None)
         await rig.send(Power(on=True))
 
-        homed = await rig.done(Home(method=HomeMethod.INDEX, velocity=2.0, stop=HomeStop.SMOOTH))
+        homed = await rig.done(Home(method=HomeMethod.INDEX, velocity=1.4, stop=HomeStop.SMOOTH))
 
         assert (homed.referenced, homed.last_error) == (True, None)
         assert not (await rig.until_fault(lambda faults: not faults.active)).active

@@ -1,15 +1,26 @@
 """Axes that start in one servo cycle, stop by one packet and show one instant."""
 
 import asyncio
+import contextlib
 
 import pytest
 
 from ldcnd.config.rig import load_config
 from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
+from ldcnd.drivers.ldcn.commands import spaced
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.line import GroupSpec, LineSpec, StartPolicy
-from ldcnd.errors import ConfigError, DriveFault, NotSupported, OutcomeUnknown, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.errors import (
+    BusError,
+    ConfigError,
+    DriveFault,
+    NotSupported,
+    OutcomeUnknown,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+)
 from ldcnd.model.commands import HomeMethod, MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
@@ -57,6 +68,57 @@ async def test_members_start_with_one_packet_and_nobody_else_does(line_spec):
     assert [drive(chain, address).loop.position for address in (1, 4)] == [0, 0]
     assert abs(drive(chain, 2).loop.position - 20_000) <= 1
     assert abs(drive(chain, 3).loop.position + 20_000) <= 1
+
+
+def is_leader(packet):
+    return packet.command is Command.SET_ADDRESS and not packet.data[1] & 0x80
+
+
+async def test_set_baud_goes_to_groups_while_they_have_no_leader():
+    async with bare_network(chain_of(), AXES, line=LED_PAIR) as line:
+        await up(line, power=False)
+        sent = line.sent()
+
+    rate_changes = [at for at, packet in enumerate(sent) if packet.command is Command.SET_BAUD_RATE]
+    leaders = [at for at, packet in enumerate(sent) if is_leader(packet)]
+    assert len(rate_changes) >= 2
+    assert leaders
+    assert min(leaders) > max(rate_changes)
+
+
+async def test_a_leader_is_none_while_a_line_changes_its_rate_to_bring_a_drive_back():
+    chain = chain_of()
+    async with bare_network(chain, AXES, line=LED_PAIR) as line:
+        await up(line, power=False)
+        now_s = asyncio.get_running_loop().time()
+        chain.modules[3].power(on=False, at_s=now_s)
+        chain.modules[3].power(on=True, at_s=now_s)
+        before = len(line.sent())
+        for _ in range(3):
+            with contextlib.suppress(BusError):
+                await line.network.axes["a4"].stop(StopMode.OFF)
+        await line.network.rejoin(lambda _: None)
+        sent = line.sent(before)
+
+    steps = [
+        "leads" if is_leader(packet) else "member" if packet.command is Command.SET_ADDRESS else "rate"
+        for packet in sent
+        if packet.command in (Command.SET_ADDRESS, Command.SET_BAUD_RATE)
+        and (packet.command is Command.SET_BAUD_RATE or packet.address == 3)
+    ]
+    assert (steps[0], steps[-1]) == ("member", "leads")
+    assert "leads" not in steps[:-1]
+
+
+@pytest.mark.parametrize("baud", [9600, 19_200, 115_200, 230_400])
+def test_group_packets_are_a_servo_cycle_apart_on_the_wire(baud):
+    byte_s = 10 / baud
+
+    piece = spaced([b"first", b"second"], byte_s)
+
+    gap = piece.removeprefix(b"first").removesuffix(b"second")
+    assert set(gap) == {0}
+    assert len(gap) * byte_s >= 0.51e-3
 
 
 async def test_the_whole_line_is_a_group_when_none_is_configured():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drivers.ldcn.controls import HomingControl
-from ldcnd.errors import BusError, MalformedRequest, NotSupported, PositionLimit
+from ldcnd.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
 from ldcnd.model.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
@@ -198,6 +198,55 @@ async def test_the_axis_is_homing_from_the_first_leg_to_the_last():
                     seen.append((await anext(states))[1].state)
 
     assert set(seen[seen.index(AxisState.HOMING) : -1]) == {AxisState.HOMING}
+
+
+@named((V4, SC, LS_182AP))
+@pytest.mark.parametrize(("velocity", "nearest"), [(20.0, 1.464843), (-2.0, -1.464843)])
+async def test_a_search_that_the_index_pulse_can_slip_through_is_refused_with_the_nearest_velocity(
+    dialect, velocity, nearest
+):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+
+        with pytest.raises(VelocityLimit, match="can miss an index pulse of 1 counts") as refusal:
+            await rig.send(Home(method="index", velocity=velocity))
+
+        assert refusal.value.nearest == pytest.approx(nearest, abs=1e-5)
+        assert rig.position_mm == 0.0
+
+
+@pytest.mark.parametrize("index_at_counts", [700, 701, 702, 703, 704])
+async def test_at_the_nearest_velocity_no_index_pulse_is_missed(index_at_counts):
+    narrow = replace(PLANT, index_width_counts=1, index_at_counts=index_at_counts)
+    async with dialect_rig(LS_182AP, narrow) as rig:
+        await rig.power_on()
+
+        state = await rig.done(Home(method="index", velocity=1.4648, position=0.0))
+
+        assert (state.referenced, state.last_error) == (True, None)
+        assert await offset(rig) == pytest.approx(-index_at_counts / 1000, abs=0.004)
+
+
+async def test_a_wider_index_pulse_may_be_searched_for_faster():
+    home = {"method": "index", "velocity": 20.0, "index_width": 40}
+    async with dialect_rig(LS_182AP, WIDE_INDEX, home=home) as rig:
+        await rig.power_on()
+
+        assert (await rig.done(Home())).referenced
+
+
+@named((V1, V4, LS_182AP))
+async def test_a_switch_is_found_fast_and_taken_over_slowly(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        began_s = asyncio.get_running_loop().time()
+
+        state = await rig.done(Home(method="forward_limit", velocity=0.5, find_velocity=10.0, position=100.0))
+        took_s = asyncio.get_running_loop().time() - began_s
+
+        assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
+        assert await offset(rig) == pytest.approx(80.0, abs=0.002)
+        assert took_s < 20.0 / 0.5 / 2
 
 
 async def test_a_search_ends_at_its_distance():

@@ -12,7 +12,7 @@ from ldcnd.errors import (
     TooManyRequests,
     ValueOutOfRange,
 )
-from ldcnd.model.commands import Track
+from ldcnd.model.commands import SetGains, Track
 from ldcnd.model.samples import AxisState
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from tests.support.dialect_rig import (
@@ -70,6 +70,17 @@ async def test_a_set_point_too_far_from_the_last_one_is_refused():
 
         assert refusal.value.nearest == pytest.approx(1.0)
         assert (await rig.rig.client.state(AXIS)).command.verb == "track"
+
+
+async def test_a_position_error_limit_below_the_step_is_refused():
+    async with dialect_rig(LS_182AP, tracking={"step": 0.5, "rate": 50}) as rig:
+        await rig.power_on()
+
+        with pytest.raises(ValueOutOfRange, match="is not above a tracking step of 500 counts") as refusal:
+            await rig.send(SetGains(el=500))
+
+        assert refusal.value.nearest == 501
+        await rig.send(SetGains(el=501))
 
 
 async def test_set_points_faster_than_the_rate_are_refused():

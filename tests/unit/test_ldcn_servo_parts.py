@@ -128,6 +128,19 @@ def test_the_three_kinds_of_motion_are_three_trajectories():
     )
 
 
+@pytest.mark.parametrize(
+    ("profile", "most"), [(PIC_SERVO_V4, 500_000), (LS_182AP, 2_000_000), (PIC_SERVO_SC, 2_500_000)]
+)
+def test_a_speed_at_which_the_encoder_would_lose_counts_is_refused(profile, most):
+    assert quantised(Motion(None, float(most), 1e6), 1, profile).velocity_counts_per_s == pytest.approx(most)
+    for refused in (Motion(0, most * 1.001, 1e6), Motion(None, -most * 1.001, 1e6)):
+        with pytest.raises(ValueOutOfRange) as refusal:
+            quantised(refused, 1, profile)
+        assert abs(refusal.value.nearest) == most
+        with pytest.raises(ValueOutOfRange):
+            trajectory_of(refused, 1, profile)
+
+
 def test_an_analog_motion_needs_absolute_positioning():
     with pytest.raises(NotSupported):
         trajectory_of(AnalogMotion(100, 1000.0, 1000.0), 1, PIC_SERVO_V4)

@@ -1,5 +1,7 @@
 """What each command does to one axis: check, plan, talk to the drive, tell the tracker."""
 
+import math
+
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
@@ -10,7 +12,15 @@ from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, Gains, StopMode
-from ldcnd.errors import DriveFault, NotSupported, OutcomeUnknown, RequestRefused, StopLatched, WrongState
+from ldcnd.errors import (
+    DriveFault,
+    NotSupported,
+    OutcomeUnknown,
+    RequestRefused,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+)
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import (
     AxisCommand,
@@ -338,9 +348,30 @@ class AxisCommands:
         changed = Gains(**{name: asked.get(name, getattr(gains, name)) for name in Gains.__slots__})
         if changed.sr != gains.sr:
             guards.check_stands(view)
+        self._check_tracking_step(changed)
         await turn.permit.set_gains(changed)
         self._gains = changed
         return self._motion.reply(turn)
+
+    def _check_tracking_step(self, gains: Gains) -> None:
+        """Refuse a position error limit that the next set-point of `track` could exceed.
+
+        Raises:
+            ValueOutOfRange: names the lowest `el`.
+        """
+        config = self._motion.config
+        if config.tracking is None:
+            return
+        step_counts = math.ceil(config.tracking.step * self._motion.scale.counts_per_unit)
+        if gains.el <= step_counts:
+            raise ValueOutOfRange(
+                f"axis {config.name}: el {gains.el} is not above a tracking step of {step_counts} counts",
+                axis=config.name,
+                value=gains.el,
+                limit=step_counts,
+                nearest=step_counts + 1,
+                remedy="configure a shorter tracking step",
+            )
 
     async def _set_outputs(self, turn: Turn, request: SetOutputs) -> CommandReply:
         guards.check_reachable(self._tracker.view())

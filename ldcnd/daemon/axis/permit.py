@@ -59,6 +59,8 @@ class QuietDrive(Protocol):
     adc_full_scale: int | None
     home_methods: frozenset[HomeMethod]
 
+    @property
+    def index_sample_s(self) -> float: ...  # noqa: D102 - of `AxisDriver`, as all of these
     def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `AxisDriver`, as all of these
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
     async def stop(self, mode: StopMode) -> None: ...  # noqa: D102

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node, unanswered
+from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes
 from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
@@ -155,6 +155,11 @@ class GroupPlan:
         leader = self.place(address).leader
         return leader is not None and self._axes.get(address) == leader
 
+    @property
+    def leaders(self) -> tuple[int, ...]:
+        """Return the addresses of the modules that answer for their groups."""
+        return tuple(address for address in self._axes if self.leads(address))
+
     def exactly(self, names: frozenset[str]) -> Group | None:
         """Return the group with exactly these members: a command to it concerns nobody else."""
         return next((group for group in self.groups if group.members == names), None)
@@ -175,7 +180,6 @@ EVERYBODY = 0xFF
 NULLS = bytes(16)
 """Fill up any half-received command buffer (PIC-SERVO manual, 4.1)."""
 NULLS_SETTLE_S = 0.001
-LEADER_REPLY_BYTES = 2
 
 
 def nulls(quiet_s: float) -> Exchange[None]:
@@ -223,16 +227,17 @@ class LineRate:
     async def everybody_to(self, baud: int) -> None:
         """Move all modules that hear us, and the host; allowed while motors move.
 
-        A group's leader answers at the new rate, which the host does not hear: it waits that reply out.
+        Only groups without a leader take Set Baud Rate (LS-182AP manual, "Addressing": "must be sent only as a group
+        command with no group leader"): `Addressing.without_leaders` sees to that beforehand.
         """
         if self._bus.baud == baud:
             return
         profile = PIC_SERVO_SC if baud == FASTEST_BAUD else None
-        burst = b"".join(
+        packets = [
             commands.set_baud(commands.Group(address, profile), baud, self._codes).request for address in self.groups
-        )
-        quiet_s = SERVO_CYCLE_S + LEADER_REPLY_BYTES * self._bus.settings.bits_per_byte / min(baud, self._bus.baud)
-        await self._bus.change_baud(unanswered(EVERYBODY, burst, quiet_s, repeatable=False), baud)
+        ]
+        burst = spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
+        await self._bus.change_baud(unanswered(EVERYBODY, burst, SERVO_CYCLE_S, repeatable=False), baud)
 
     async def who_is(self, address: int, *, patient: bool = False) -> Identity | None:
         """Ask an address who it is at the host's rate; None when nobody answers.
@@ -292,6 +297,7 @@ class Addressing:
         """
         for baud in self._rate.candidates:
             if baud != RESET_BAUD and await self._rate.host_to(baud):
+                await self.without_leaders()
                 await self._rate.everybody_to(RESET_BAUD)
         for baud in self._rate.candidates:
             await self._reset_at(baud, commands.RESET_SETTLE_S if baud == RESET_BAUD else NULLS_SETTLE_S)
@@ -300,7 +306,8 @@ class Addressing:
     async def _reset_at(self, baud: int, settle_s: float) -> None:
         if not await self._rate.host_to(baud):
             return
-        burst = b"".join(commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses)
+        packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
+        burst = spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
         for _ in range(2):
             await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
 
@@ -321,7 +328,7 @@ class Addressing:
         return modules
 
     async def address_next(self, address: int) -> bool:
-        """Address the module that is at 0 now; tell whether there was one.
+        """Address the module that is at 0 now, as a member of its group; tell whether there was one.
 
         A lost reply leaves open whether the module took the address: then it answers there.
         """
@@ -346,15 +353,24 @@ class Addressing:
         """
         node = Node(address, ANY_DIALECT)
         for _ in range(ADDRESSING_ATTEMPTS):
-            if await self._set_address(node, address):
+            if await self._set_address(node, address, leader=self._plan.leads(address)):
                 return True
             if not await self._rate.who_is(address, patient=True):
                 return False
         return False
 
-    async def _set_address(self, node: Node, address: int) -> bool:
-        group = self._plan.place(address).address
-        packet = commands.set_address(node, address, group, leader=self._plan.leads(address))
+    async def without_leaders(self) -> None:
+        """Make leaders members, so that their groups take Set Baud Rate; those that do not answer are left."""
+        for address in self._plan.leaders:
+            await self._set_address(Node(address, ANY_DIALECT), address)
+
+    async def with_leaders(self) -> None:
+        """Make leaders lead, once all modules are at the rate where they stay."""
+        for address in self._plan.leaders:
+            await self.regroup(address)
+
+    async def _set_address(self, node: Node, address: int, *, leader: bool = False) -> bool:
+        packet = commands.set_address(node, address, self._plan.place(address).address, leader=leader)
         try:
             await self._bus.execute(packet)
         except (OutcomeUnknown, BadReply, PacketRejected):

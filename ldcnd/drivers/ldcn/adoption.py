@@ -258,14 +258,19 @@ class Rejoin:
     async def _at_reset_baud(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
         """Address newcomers at the rate of power-up; everybody who hears is at the working rate again afterwards."""
         self._suspect(each.address for each in self._expected)
+        await self._addressing.without_leaders()
         await self._rate.everybody_to(RESET_BAUD)
         try:
             await self._address_newcomers(lost, addressing)
         except LdcndError:
             if self._bus.is_open:
-                await self._rate.everybody_to(self._rate.working)
+                await self._back_to_work()
             raise
+        await self._back_to_work()
+
+    async def _back_to_work(self) -> None:
         await self._rate.everybody_to(self._rate.working)
+        await self._addressing.with_leaders()
 
     async def _address_newcomers(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
         """Give the module at address 0 the first address that is missing, as long as there is one."""
@@ -281,6 +286,9 @@ class Rejoin:
                 self._foreign = found
                 break
             log.info("newcomer", bus=self._bus.settings.name, address=each.address, identity=str(found))
+            if each.profile.sc_extensions:
+                # saved settings may energise its motor as it gets an address, but not after a reset by command
+                await self._bus.execute(commands.hard_reset(Node(UNADDRESSED, each.profile)))
             addressing(each.address)
             if not await self._addressing.address_next(each.address):
                 break

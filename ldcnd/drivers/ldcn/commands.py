@@ -7,6 +7,7 @@ Sources: LS-182AP manual, "Addressing", "Command Description"; PIC-SERVO manual,
 data sheets.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -144,6 +145,17 @@ def unanswered(address: int, request: bytes, quiet_s: float, *, repeatable: bool
         response_s=quiet_s,
         repeatable=repeatable,
     )
+
+
+def spaced(packets: Sequence[bytes], byte_s: float) -> bytes:
+    """Return group packets as one piece in which each is executed before the next one comes.
+
+    "The host should wait for at least 0.51 milliseconds before sending another command to keep from overwriting the
+    previous command" (PIC-SERVO manual, 4.1). Nulls fill the time: outside a packet modules skip them, and they keep
+    the distance whatever an adapter does to the piece as a whole.
+    """
+    gap = bytes(math.ceil(SERVO_CYCLE_S / byte_s))
+    return gap.join(packets)
 
 
 def _unexpected(_data: bytes) -> ReplyVerdict:

@@ -13,7 +13,7 @@ from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
-from ldcnd.drivers.ldcn.commands import Node, unanswered
+from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
@@ -55,8 +55,8 @@ class Groups:
         if not groups:
             return
         control = STOP_CONTROLS[mode]
-        burst = b"".join(commands.stop_motor(commands.Group(group.address), control).request for group in groups)
-        stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True)
+        packets = [commands.stop_motor(commands.Group(group.address), control).request for group in groups]
+        stop = unanswered(groups[0].address, self._spaced(packets), self._quiet_s(groups), repeatable=True)
         try:
             await self._bus.execute(stop, Lane.STOP)
         finally:
@@ -117,8 +117,8 @@ class Groups:
             raise WrongState(f"axis {homing[0]} is homing: its home register is in use", axis=homing[0])
         await self._prove()
         before = {name: await self._frozen(name) for name in self._drives}
-        burst = b"".join(commands.save_home(commands.Group(group.address)).request for group in groups)
-        await self._bus.execute(unanswered(EVERYBODY, burst, self._quiet_s(groups), repeatable=False))
+        packets = [commands.save_home(commands.Group(group.address)).request for group in groups]
+        await self._bus.execute(unanswered(EVERYBODY, self._spaced(packets), self._quiet_s(groups), repeatable=False))
         positions = {}
         for name in self._drives:
             status = await self._frozen(name)
@@ -137,6 +137,9 @@ class Groups:
         """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which nobody reads."""
         leaders = sum(group.leader is not None for group in groups)
         return SERVO_CYCLE_S + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
+
+    def _spaced(self, packets: list[bytes]) -> bytes:
+        return spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
 
     async def _prove(self) -> None:
         """Tell every drive its group again, unless it was this daemon that did."""

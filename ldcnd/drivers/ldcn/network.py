@@ -191,9 +191,11 @@ class LdcnNetwork(Network):
             modules, remarks = await self._address_afresh()
             deaf = await self._change_rate(modules)
             if deaf is None:
+                await self._addressing.with_leaders()
                 return modules, remarks
         modules, remarks = await self._address_afresh()
         self._rate.working = RESET_BAUD
+        await self._addressing.with_leaders()
         told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {RESET_BAUD}"
         return modules, (*remarks, told)
 

@@ -32,7 +32,7 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
 from ldcnd.drivers.ldcn.faults import DriveState, FaultCode, sensor_lost
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
-from ldcnd.drivers.ldcn.registers import LIMIT_PINS, Gains, RegisterBook, gain_values
+from ldcnd.drivers.ldcn.registers import LIMIT_PINS, SERVO_CYCLE_S, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
@@ -154,6 +154,11 @@ class LdcnAxis(AxisDriver):
         if self._gains:
             self.state.servo_divisor = self._gains.sr
         self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
+
+    @property
+    def index_sample_s(self) -> float:  # type: ignore[override]
+        """One servo cycle (LS-182AP manual, "Encoder Input")."""
+        return SERVO_CYCLE_S * (self.state.servo_divisor if self.profile.divisor_slows_profile else 1)
 
     def registers(self) -> tuple[Register, ...]:
         """See `AxisDriver`."""

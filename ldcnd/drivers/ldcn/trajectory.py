@@ -5,6 +5,7 @@ sensor control"; PIC-SERVO manual, 4.4, 4.5, 5.2. Where the LS-182AP text has bi
 velocity it means bit 5, as its own list of bits says.
 """
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntFlag, StrEnum
 
@@ -175,6 +176,7 @@ def quantised(motion: Motion, servo_divisor: int, profile: Profile) -> Motion:
     Raises:
         ValueOutOfRange: a value does not fit its register.
     """
+    _check_encoder_rate(motion.velocity_counts_per_s, profile)
     velocity = programmed_velocity(abs(motion.velocity_counts_per_s), servo_divisor, profile)
     acceleration = programmed_acceleration(motion.acceleration_counts_per_s2, servo_divisor, profile)
     speed = velocity_counts_per_s(velocity, servo_divisor, profile)
@@ -185,6 +187,24 @@ def quantised(motion: Motion, servo_divisor: int, profile: Profile) -> Motion:
     )
 
 
+def _check_encoder_rate(counts_per_s: float, profile: Profile) -> None:
+    """Refuse a speed at which the drive would lose counts.
+
+    PIC-SERVO manual, 3.2: 500 kHz; LS-182AP manual, "Features": 2 MHz.
+
+    Raises:
+        ValueOutOfRange: names the highest speed.
+    """
+    most = float(profile.encoder_counts_per_s)
+    if abs(counts_per_s) > most:
+        raise ValueOutOfRange(
+            f"{abs(counts_per_s):.10g} counts/s: {profile.title} counts up to {most:.10g} a second",
+            value=counts_per_s,
+            limit=most,
+            nearest=math.copysign(most, counts_per_s),
+        )
+
+
 def trajectory_of(motion: Motion | AnalogMotion | PwmOutput, servo_divisor: int, profile: Profile) -> Trajectory:
     """Return what Load Trajectory takes for a motion; it waits for Start Motion.
 
@@ -192,6 +212,8 @@ def trajectory_of(motion: Motion | AnalogMotion | PwmOutput, servo_divisor: int,
         ValueOutOfRange: a value does not fit its register, or is an analog target that looks like a broken sensor.
         NotSupported: an analog target on a drive without absolute positioning.
     """
+    if not isinstance(motion, PwmOutput):
+        _check_encoder_rate(motion.velocity_counts_per_s, profile)
     acceleration = programmed_acceleration(motion.acceleration_counts_per_s2, servo_divisor, profile)
     match motion:
         case PwmOutput():

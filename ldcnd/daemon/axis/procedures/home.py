@@ -15,7 +15,7 @@ from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import MalformedRequest, NotSupported
+from ldcnd.errors import MalformedRequest, NotSupported, VelocityLimit
 from ldcnd.log import get_logger
 from ldcnd.model.commands import CommandReply, Home, HomeMethod, HomeStop
 from ldcnd.model.samples import AxisState
@@ -24,6 +24,8 @@ log = get_logger("axis")
 
 DEFAULT_TIMEOUT_S = 60.0
 STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
+INDEX_SHARE = 0.75
+"""Of the velocity at which an index pulse lasts exactly one look of the drive: a shaft does not turn quite evenly."""
 BEYOND = 1.1
 """A search without a distance ends in the drive this much later than its time-out, in case nobody stops it."""
 
@@ -35,6 +37,8 @@ class HomeSearch:
     Attributes:
         method: what marks the reference position.
         velocity: units a second, signed.
+        find_velocity: units a second, positive, for finding a limit switch beforehand; None without.
+        index_width: counts for which the index pulse lasts.
         acceleration: units a second squared; None for the axis default.
         position: what the position is called there, in axis units.
         timeout_s: when to give up.
@@ -46,6 +50,8 @@ class HomeSearch:
 
     method: HomeMethod
     velocity: float
+    find_velocity: float | None
+    index_width: int
     acceleration: float | None
     position: float
     timeout_s: float
@@ -96,6 +102,8 @@ def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSe
     return HomeSearch(
         method=method,
         velocity=velocity,
+        find_velocity=request.find_velocity or (preset.find_velocity if preset and preset.method is method else None),
+        index_width=defaults.index_width,
         acceleration=request.acceleration,
         position=request.position if request.position is not None else defaults.position,
         timeout_s=request.timeout_s or defaults.timeout_s,
@@ -109,6 +117,10 @@ def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSe
 class Leg(Enum):
     """Where a homing is."""
 
+    FIND = "find"
+    """Fast, onto the limit switch; what is captured there does not count."""
+    BRAKE = "brake"
+    """On the switch, coming to rest."""
     OFF_SWITCH = "off_switch"
     CLEAR = "clear"
     """Off the switch, coming to rest."""
@@ -133,12 +145,14 @@ class HomeSequence(Procedure):
         guards.check_may_move(view)
         search = self._search
         plan = motion.planner.at_velocity(view, search.velocity, search.acceleration)
+        self._check_index_is_seen(plan)
         if search.move_to is not None:
             guards.check_position(view, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
         off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
         self.turn.still_wanted()  # a stop that came meanwhile has disarmed nothing yet
-        await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.SEARCH)
+        finds = search.find_velocity is not None and search.runs_onto_switch(motion.scale)
+        await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
         return motion.reply(self.turn).model_copy(
             update={"position": search.position, "velocity": plan.velocity, "acceleration": plan.acceleration}
         )
@@ -146,7 +160,7 @@ class HomeSequence(Procedure):
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`."""
         resting = reading.profile_done and self._motion.tracker.at_rest
-        if self._leg in (Leg.CLEAR, Leg.FOUND):
+        if self._leg in (Leg.BRAKE, Leg.CLEAR, Leg.FOUND):
             return resting
         return not reading.homing or resting
 
@@ -162,6 +176,9 @@ class HomeSequence(Procedure):
             case Leg.CLEAR:
                 await self._set_out(turn, Leg.SEARCH)
                 return True
+            case Leg.BRAKE:
+                await self._set_out(turn, Leg.OFF_SWITCH)
+                return True
             case Leg.FOUND:
                 return await self._move_on(turn)
         if reading.homing:
@@ -170,7 +187,7 @@ class HomeSequence(Procedure):
             return await self._take_over(turn)
         await self._motion.driver.stop(StopMode.SMOOTH)
         turn.still_wanted()
-        self._leg = Leg.CLEAR
+        self._leg = Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR
         self._motion.stopping(turn.command_id, turn.verb, AxisState.HOMING, Completion.PROCEDURE)
         return True
 
@@ -178,10 +195,11 @@ class HomeSequence(Procedure):
         """Begin a leg that looks for the mark."""
         motion, search = self._motion, self._search
         away = leg is Leg.OFF_SWITCH
-        plan = motion.planner.at_velocity(
-            motion.tracker.view(), -search.velocity if away else search.velocity, search.acceleration
-        )
-        capture = HomeCapture(search.method, StopMode.SMOOTH if away else search.stop)
+        velocity = -search.velocity if away else search.velocity
+        if leg is Leg.FIND and search.find_velocity is not None:
+            velocity = math.copysign(search.find_velocity, search.velocity)
+        plan = motion.planner.at_velocity(motion.tracker.view(), velocity, search.acceleration)
+        capture = HomeCapture(search.method, search.stop if leg is Leg.SEARCH else StopMode.SMOOTH)
         leg_motion = replace(
             plan.motion,
             target_counts=self._end_of_leg(plan),
@@ -192,7 +210,31 @@ class HomeSequence(Procedure):
         motion.tracker.referenced = False
         opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
         self.deadline_s = motion.clock.now_s() + search.timeout_s
-        await motion.start(turn, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and not away)
+        await motion.start(turn, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH)
+
+    def _check_index_is_seen(self, plan: MotionPlan) -> None:
+        """Refuse a search that the index pulse can slip through: the drive looks once in a servo cycle.
+
+        LS-182AP manual, "Encoder Input": the velocity has "to guarantee index pulse longer then 512us".
+
+        Raises:
+            VelocityLimit: names the nearest velocity at which no pulse is missed.
+        """
+        motion, search = self._motion, self._search
+        sample_s = motion.driver.index_sample_s
+        if search.method is not HomeMethod.INDEX or not sample_s:
+            return
+        limit = INDEX_SHARE * search.index_width / sample_s / motion.scale.counts_per_unit
+        if abs(plan.velocity) > limit:
+            raise VelocityLimit(
+                f"axis {motion.config.name}: at {abs(search.velocity):g} {motion.config.unit}/s the drive can miss an"
+                f" index pulse of {search.index_width} counts: it looks every {1000 * sample_s:g} ms",
+                axis=motion.config.name,
+                value=search.velocity,
+                limit=limit,
+                nearest=math.copysign(math.floor(limit * 1e6) / 1e6, search.velocity),
+                remedy="search more slowly, or configure index_width if the pulse is wider",
+            )
 
     def _end_of_leg(self, plan: MotionPlan) -> int:
         search, here = self._search, self._motion.latest().position_counts
