@@ -11,7 +11,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ldcnd.console.errors import answering_errors, error_response
-from ldcnd.console.pages import PageControl, Pages, ToPage
+from ldcnd.console.pages import FromPage, PageControl, Pages, ToPage
 from ldcnd.console.reading import NOTHING_TO_SAY, SEND_TIME_S
 from ldcnd.console.requests import body_of, json_reply
 from ldcnd.errors import LdcndError
@@ -77,7 +77,7 @@ def control_routes(pages: Pages) -> list[BaseRoute]:
             async with pages.open(socket.state.visitor, waiting.put_nowait) as page:
                 await socket.accept()
                 waiting.put_nowait(ToPage(page=page.token, client=page.client))
-                await _serve(socket, waiting)
+                await _serve(socket, page, waiting)
         except* LdcndError as errors:
             refused = errors.exceptions[0]
             if isinstance(refused, LdcndError):
@@ -105,15 +105,25 @@ async def _release_all(page: PageControl, rig: str, axes: Iterable[str]) -> None
             group.create_task(page.release(rig, axis), name=f"release {axis}")
 
 
-async def _serve(socket: WebSocket, waiting: asyncio.Queue[ToPage]) -> None:
-    """Tell the page what happens to its control until its web socket closes, by it or by the keep-alive's time-out."""
+async def _serve(socket: WebSocket, page: PageControl, waiting: asyncio.Queue[ToPage]) -> None:
+    """Speak with the page until its web socket closes, by it, by the keep-alive's time-out or for nonsense."""
     async with asyncio.TaskGroup() as group:
         telling = group.create_task(_tell(socket, waiting), name="page is told")
-        listening = group.create_task(socket.receive(), name="page listens")
-        telling.add_done_callback(lambda _: listening.cancel())
-        listening.add_done_callback(lambda _: telling.cancel())
-    if not listening.cancelled() and listening.result()["type"] == "websocket.receive":
+        hearing = group.create_task(_hear(socket, page), name="page is heard")
+        telling.add_done_callback(lambda _: hearing.cancel())
+        hearing.add_done_callback(lambda _: telling.cancel())
+    if not hearing.cancelled() and not hearing.result():
         await socket.close(NOTHING_TO_SAY)
+
+
+async def _hear(socket: WebSocket, page: PageControl) -> bool:
+    """Hand over what the page says; returns whether the page has closed its socket, rather than said nonsense."""
+    while (message := await socket.receive())["type"] == "websocket.receive":
+        try:
+            page.heard(decode(FromPage, (message.get("text") or "").encode(), Encoding.JSON))
+        except LdcndError:
+            return False
+    return True
 
 
 async def _tell(socket: WebSocket, waiting: asyncio.Queue[ToPage]) -> None:

@@ -11,13 +11,24 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 
+from pydantic import Field
+
 from ldcnd.client.lease import Control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor
-from ldcnd.errors import LdcndError, LeaseExpired, LeaseRequired, NotSupported, TooManyRequests, UnknownAxis
+from ldcnd.errors import (
+    LdcndError,
+    LeaseExpired,
+    LeaseRequired,
+    NotSupported,
+    RequestRefused,
+    TooManyRequests,
+    UnknownAxis,
+)
 from ldcnd.log import get_logger
-from ldcnd.model.commands import AxisCommand, CommandReply, Effect, Halt
+from ldcnd.messaging.codec import error_reply
+from ldcnd.model.commands import AxisCommand, CommandReply, Effect, ErrorReply, Halt, MoveVelocity
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.rig_commands import Acquire, MoveTogether, MoveTogetherReply
 from ldcnd.model.samples import Moving
@@ -31,6 +42,8 @@ REST_TIME_S = 15.0
 """An axis that a page leaves behind has so long to come to rest; then its lease ends by itself, and `loss.client` of
 its configuration decides."""
 LOOK_EACH_S = 0.05
+HELD_S = 0.4
+"""A jog ends when the page says for so long nothing of the hand that holds it; pages say it each tenth of a second."""
 MOST_PAGES = 64
 TOKEN_BYTES = 16
 
@@ -46,8 +59,30 @@ class Lost(Frozen):
     """Why it has no control any more."""
 
 
+class Jog(Frozen):
+    """Run an axis for as long as the page goes on saying that it is held."""
+
+    rig: str
+    """The rig."""
+    axis: str
+    """The axis."""
+    velocity: float
+    """Units a second, signed."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Units a second squared; the axis default when missing."""
+
+
+class FromPage(Frozen):
+    """One message of a page on its web socket."""
+
+    jog: Jog | None = None
+    """Begin to jog; an earlier jog of the page ends."""
+    held: bool | None = None
+    """The jog goes on, for `HELD_S` more; false ends it."""
+
+
 class ToPage(Frozen):
-    """One message to a page on its web socket; the first has `page` and `client`, the others have `lost`."""
+    """One message to a page on its web socket; the first has `page` and `client`, the others one of the rest."""
 
     page: str | None = None
     """What its commands carry as `X-Ldcnd-Page`."""
@@ -55,6 +90,8 @@ class ToPage(Frozen):
     """The name under which its commands go."""
     lost: Lost | None = None
     """Control that it does not have any more."""
+    refused: ErrorReply | None = None
+    """Why a jog did not begin, or how it ended by itself."""
 
 
 @dataclass(slots=True, eq=False)
@@ -102,6 +139,17 @@ class PageControl:
         self._group = group
         self._held: dict[tuple[str, str], _Hold] = {}
         self._gone = False
+        self._jogging: asyncio.Task[None] | None = None
+        self._held_on = asyncio.Event()
+
+    def heard(self, message: FromPage) -> None:
+        """Take a message of the page."""
+        if message.jog is not None or message.held is False:
+            self._end_jog()
+        if message.jog is not None:
+            self._jogging = self._group.create_task(self._jog(message.jog), name=f"{self.client} jogs")
+        elif message.held:
+            self._held_on.set()
 
     async def take(self, rig: str, axis: str, *, force: bool) -> None:
         """Take control of an axis, from its holder too with `force`.
@@ -169,10 +217,41 @@ class PageControl:
     async def leave(self) -> None:
         """Give up everything: halt what may move, then release it. Nothing more is sent for this page."""
         self._gone = True
+        self._end_jog()
         holds, self._held = list(self._held.values()), {}
         async with asyncio.TaskGroup() as group:
             for hold in holds:
                 group.create_task(_give_up(hold, self.client), name=f"{self.client} leaves {hold.axis}")
+
+    def _end_jog(self) -> None:
+        if self._jogging:
+            self._jogging.cancel()
+            self._jogging = None
+
+    async def _jog(self, jog: Jog) -> None:
+        """Run an axis until its page lets go of it or falls silent, then halt it."""
+        command = MoveVelocity(velocity=jog.velocity, acceleration=jog.acceleration, client=self.client)
+        try:
+            await self.command(jog.rig, jog.axis, command)
+            while True:
+                self._held_on.clear()
+                async with asyncio.timeout(HELD_S):
+                    await self._held_on.wait()
+        except RequestRefused as error:
+            self._tell(ToPage(refused=error_reply(error)))
+            return
+        except (TimeoutError, LdcndError, asyncio.CancelledError) as error:
+            await self._halt_jog(jog)
+            if isinstance(error, LdcndError):
+                self._tell(ToPage(refused=error_reply(error)))
+            if isinstance(error, asyncio.CancelledError):
+                raise
+
+    async def _halt_jog(self, jog: Jog) -> None:
+        try:
+            await self._rigs.client(jog.rig).command(jog.axis, Halt(client=self.client), HALT_TIME_S)
+        except LdcndError as error:
+            self._tell(ToPage(refused=error_reply(error)))
 
     async def _keep(self, rig: str, axis: str, control: Control) -> None:
         await control.keep()

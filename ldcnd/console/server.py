@@ -40,7 +40,7 @@ SENT_BYTES = 64 * 1024
 UNREAD_MS = 30_000
 """The kernel gives up a page that takes nothing for so long."""
 LONGEST_MESSAGE_BYTES = 1024
-"""Pages have nothing to say on their web sockets."""
+"""What pages say on their web sockets is short."""
 PING_EACH_S = 1.0
 PONG_TIME_S = 4.0
 """A browser answers for hidden pages, too; of one that does not answer for so long the pages are gone."""

@@ -142,3 +142,56 @@ async def test_control_is_of_axes_not_of_what_else_has_a_name(console):
         answers = [await page.post(f"{RIG}/control", {"axes": axes}) for axes in (["w"], ["*"], [""], [])]
 
     assert [answer.status for answer in answers] == [404, 404, 404, 400]
+
+
+async def jogging(console, page, velocity):
+    """Begin to jog x by the page's web socket; returns once it moves."""
+    await page.take("sim", "x")
+    await page.post(f"{X}/power", {"on": True})
+    await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+    page.say({"jog": {"rig": "sim", "axis": "x", "velocity": velocity}})
+    await console.rig.until("x", lambda state: state.moving is Moving.YES)
+
+
+async def test_a_jog_runs_for_as_long_as_the_page_says_that_it_is_held(console):
+    async with open_page(console.app, console.browser) as page:
+        await jogging(console, page, 1.0)
+        for _ in range(30):
+            page.say({"held": True})
+            await asyncio.sleep(0.1)
+        assert not await stands(console, "x")
+        page.say({"held": False})
+        await asyncio.sleep(0.5)
+
+        assert await stands(console, "x")
+        assert await holder(console, "x") == page.client
+
+
+async def test_a_jog_ends_when_nothing_is_heard_of_the_hand_that_holds_it(console):
+    async with open_page(console.app, console.browser) as page:
+        await jogging(console, page, 1.0)
+        await asyncio.sleep(1.0)
+
+        assert await stands(console, "x")
+
+
+async def test_a_jog_needs_control_and_says_why_it_does_not_run(console):
+    async with open_page(console.app, console.browser) as page:
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})
+        untaken = await page.told()
+        await page.take("sim", "x")
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})
+        disabled = await page.told()
+
+    assert untaken["refused"]["code"] == "lease_required"
+    assert disabled["refused"]["code"] == "wrong_state"
+
+
+async def test_a_page_that_says_nonsense_on_its_socket_is_closed(console):
+    async with open_page(console.app, console.browser) as page:
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": "fast"}})
+        async with asyncio.timeout(60):
+            while page.socket.closed is None:
+                await asyncio.sleep(0.1)
+
+    assert page.socket.closed == 1008

@@ -149,6 +149,10 @@ class OpenPage:
         answer = await self.post(f"/api/rigs/{rig}/control", {"axes": list(axes)})
         assert answer.status == 200, answer.document
 
+    def say(self, message: JsonObject) -> None:
+        """Say something on its web socket."""
+        self.socket.say(json.dumps(message))
+
     async def told(self) -> JsonObject:
         """Return the next message on its web socket."""
         message = json.loads(await self.socket.frame())

@@ -25,7 +25,7 @@ def test_a_refused_configuration_comes_with_what_to_do(monkeypatch, capsys):
 def test_names_from_the_network_steer_no_terminal_and_forge_no_line(capsys):
     show_lines("x: by eve\x1b]52;c;aGk=\x07\nx: stopped \x9b2J\u202e", "y")
 
-    assert capsys.readouterr().out == ("x: by eve\\u001b]52;c;aGk=\\u0007\\u000ax: stopped \\u009b2J\\u202e\ny\n")
+    assert capsys.readouterr().out == ("x: by eve\\x1b]52;c;aGk=\\x07\\nx: stopped \\x9b2J\\u202e\ny\n")
 
 
 def test_errors_quote_what_a_stranger_sent_without_passing_it_on(monkeypatch, capsys):
@@ -40,6 +40,6 @@ def test_errors_quote_what_a_stranger_sent_without_passing_it_on(monkeypatch, ca
 
     assert end.value.code == 1
     said = capsys.readouterr().err
-    assert "eve\\u001b[2J" in said
+    assert "eve\\x1b[2J" in said
     assert "\x1b" not in said
     assert "\x9b" not in said
