@@ -24,6 +24,10 @@ PAGES = {
 """Each page with a heading that tells that it is there."""
 
 
+NARROW_INPUTS = """
+[...document.querySelectorAll("input[type=number], select")].filter((field) => field.clientWidth < 60).map(
+  (field) => field.getAttribute("aria-label") ?? field.id)
+"""
 EVERYTHING = {"resultTypes": ["violations"]}
 COLOURS = EVERYTHING | {"runOnly": {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}}
 """Only colours depend on the scheme."""
@@ -55,15 +59,22 @@ async def test_axe_finds_nothing_on_any_page_in_the_dark_and_in_the_light(house)
     assert not reports, "\n".join(reports)
 
 
-async def test_no_page_is_wider_than_a_narrow_screen(house):
+@pytest.mark.parametrize("width", [390, 1280, 1920])
+async def test_no_page_is_wider_than_the_screen(house, width):
     await something_stands_out(house)
-    async with house.desk(width=400) as desk:
+    async with house.desk(width=width) as desk:
         await desk.open("rig")
         for place in PAGES:
             await go(desk, place)
-            assert await desk.page.evaluate("document.documentElement.scrollWidth") <= 400, place
+            assert await desk.page.evaluate("document.documentElement.scrollWidth") <= width, place
+            narrow = await desk.page.evaluate(NARROW_INPUTS)
+            assert not narrow, place
             stop = desk.page.get_by_role("button", name="Stop all axes")
             await expect(stop).to_be_in_viewport(ratio=1)
+            for link in await desk.page.get_by_role("navigation").get_by_role("link").all():
+                box = await link.bounding_box()
+                assert box["x"] >= 0
+                assert box["x"] + box["width"] <= width, place
 
 
 async def test_the_keyboard_reaches_the_page_and_an_axis(house):

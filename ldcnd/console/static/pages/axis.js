@@ -7,6 +7,7 @@ import { FaultPanel, WhyPanel } from "./axis_faults.js";
 import { GainsPanel } from "./axis_gains.js";
 import { HomePanel } from "./axis_homing.js";
 import { LimitsPanel, RegistersPanel } from "./axis_limits.js";
+import { JogPanel } from "./axis_jog.js";
 import { MovePanel } from "./axis_motion.js";
 import { NowPanel } from "./axis_now.js";
 
@@ -20,12 +21,12 @@ export function AxisPage({ at }) {
     <header class="title">
       <h1><a href="#/rig">${axis.rig.name}</a> <span class="quiet">/</span> ${axis.name}</h1>
       <p class="quiet">${info.identity ?? info.model}, address ${info.address} on ${info.bus}</p>
-      <p class="links"><a href="#/scope">Scope</a> <a href=${`#/trace/${axis.rig.name}/${axis.name}`}>Trace</a>
+      <p class="links"><a href=${`#/scope/${axis.rig.name}/${axis.name}`}>Scope</a> <a href=${`#/trace/${axis.rig.name}/${axis.name}`}>Trace</a>
         ${axis.can("set_gains") && html` <a href=${`#/tuning/${axis.rig.name}/${axis.name}`}>Tuning</a>`}
         ${axis.can("list_parameters") && html` <a
           href=${`#/parameters/${axis.rig.name}/${axis.name}`}>Parameters</a>`}</p>
     </header>
-    ${axis.rig.worth && html`<p class="notice mark" data-level="bad">${axis.rig.worth.why} What follows is what was known last.</p>`}
+    ${axis.rig.worth && html`<p class="notice mark" data-level="bad">${axis.rig.worth.why} The values below are the last known ones.</p>`}
     <${FaultPanel} axis=${axis} />
     <div class="columns">
       <div class="column">
@@ -36,6 +37,7 @@ export function AxisPage({ at }) {
       </div>
       <div class="column">
         <${AuthorityPanel} axis=${axis} />
+        ${axis.can("move_velocity") && html`<${JogPanel} key=${axis.name} axis=${axis} />`}
         ${MOTIONS.some((verb) => axis.can(verb)) && html`<${MovePanel} axis=${axis} />`}
         ${axis.can("home") && html`<${HomePanel} axis=${axis} />`}
         ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}

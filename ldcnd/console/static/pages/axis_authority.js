@@ -12,7 +12,7 @@ export function AuthorityPanel({ axis }) {
   const [force, setForce] = useState(false);
   const others = !mine && axis.holder;
   return html`<${Panel} title="Control">
-    <p>Held by <${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
+    <p>${mine || axis.holder ? "Held by " : "This axis is "}<${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
     <p class="row">
       ${
         mine

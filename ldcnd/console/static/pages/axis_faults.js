@@ -3,6 +3,7 @@
 import { html, useEffect, useState } from "../html.js";
 import { Action, Panel, RefusalText } from "../parts/controls.js";
 import { clock, words } from "../parts/format.js";
+import { inPageTerms } from "../parts/remedies.js";
 import { faultPage, Mark } from "../parts/state.js";
 import { command, controls, question } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -14,11 +15,11 @@ export function FaultPanel({ axis }) {
     ${
       faults.length > 0 &&
       html`<section class="faults" aria-label="Faults">
-      <h2>${faults.length === 1 ? "A fault stands" : `${faults.length} faults stand`}</h2>
+      <h2>${faults.length === 1 ? "Active fault" : `${faults.length} active faults`}</h2>
       ${
         first &&
         !faults.some((each) => each.code === first.code) &&
-        html`<p>First of all came
+        html`<p>First fault:
         <a href=${faultPage(first.code)}>${words(first.code)}</a> at ${clock(first.since)}: ${first.text}.</p>`
       }
       <ul>${faults.map((fault) => html`<${FaultItem} fault=${fault} first=${first} />`)}</ul>
@@ -32,7 +33,7 @@ export function FaultPanel({ axis }) {
 function FaultItem({ fault, first }) {
   return html`<li>
     <${Mark} level=${fault.stops ? "bad" : "warn"}>${fault.stops ? "motor off" : "warning"}<//>
-    ${" "}<b>${words(fault.code)}</b>${first?.code === fault.code && html` <span class="quiet">came first</span>`}
+    ${" "}<b>${words(fault.code)}</b>${first?.code === fault.code && html` <span class="quiet">first fault</span>`}
     <p>${fault.text}.</p>
     <p class="quiet">Since ${clock(fault.since)}, says the ${fault.source}.
       ${" "}<a href=${faultPage(fault.code)}>More about ${words(fault.code)}</a></p>
@@ -73,14 +74,14 @@ export function WhyPanel({ axis }) {
         why &&
         !refusal &&
         (why.can_move
-          ? html`<p>Yes: a motion within the limits would be accepted.</p>`
-          : html`<p>No. In the order in which it has to be cleared:</p><ol class="causes">${why.causes.map(
+          ? html`<p>Ready to move: a motion within the limits would be accepted.</p>`
+          : html`<p>Not now. Clear in this order:</p><ol class="causes">${why.causes.map(
               (cause) => html`<li>
             <a href=${faultPage(cause.code)}>${words(cause.code)}</a> <span>${cause.text}.</span>
-            ${cause.remedy && html`<p class="quiet">To clear it: ${cause.remedy}.</p>`}</li>`,
+            ${cause.remedy && html`<p class="quiet">To clear it: ${inPageTerms(cause.remedy)}.</p>`}</li>`,
             )}</ol>`)
       }
-      ${why?.first_fault && html`<p class="quiet">First since the last reset: ${why.first_fault}.</p>`}
+      ${why?.first_fault && html`<p class="quiet">First fault since the last reset: ${why.first_fault}.</p>`}
     </div>
     <${RefusalText} refusal=${refusal} />
   <//>`;

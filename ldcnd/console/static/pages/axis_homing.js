@@ -40,10 +40,10 @@ export function HomePanel({ axis }) {
     ${way && html`<${Reason} id=${toHome} text=${way} />`}
     ${
       axis.can("set_position") &&
-      html`<h3>Or tell it where it is</h3>
-      <div class="fields"><${Field} label="This is position" unit=${unit} value=${name} onChange=${setName} /></div>
+      html`<h3>Or set current position</h3>
+      <div class="fields"><${Field} label="Current position is" unit=${unit} value=${name} onChange=${setName} /></div>
       <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} obstacle=${naming}
-        reason=${toSet} title="Nothing moves; afterwards the axis is referenced">Set position<//></p>
+        reason=${toSet} title="Nothing moves; afterwards the axis counts as homed">Set position<//></p>
       ${naming && html`<${Reason} id=${toSet} text=${naming} />`}`
     }
   <//>`;

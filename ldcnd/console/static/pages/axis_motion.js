@@ -58,7 +58,7 @@ export function MovePanel({ axis }) {
   const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing;
 
   return html`<${Panel} title="Move">
-    <div class="fields">
+    <div class="fields" onKeyDown=${enterSends}>
       <${Choice} label="Move" options=${kinds.map((each) => [each, KINDS[each].title])} value=${verb}
         onChange=${setVerb} />
       <${Field} label=${label} unit=${unit(axis.info.unit)} value=${values[field]} onChange=${set(field)} />
@@ -81,6 +81,13 @@ export function MovePanel({ axis }) {
       kind="main">Move<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
+}
+
+/** Enter in a field does what the main button of its panel does. */
+function enterSends(event) {
+  if (event.key !== "Enter" || event.target.tagName !== "INPUT") return;
+  event.preventDefault();
+  event.currentTarget.closest(".panel").querySelector("button.main").click();
 }
 
 /** Return what the verb carries, or null while its main value is missing. */
@@ -116,11 +123,11 @@ function Preview({ axis, body, field, onNearest }) {
   }, [asked, axis]);
 
   return html`<div class="preview" aria-live="polite">
-    <h3>What it would do</h3>
+    <h3>Preview</h3>
     ${
       plan
         ? html`<${Planned} axis=${axis} plan=${plan} field=${field} onNearest=${onNearest} />`
-        : html`<p class="quiet">${asked ? "Asking the daemon…" : "Type a value: the daemon says what would come of it."}</p>`
+        : html`<p class="quiet">${asked ? "Asking the daemon…" : "Type a value to see what the move would do."}</p>`
     }
     <${RefusalText} refusal=${refusal} />
   </div>`;
@@ -143,7 +150,7 @@ function Planned({ axis, plan, field, onNearest }) {
   const rounding = (value, error) =>
     Math.abs(error) > NOTICED * Math.abs(value) && ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)`;
   const held = (value, error, of) => `${number(value, 3)} ${of}${rounding(value, error) || ""}`;
-  return html`<p>${plan.position === null ? "Goes on until it is told otherwise" : `Ends at ${number(plan.position, decimals)} ${unit}`},
+  return html`<p>${plan.position === null ? "Runs until stopped or to the soft limit" : `Ends at ${number(plan.position, decimals)} ${unit}`},
     ${" "}at ${held(plan.velocity, plan.velocity_error, `${unit}/s`)}, with ${held(plan.acceleration, plan.acceleration_error, `${unit}/s²`)}${
       plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`
     }.

@@ -44,8 +44,8 @@ function remaining(command) {
 function StatusLamps({ state }) {
   return html`<ul class="lamps" aria-label="Status bits">
     <${Lamp} label="loop closed" on=${state?.enabled} />
-    <${Lamp} label="referenced" on=${state?.referenced} />
-    <${Lamp} label="moves" on=${state && state.moving !== "unknown" ? state.moving === "yes" : null} />
+    <${Lamp} label="homed" on=${state?.referenced} />
+    <${Lamp} label="moving" on=${state && state.moving !== "unknown" ? state.moving === "yes" : null} />
     <${Lamp} label="answers" on=${state && state.link !== "down"} yes=${state?.link} no="down"
       level=${state?.link === "degraded" ? "warn" : ""} />
     <${Lamp} label="stop latched" on=${state?.stop_latched} level="warn" />

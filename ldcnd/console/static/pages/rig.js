@@ -1,15 +1,16 @@
-/** The rig page: what is wrong first, then every axis of every line of every rig. */
+/** The rig page: faults and warnings first, then every axis of every line of every rig, and what can be asked of them. */
 
-import { html, useState } from "../html.js";
-import { Action, Facts } from "../parts/controls.js";
+import { html, useId, useState } from "../html.js";
+import { Action, Facts, Tick } from "../parts/controls.js";
 import { dateAndClock, decimalsOf, duration, number, percent } from "../parts/format.js";
 import { problems } from "../parts/problems.js";
 import { FaultWords, Mark, Meter, QualityWord, StateWord } from "../parts/state.js";
 import { ask } from "../session/api.js";
-import { controls } from "../session/control.js";
+import { command, controls, release, take } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
 import { endpoints, useRigs } from "../session/rigs.js";
 
-const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Rate", "Control"];
+const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Control", "Commands"];
 const FULL = 0.9;
 const COUNTERS = [
   ["timeouts", "timeouts"],
@@ -52,10 +53,10 @@ function Attention({ rigs }) {
   return html`<section class="attention" aria-labelledby="attention">
     <h2 id="attention">Needs attention</h2>
     <ul>${wrong.map(
-      ({ level, text, places }) => html`<li key=${text} data-level=${level}>
-      <${Mark} level=${level}>${level === "bad" ? "wrong" : "look"}<//>
-      <span>${text}</span> <span class="places">${places.map(({ where, link }) => html`<a
-        href=${link}>${where}</a> `)}</span>
+      ({ level, text, places }) => html`<li key=${`${level} ${text}`} data-level=${level}>
+      <${Mark} level=${level}>${level === "bad" ? "fault" : "warning"}<//>
+      <span>${text}</span> <span class="places">${places.map(({ where, link, detail }) => html`<a
+        href=${link}>${where}</a>${detail && html` <span class="quiet number">${detail}</span>`} `)}</span>
     </li>`,
     )}</ul>
   </section>`;
@@ -72,7 +73,8 @@ function RigSection({ rig }) {
         ["loop lag", duration(rig.health?.loop_lag_s)],
       ]} />
     </header>
-    ${rig.worth && html`<p class="notice mark" data-level="bad">${rig.worth.why} What follows is what was known last.</p>`}
+    ${rig.worth && html`<p class="notice mark" data-level="bad">${rig.worth.why} The values below are the last known ones.</p>`}
+    <${RigCommands} rig=${rig} />
     ${[...rig.buses.values()].map((bus) => html`<${BusSection} key=${bus.name} rig=${rig} bus=${bus} />`)}
   </section>`;
 }
@@ -123,14 +125,70 @@ function AxisRow({ axis }) {
     ${cell("Target", number(state?.command?.target, decimals), "number")}
     ${cell("A/D", adc ? html`${number(adc.volts, 2)} <span class="unit">V</span>` : html`<span class="quiet">none</span>`, "number")}
     ${cell("Faults", html`<${FaultWords} axis=${axis} />`)}
-    ${cell("Values", html`<${QualityWord} axis=${axis} />`)}
-    ${cell("Rate", html`${number(health?.rate_hz, 1)} <span class="quiet">of ${number(health?.rate_wanted_hz, 1)} Hz</span>`, "number")}
+    ${cell("Values", html`<${QualityWord} axis=${axis} />
+      <small>${number(health?.rate_hz, 1)} of ${number(health?.rate_wanted_hz, 1)} Hz</small>`)}
     ${cell("Control", html`<${HolderWord} axis=${axis} />`)}
+    ${cell("Commands", html`<${AxisCommands} axis=${axis} />`, "commands")}
   </tr>`;
+}
+
+/** What can be asked of one axis without leaving the page; why not is in the title and read to screen readers. */
+function AxisCommands({ axis }) {
+  if (!axis.can("power")) return html`<span class="quiet">none</span>`;
+  const on = axis.state?.enabled;
+  const commands = [
+    [on ? "Disable" : "Enable", on ? "disable" : "enable", () => command(axis, "power", { on: !on })],
+    ["Reset", "reset", () => command(axis, "reset")],
+    ["Home", "home", () => command(axis, "home")],
+    ["Halt", "halt", () => command(axis, "halt")],
+  ];
+  return html`<span class="row" role="group" aria-label=${`Commands for ${axis.name}`}>
+    ${commands.map(([title, act, run]) => html`<${ShortAction} key=${act} title=${title} name=${axis.name}
+      act=${run} obstacle=${obstacle(axis, act)} />`)}
+  </span>`;
+}
+
+function ShortAction({ title, name, act, obstacle: way }) {
+  const reason = useId();
+  return html`<${Action} act=${act} obstacle=${way} reason=${reason} title=${way ?? `${title} ${name}`}
+    >${title}<span class="unseen"> ${name}</span><//>${way && html`<span class="unseen" id=${reason}>${way}</span>`}`;
+}
+
+/** What can be asked of all axes of a rig at once; each one that cannot do it now is passed over. */
+function RigCommands({ rig }) {
+  const axes = [...rig.axes.values()].filter((axis) => axis.can("power"));
+  const [force, setForce] = useState(false);
+  const [told, setTold] = useState("");
+  if (!axes.length) return null;
+  const mine = axes.filter(controls);
+  const others = axes.filter((axis) => !controls(axis) && axis.holder);
+  const ready = (act) => axes.filter((axis) => obstacle(axis, act) === null);
+  const each = (act, verb, body) => async () => {
+    const asked = ready(act);
+    const outcomes = await Promise.allSettled(asked.map((axis) => command(axis, verb, body)));
+    const failed = outcomes.flatMap(({ reason }, at) => (reason ? [`${asked[at].name}: ${reason.message}`] : []));
+    setTold(failed.join(" ") || `${verb === "power" ? (body.on ? "enabled" : "disabled") : verb}: ${asked.map(({ name }) => name).join(", ")}`);
+  };
+  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" act=${each(act, verb, body)}
+    obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;
+  return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
+    <p class="row">
+      ${mine.length < axes.length && html`<${Action} kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)}
+        obstacle=${obstacle(axes[0], "none") ?? (others.length && !force ? `${others.map(({ name, holder }) => `${name} is controlled by ${holder}`).join(", ")}: tick to take it from there.` : null)}
+        >Take control of all<//>`}
+      ${mine.length > 0 && html`<${Action} act=${() => release(mine)} title="Axes that move are halted first">Release control<//>`}
+      ${others.length > 0 && html`<${Tick} label="Take it from the others" checked=${force} onChange=${setForce} />`}
+      ${button("Enable", "enable", "power", { on: true })}
+      ${button("Disable", "disable", "power", { on: false })}
+      ${button("Reset", "reset", "reset", {})}
+      ${button("Halt", "halt", "halt", {})}
+    </p>
+    <p role="status">${told}</p>
+  </div>`;
 }
 
 /** Who controls an axis. */
 export function HolderWord({ axis }) {
   if (controls(axis)) return html`<span class="mine">this page</span>`;
-  return axis.holder ? html`<span>${axis.holder}</span>` : html`<span class="quiet">nobody</span>`;
+  return axis.holder ? html`<span>${axis.holder}</span>` : html`<span class="quiet">not controlled</span>`;
 }

@@ -13,17 +13,18 @@ const AT_FIRST = 2;
 /** What was chosen is kept while other pages are looked at. */
 let remembered = null;
 
-export function ScopePage() {
+export function ScopePage({ at }) {
   const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.info);
   const [chosen, setChosen] = useState(remembered);
   const [windowS, setWindowS] = useState(10);
   const [paused, setPaused] = useState(false);
-  const keys = chosen ?? atFirst(axes);
+  const keys = ofAxis(axes, at) ?? chosen ?? atFirst(axes);
   const recording = useRecording(axes, keys);
 
   function toggle(key, on) {
     remembered = on ? [...keys, key] : keys.filter((each) => each !== key);
     setChosen(remembered);
+    if (at.axis) location.hash = "#/scope"; // from now on it is the choice that is shown
   }
 
   if (!recording) return html`<h1>Scope</h1><p>No axis is known yet.</p>`;
@@ -58,6 +59,12 @@ function AxisChannels({ axis, keys, onToggle }) {
       );
     })}
   </fieldset>`;
+}
+
+/** The keys of the axis that the address names: all that tells its motion. */
+function ofAxis(axes, at) {
+  const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis);
+  return axis ? channelsOf(axis).filter(({ item }) => item === "position" || item === "velocity").map(({ key }) => key) : null;
 }
 
 /** The keys of the first axes' positions. */

@@ -74,7 +74,7 @@ function TraceForm({ axis }) {
         set.trigger &&
         html`<${Choice} label="When it is" options=${TRIGGER_KINDS.map((each) => [each, each])} ...${field("kind")} />
         <${Field} label="Level" hint="not used for signals" ...${field("level")} />
-        <${Field} label="Samples before" ...${field("pre_trigger")} min="0" step="1" />
+        <${Field} label="Samples before trigger" ...${field("pre_trigger")} min="0" step="1" />
         <${Field} label="Wait at most" unit="s" ...${field("timeout_s")} />`
       }
     </div>
@@ -126,6 +126,7 @@ function curvesOf(shown) {
         new Curve({
           label: `${one.axis.name} ${words(channel.name)}${nth ? ` (${clock(one.header.t)})` : ""}`,
           unit: channel.unit,
+          pane: channel.name === "following_error" ? `${channel.unit} error` : channel.unit,
           step: channel.signal,
           colour: look(count++).colour,
           dash: nth

@@ -150,7 +150,8 @@ function curvesOf(axis, run, nth) {
     new Curve({
       ...shown,
       label: `${run.number} following error`,
-      unit: `${unit} error`,
+      unit,
+      pane: `${unit} error`,
       colour: look(2 * nth + 1).colour,
       ys: flipped(error, 0),
     }),

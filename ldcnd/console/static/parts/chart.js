@@ -1,4 +1,4 @@
-/** A chart: one pane for each unit, one time axis for all. uPlot draws grids and axes, the curves draw themselves. */
+/** A chart: one pane for each unit, errors apart from positions, one time axis for all. uPlot draws grids and axes, the curves draw themselves. */
 
 import uPlot from "../vendor/uplot/uPlot.esm.js";
 
@@ -46,7 +46,7 @@ export class Chart {
   /** Show these curves; builds the panes anew. */
   show(curves) {
     this.curves = curves;
-    const units = [...new Set(curves.map((curve) => curve.unit))];
+    const units = [...new Set(curves.map((curve) => curve.pane))];
     this.#panes.forEach((pane) => pane.plot.destroy());
     this.#panes = (units.length ? units : [""]).map((unit, index, all) =>
       this.#pane(unit, index === all.length - 1, all.length),
@@ -100,7 +100,7 @@ export class Chart {
   }
 
   #shown(unit) {
-    return this.curves.filter((curve) => curve.unit === unit && !curve.hidden);
+    return this.curves.filter((curve) => curve.pane === unit && !curve.hidden);
   }
 
   #pane(unit, isLast, count) {

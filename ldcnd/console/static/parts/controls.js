@@ -1,6 +1,7 @@
 /** Controls: a button says in visible text why it cannot act now; a field has a label, a unit and a hint. */
 
 import { html, useId, useState } from "../html.js";
+import { inPageTerms } from "./remedies.js";
 import { faultPage } from "./state.js";
 
 /** A button that carries out `act`, shows what came of it, and cannot act while `obstacle` is a text.
@@ -48,7 +49,7 @@ export function RefusalText({ refusal }) {
   return html`<span class="refusal" role="alert">
     ${
       refusal &&
-      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${refusal.remedy}.</span>`}
+      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${inPageTerms(refusal.remedy)}.</span>`}
       ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`
     }
   </span>`;

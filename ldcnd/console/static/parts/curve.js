@@ -10,8 +10,8 @@ export class Curve {
   length;
   hidden = false;
 
-  constructor({ label, unit, colour, dash = [], step = false, gapS = GAP_S, xs, ys, length = xs.length }) {
-    Object.assign(this, { label, unit, colour, dash, step, gapS, xs, ys, length });
+  constructor({ label, unit, pane = unit, colour, dash = [], step = false, gapS = GAP_S, xs, ys, length = xs.length }) {
+    Object.assign(this, { label, unit, pane, colour, dash, step, gapS, xs, ys, length });
   }
 
   /** Index of the last point at or before a time; -1 when there is none. */

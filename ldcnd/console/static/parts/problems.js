@@ -1,4 +1,4 @@
-/** What is wrong, the worst first: the list that comes before everything else. */
+/** Faults and warnings, faults first: the list that comes before everything else. */
 
 import { number, words } from "./format.js";
 
@@ -10,16 +10,16 @@ const EDGE_HZ = 1;
 const ERRORS_A_MINUTE = 5;
 const COUNTERS = ["timeouts", "corrupt_replies", "rejected_packets"];
 
-/** Return `{level, text, places: [{where, link}]}` of everything that deserves a look, "bad" before "warn".
+/** Return `{level, text, places: [{where, link, detail}]}` of everything that needs attention, "bad" before "warn".
 
- * What is said of several axes is said once.
+ * What is said of several axes is said once. Values that change are details of a place, so that the list stands still.
  */
 export function problems(rigs) {
   const found = new Map();
-  for (const { level, text, where, link } of [...rigs].flatMap((rig) => [...ofRig(rig)])) {
+  for (const { level, text, where, link, detail } of [...rigs].flatMap((rig) => [...ofRig(rig)])) {
     const key = `${level} ${text}`;
     if (!found.has(key)) found.set(key, { level, text, places: [] });
-    found.get(key).places.push({ where, link });
+    found.get(key).places.push({ where, link, detail });
   }
   return [...found.values()].sort((one, other) => (one.level === other.level ? 0 : one.level === "bad" ? -1 : 1));
 }
@@ -32,7 +32,7 @@ function* ofRig(rig) {
   }
   if (rig.problem) yield { level: "bad", where: rig.name, text: rig.problem, link };
   if (rig.plan && !rig.plan.holds) {
-    yield { level: "warn", where: rig.name, text: "The plan of its lines does not hold.", link: "#/network" };
+    yield { level: "warn", where: rig.name, text: "A line is asked for more than it can carry.", link: "#/network" };
   }
   for (const bus of rig.buses.values()) yield* ofBus(rig, bus);
   for (const axis of rig.axes.values()) yield* ofAxis(rig, axis);
@@ -45,7 +45,7 @@ function* ofBus(rig, bus) {
   if (!bus.health) return;
   const errors = COUNTERS.reduce((sum, counter) => sum + bus.lately(counter), 0);
   if (errors > ERRORS_A_MINUTE) {
-    yield { ...at, level: "warn", text: `${errors} bad or missing replies within the last minute.` };
+    yield { ...at, level: "warn", text: "Bad or missing replies within the last minute:", detail: errors };
   }
   if (bus.health.utilisation > BUSY) yield { ...at, level: "warn", text: "The line is full." };
 }
@@ -53,8 +53,9 @@ function* ofBus(rig, bus) {
 function* ofAxis(rig, axis) {
   const at = { where: `${rig.name} · ${axis.name}`, link: `#/axis/${rig.name}/${axis.name}` };
   const { state, quality, health } = axis;
-  if (state?.link === "down") yield { ...at, level: "bad", text: "The drive does not answer." };
-  for (const fault of axis.faults)
+  const silent = state?.link === "down";
+  if (silent) yield { ...at, level: "bad", text: "The drive does not answer." };
+  for (const fault of silent ? [] : axis.faults)
     yield { ...at, level: fault.stops ? "bad" : "warn", text: `${words(fault.code)}: ${fault.text}` };
   if (state?.state === "error_stop" && !axis.faults.length && state.link !== "down") {
     yield { ...at, level: "bad", text: `In error stop: ${state.last_error ?? "reset it to go on"}` };
@@ -65,6 +66,6 @@ function* ofAxis(rig, axis) {
     yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
   const asked = health?.items.find(({ item }) => item === "position")?.asked_hz ?? health?.rate_wanted_hz;
   if (state?.link === "up" && health && health.rate_hz + EDGE_HZ < ENOUGH * asked) {
-    yield { ...at, level: "warn", text: `${number(health.rate_hz, 1)} samples a second instead of ${number(asked, 1)}.` };
+    yield { ...at, level: "warn", text: "Fewer samples a second than asked for:", detail: `${number(health.rate_hz, 0)} of ${number(asked, 0)}` };
   }
 }

@@ -12,11 +12,11 @@ const DASHES = [[], [8, 4], [2, 3]];
 
 /** One quantity of one axis. */
 export class Channel {
-  constructor(axis, item, field, title, unit) {
-    Object.assign(this, { axis, item, field, title, unit });
+  constructor(axis, item, field, title, unit, pane = unit) {
+    Object.assign(this, { axis, item, field, title, unit, pane });
     this.key = `${axis.rig.name}/${axis.name}/${item}/${field}`;
     this.stream = `${axis.rig.name}/${axis.name}/${item}`;
-    this.label = `${axis.name} ${title}`;
+    this.label = `${axis.rig.name} · ${axis.name} ${title}`;
   }
 
   /** How far apart samples may be before the line between them breaks. */
@@ -31,7 +31,7 @@ export function channelsOf(axis) {
   const found = [new Channel(axis, "position", "value", "position", unit)];
   found.push(new Channel(axis, "velocity", "value", "velocity", `${unit}/s`));
   if (axis.info.capabilities.includes("power")) {
-    found.push(new Channel(axis, "position", "following_error", "following error", unit));
+    found.push(new Channel(axis, "position", "following_error", "following error", unit, `${unit} error`));
   }
   if (items.includes("adc")) found.push(new Channel(axis, "adc", "volts", "A/D", "V"));
   for (const name of monitors) {
@@ -56,8 +56,8 @@ export class Recording {
   constructor(channels) {
     this.channels = channels;
     this.curves = channels.map((channel, index) => {
-      const { label, unit, gapS } = channel;
-      const curve = new GrowingCurve({ label, unit, gapS, ...look(index) }, KEPT);
+      const { label, unit, pane, gapS } = channel;
+      const curve = new GrowingCurve({ label, unit, pane, gapS, ...look(index) }, KEPT);
       const topic = `${channel.axis.rig.name}/tele/${channel.axis.name}/${channel.item}`;
       this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, field: channel.field }]);
       return curve;

@@ -5,6 +5,8 @@ import { moves } from "./obstacles.js";
 import { askHolders, changed, rigs } from "./rigs.js";
 
 const OPEN_AGAIN_MS = 1_000;
+/** As the console's `HELD_S` wants it, several times over. */
+const HELD_EACH_MS = 100;
 const MOTIONS = new Set([
   "move_absolute",
   "move_relative",
@@ -23,6 +25,12 @@ export let client = null;
 
 /** Why control was lost last, for people; null when it was not. */
 export let lost = null;
+
+/** Why a jog did not begin, or ended by itself; null when the last one did what the hand did. */
+export let jogRefusal = null;
+
+let socket = null;
+let holding = 0;
 
 /** Forget what was lost: the operator has seen it. */
 export function dismissLost() {
@@ -71,6 +79,28 @@ export function question(axis, verb, body = {}) {
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, given(body));
 }
 
+/** Run an axis until `endJog`; the console halts it by itself when this page falls silent. */
+export function beginJog(axis, velocity) {
+  endJog();
+  jogRefusal = null;
+  noteMoved(axis);
+  say({ jog: { rig: axis.rig.name, axis: axis.name, velocity } });
+  holding = setInterval(() => say({ held: true }), HELD_EACH_MS);
+  changed();
+}
+
+/** Halt the axis that jogs. */
+export function endJog() {
+  if (!holding) return;
+  clearInterval(holding);
+  holding = 0;
+  say({ held: false });
+}
+
+function say(message) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+}
+
 /** Note that this page has set an axis in motion. */
 export function noteMoved(axis) {
   if (held.has(axis)) held.set(axis, true);
@@ -85,16 +115,21 @@ export function keepControl() {
 }
 
 function open() {
-  const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/api/page`);
+  socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/api/page`);
   socket.onmessage = ({ data }) => {
     const told = JSON.parse(data);
     if (told.page) {
       client = told.client;
       nameThisPage(told.page);
     } else if (told.lost) forget(told.lost);
+    else if (told.refused) {
+      endJog();
+      jogRefusal = told.refused;
+    }
     changed();
   };
   socket.onclose = () => {
+    endJog();
     client = null;
     nameThisPage(null);
     if (held.size) {

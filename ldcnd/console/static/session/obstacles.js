@@ -4,22 +4,22 @@ import { controls } from "./control.js";
 
 const MOVING = new Set(["homing", "discrete_motion", "continuous_motion", "stopping"]);
 
-const heard = (axis) => axis.rig.worth && "No data from this rig: what the axis does is not known here.";
+const heard = (axis) => axis.rig.worth && "No data from this rig: the state of the axis is unknown.";
 const reachable = (axis) => axis.state?.link === "down" && "The drive does not answer: check its power and the line.";
 const unlatched = (axis) => axis.state?.stop_latched && "A stop is latched: reset first.";
-const faultless = (axis) => axis.state?.state === "error_stop" && "It is in error stop: remove the cause, then reset.";
-const enabled = (axis) => axis.state && !axis.state.enabled && "It is disabled: enable it first.";
-const disabled = (axis) => axis.state?.enabled && "It is enabled already.";
-const standing = (axis) => moves(axis) && "It moves: halt it and wait.";
-const moving = (axis) => axis.state && !moves(axis) && axis.state.moving === "no" && "It stands already.";
+const faultless = (axis) => axis.state?.state === "error_stop" && "The axis is in error stop: remove the cause, then reset.";
+const enabled = (axis) => axis.state && !axis.state.enabled && "The axis is disabled: enable it first.";
+const disabled = (axis) => axis.state?.enabled && "The axis is enabled already.";
+const standing = (axis) => moves(axis) && "The axis moves: halt it and wait.";
+const moving = (axis) => axis.state && !moves(axis) && axis.state.moving === "no" && "The axis is not moving.";
 const referenced = (axis) =>
-  axis.state && !axis.state.referenced && "It is not referenced: home it, or tell it where it is.";
+  axis.state && !axis.state.referenced && "The axis is not homed: home it, or set its current position.";
 const resettable = (axis) =>
   axis.state &&
   !axis.state.stop_latched &&
   axis.state.state !== "error_stop" &&
   !axis.faults.length &&
-  "There is nothing to reset: no stop is latched, no fault stands.";
+  "Nothing to reset: no stop is latched, no fault is active.";
 
 function controlled(axis) {
   if (controls(axis)) return false;

@@ -1,0 +1,81 @@
+/** Jog: run for as long as a button or an arrow key is held, or move by a step. */
+
+import { html, useEffect, useId, useRef, useState } from "../html.js";
+import { Action, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
+import { number } from "../parts/format.js";
+import { beginJog, command, endJog, jogRefusal } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+
+const STEPS = [-10, -1, -0.1, 0.1, 1, 10];
+/** At first a jog has this share of the velocity limit: slow enough to let go in time. */
+const FIRST_SHARE = 0.1;
+const KEYS = { ArrowLeft: -1, ArrowRight: 1 };
+
+export function JogPanel({ axis }) {
+  const [speed, setSpeed] = useState(axis.info.limits.velocity * FIRST_SHARE);
+  const reason = useId();
+  const { unit } = axis.info;
+  const missing = speed > 0 ? null : "A speed above 0 is missing.";
+  const way = obstacle(axis, "move_velocity", true) ?? missing;
+  const stepWay = obstacle(axis, "move_relative") ?? missing;
+
+  return html`<${Panel} title="Jog" note="Runs while you hold a button or, with a button focused, an arrow key; letting go halts.">
+    <div class="fields">
+      <${Field} label="Speed" unit=${`${unit}/s`} value=${speed} onChange=${setSpeed} min="0" />
+    </div>
+    <p class="row jog" role="group" aria-label=${`Jog ${axis.name}`}>
+      <${HoldButton} axis=${axis} velocity=${-speed} way=${way} reason=${reason}>◀ Hold to run −<//>
+      <${HoldButton} axis=${axis} velocity=${speed} way=${way} reason=${reason}>Hold to run + ▶<//>
+    </p>
+    ${axis.can("move_relative") && html`<p class="row steps" role="group" aria-label=${`Steps of ${axis.name}`}>
+      ${STEPS.map((step) => html`<${Action} key=${step} obstacle=${stepWay} reason=${reason}
+        act=${() => command(axis, "move_relative", { distance: step, velocity: speed })}
+        >${step > 0 ? "+" : ""}${number(step, Math.abs(step) < 1 ? 1 : 0)} ${unit}<//>`)}
+    </p>`}
+    ${(way ?? stepWay) && html`<${Reason} id=${reason} text=${way ?? stepWay} />`}
+    <${RefusalText} refusal=${jogRefusal} />
+  <//>`;
+}
+
+/** A button that lets an axis run while it is held, whatever ends that: finger, key, focus, window or page. */
+function HoldButton({ axis, velocity, way, reason, children }) {
+  const holding = useRef(false);
+
+  function begin() {
+    if (way || holding.current) return;
+    holding.current = true;
+    beginJog(axis, velocity);
+  }
+  function end() {
+    if (!holding.current) return;
+    holding.current = false;
+    endJog();
+  }
+  useEffect(() => {
+    const hidden = () => document.hidden && end();
+    addEventListener("blur", end);
+    document.addEventListener("visibilitychange", hidden);
+    return () => {
+      end();
+      removeEventListener("blur", end);
+      document.removeEventListener("visibilitychange", hidden);
+    };
+  }, []);
+
+  const mine = (event) => event.key === " " || event.key === "Enter" || KEYS[event.key] === Math.sign(velocity);
+  return html`<button type="button" class="hold" aria-disabled=${way ? "true" : null}
+    aria-describedby=${way ? reason : null}
+    onPointerDown=${(event) => {
+      if (event.button !== 0) return;
+      event.target.setPointerCapture(event.pointerId);
+      begin();
+    }}
+    onPointerUp=${end} onPointerCancel=${end} onLostPointerCapture=${end} onBlur=${end}
+    onContextMenu=${(event) => event.preventDefault()}
+    onKeyDown=${(event) => {
+      if (!mine(event)) return;
+      event.preventDefault();
+      if (!event.repeat) begin();
+    }}
+    onKeyUp=${(event) => mine(event) && end()}>${children}</button>`;
+}

@@ -1,0 +1,72 @@
+"""What can be commanded without typing: all axes of a rig, one of a row, and a jog for as long as it is held."""
+
+import pytest
+
+from ldcnd.model.rig_commands import ListHolders
+
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+expect = playwright.expect
+
+pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+
+AXES = ("x", "y", "z", "c")
+
+
+async def holders(house):
+    told = await house.sim.rig.ask(ListHolders())
+    return {each.axis: each.client for each in told.holders}
+
+
+async def test_the_rig_page_takes_enables_halts_and_releases_all_axes(house):
+    await house.sim.quiet(*AXES)
+    async with house.desk() as desk:
+        await desk.open("rig")
+        every = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        await every.get_by_role("button", name="Take control of all").click()
+        await every.get_by_role("button", name="Enable all").click()
+        for axis in AXES:
+            await house.sim.until(axis, lambda state: state.enabled)
+        assert len(set((await holders(house)).values())) == 1
+
+        one = desk.page.get_by_role("group", name="Commands for y", exact=True)
+        await one.get_by_role("button", name="Disable y").click()
+        await house.sim.until("y", lambda state: not state.enabled)
+        await expect(one.get_by_role("button", name="Halt y")).to_be_disabled()
+        await expect(one.get_by_role("button", name="Halt y")).to_have_attribute("title", "The axis is not moving.")
+
+        await every.get_by_role("button", name="Release control").click()
+        await expect(every.get_by_role("button", name="Take control of all")).to_be_visible()
+        assert set((await holders(house)).values()) == {None}
+
+
+async def test_a_jog_runs_while_the_button_or_an_arrow_key_is_held(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        jog = desk.panel("Jog")
+        await jog.get_by_label("Speed mm/s").fill("2")
+        forward, backward = (jog.get_by_role("button", name=f"Hold to run {way}") for way in ("+", "−"))  # noqa: RUF001
+        away, back, key = (forward, backward, "ArrowLeft")
+        if await house.sim.position("x") > 0:
+            away, back, key = (backward, forward, "ArrowRight")
+
+        box = await away.bounding_box()
+        await desk.page.mouse.move(box["x"] + 20, box["y"] + 10)
+        await desk.page.mouse.down()
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await desk.page.mouse.up()
+        await house.sim.until("x", lambda state: state.moving == "no")
+
+        await back.focus()
+        await desk.page.keyboard.down(key)
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await desk.page.keyboard.up(key)
+        state = await house.sim.until("x", lambda state: state.moving == "no")
+        assert not state.stop_latched
+
+        before = await house.sim.position("x")
+        await jog.get_by_role("button", name="+1 mm", exact=True).click()
+        await house.sim.reaches("x", before + 1, within=0.05)
