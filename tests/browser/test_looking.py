@@ -87,7 +87,7 @@ async def test_the_scope_follows_a_motion_and_measures_between_cursors(house):
         await desk.button("Zoom in").click()
         await expect(desk.button("Resume")).to_be_visible()
         rows = list(csv.DictReader(io.StringIO((await saved(desk, "Save CSV")).read_text(encoding="utf-8"))))
-        assert any(row["channel"] == "x velocity" and -6 < float(row["value"]) < -1 for row in rows)
+        assert any(row["channel"] == "sim · x velocity" and -6 < float(row["value"]) < -1 for row in rows)
 
 
 async def test_a_test_move_is_judged_and_writes_nothing(house):

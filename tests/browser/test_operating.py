@@ -136,7 +136,7 @@ async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
         await desk.button("Reset z").click()
         await expect(faults).to_have_count(0)
         await desk.button("Enable").click()
-        await expect(desk.panel("Can it move?")).to_contain_text("Yes")
+        await expect(desk.panel("Can it move?")).to_contain_text("Ready to move")
         before = await house.sim.position("z")
         await desk.button("Move").click()
         await house.sim.reaches("z", before + 2, within=0.05)
