@@ -8,6 +8,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.numbers import Finite
+from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import WrongState
 from ldcnd.model.commands import MoveVelocity, Power
@@ -75,14 +76,17 @@ def bus_loss(target: Target, axis: str, velocity: float) -> None:
 
 
 async def _rehearse(client: RigClient, axis: str, velocity: float, kind: str) -> dict[str, float]:
-    await client.command(axis, Power(on=True))
-    await client.command(axis, MoveVelocity(velocity=velocity))
-    await asyncio.sleep(RUN_UP_S)
+    """Play a loss under control of the whole rig: a lost line concerns all axes on it."""
     loop = asyncio.get_running_loop()
-    began_s = loop.time()
-    await client.ask(Rehearse.model_validate({"kind": kind, "axis": axis}), timeout_s=PATIENCE_S)
-    answered_s = loop.time()
-    reacted_s, stands_s = await _watch(client, axis)
+    async with control(client, "drill", lease_s=PATIENCE_S) as held:
+        await held.command(axis, Power(on=True))
+        await held.command(axis, MoveVelocity(velocity=velocity))
+        await asyncio.sleep(RUN_UP_S)
+        began_s = loop.time()
+        request = Rehearse.model_validate({"kind": kind, "axis": axis, "lease": held.lease.lease})
+        await client.ask(request, timeout_s=PATIENCE_S)
+        answered_s = loop.time()
+        reacted_s, stands_s = await _watch(client, axis)
     return {
         "carried_out_s": answered_s - began_s,
         "reacted_s": reacted_s - began_s,

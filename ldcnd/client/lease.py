@@ -71,15 +71,23 @@ class Control:
                 until_s = asked_at_s + lease_s
         self.over.set()
 
-    async def release(self) -> None:
-        """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told."""
+    async def release(self, *, leave_running: bool = False) -> None:
+        """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told.
+
+        An axis that moves then does what its `loss.client` says, unless it is left running on purpose.
+        """
         with contextlib.suppress(LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError):
-            await self._client.ask(Release(lease=self.lease.lease))
+            await self._client.ask(Release(lease=self.lease.lease, leave_running=leave_running))
 
 
 @contextlib.asynccontextmanager
 async def control(
-    client: RigClient, name: str, *axes: str, lease_s: float = 1.0, force: bool = False
+    client: RigClient,
+    name: str,
+    *axes: str,
+    lease_s: float = 1.0,
+    force: bool = False,
+    leave_running: bool = False,
 ) -> AsyncIterator[Control]:
     """Hold control over axes (all, when none is named) until the context ends.
 
@@ -89,6 +97,8 @@ async def control(
         axes: what to control.
         lease_s: how soon the daemon shall act when this program disappears, 0.2 to 60 s.
         force: take control away from whoever has it.
+        leave_running: let what still moves at the end go on, with nobody in control; otherwise it does what its
+            `loss.client` says.
 
     Raises:
         LeaseHeld: somebody else controls one of the axes.
@@ -102,7 +112,7 @@ async def control(
                 yield held
             finally:
                 keeper.cancel()
-                await held.release()
+                await held.release(leave_running=leave_running)
     except BaseExceptionGroup as errors:
         # the renewals never fail, so this is the caller's own error: it is raised as itself
         if len(errors.exceptions) > 1:

@@ -46,6 +46,8 @@ class LeaseRequest(Frozen):
 
     lease: str
     """As the reply to acquire named it."""
+    leave_running: bool = False
+    """With release: let what moves go on to its own end, with nobody in control; without effect on renew."""
 
 
 class Renew(LeaseRequest, Command[LeaseReply]):
@@ -58,7 +60,7 @@ class Renew(LeaseRequest, Command[LeaseReply]):
 
 
 class Release(LeaseRequest, Command[LeaseReply]):
-    """Give a lease back."""
+    """Give a lease back; an axis that still moves does what its policy for the loss of a client says."""
 
     model_config = ConfigDict(title="LeaseRequest")
 
@@ -154,6 +156,8 @@ class Rehearse(Command[RehearsalReply]):
     """Who is to disappear."""
     axis: str
     """Whose policy is rehearsed; a lost line concerns all axes on it."""
+    lease: str | None = None
+    """The sender's lease: it must cover the axis, or all axes on the line, where a motion of them would need one."""
 
 
 class WireLogReply(Frozen):

@@ -161,6 +161,8 @@ class StateSample(Sample):
     """Whether the drive answers."""
     stop_latched: bool
     """A stop is latched; only reset clears it."""
+    stop_pending: bool = False
+    """A stop was asked for and the drive has not confirmed it: it is sent again until it does, and nothing moves."""
     command: CurrentCommand | None
     """What it is doing."""
     last_error: str | None = None

@@ -45,6 +45,7 @@ from ldcnd.model.commands import (
     Stop,
     Verb,
 )
+from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import LinkState, Moving, TelemetryItem
 
 log = get_logger("axis")
@@ -143,8 +144,24 @@ class AxisTurns:
                 await self._woken.wait()
 
 
+Note = Callable[[str, str, CommandStatus, str], None]
+"""Takes what happened to an axis outside any command, for the events: axis, verb, status, reason."""
+
+
+def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str) -> None:
+    pass
+
+
+STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
+"""Of two stops that no drive has confirmed, the stronger one is sent again."""
+
+
 class AxisService:
-    """The commands, the state and the telemetry of one axis."""
+    """The commands, the state and the telemetry of one axis.
+
+    Attributes:
+        stop_wanted: set when a stop waits to be sent again; its line sees to that.
+    """
 
     def __init__(
         self,
@@ -155,6 +172,7 @@ class AxisService:
         clock: Clock,
         next_command_id: Callable[[], str],
         ended: Ended,
+        note: Note = _no_note,
     ) -> None:
         self.config = config
         self.driver = driver
@@ -173,6 +191,7 @@ class AxisService:
         self._bus = bus
         self._clock = clock
         self._next_command_id = next_command_id
+        self._note = note
         self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
         self._commands = AxisCommands(self._motion)
         self._plausibility = PlausibilityGate(config, self.scale)
@@ -181,6 +200,10 @@ class AxisService:
         channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
         tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
         self.traces = TraceRecorder(config.name, tracer, publisher, clock)
+        self.stop_wanted = asyncio.Event()
+        self._pending: StopMode | None = None
+        self._reachable = False
+        self._seen = False
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
 
@@ -214,12 +237,14 @@ class AxisService:
 
     def connected(self, *, referenced: bool) -> None:
         """The line came up; `referenced` when the drive's position is known to be right."""
+        self._reachable = True
         self.tracker.referenced = referenced
         if referenced:
             self.telemetry.origin_counts = 0.0
 
     def disconnected(self) -> None:
         """The line is gone."""
+        self._reachable = False
         self.traces.disconnected()
         self._plausibility.forget()
         self.tracker.disconnected(self._clock.now_ns())
@@ -243,6 +268,9 @@ class AxisService:
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Digest a reading that is believed."""
+        self._seen = True
+        if self._pending is not None:
+            self.stop_wanted.set()  # it answers again
         was_referenced = self.tracker.referenced
         self.tracker.observed(reading, timing, self._clock.now_ns())
         if was_referenced and not self.tracker.referenced:
@@ -369,16 +397,45 @@ class AxisService:
         self._changed.set()
         overtaken = self._gate.overtaken("a queued command")
         self._turns.refuse(overtaken)
-        self._bus.withdraw(self.driver.spec.address, overtaken)
-        if not self.tracker.energised:
-            mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
+        if self._pending is None or STRENGTH[mode] > STRENGTH[self._pending]:
+            self._pending = mode
         try:
-            return await self._confirmed_stop(mode, verb)
+            if not self._reachable:
+                return False  # its line is being brought up, or is down: it is the first thing that is sent then
+            self._bus.withdraw(self.driver.spec.address, overtaken)
+            return await self._confirmed_stop(mode, verb, STOP_ROUNDS)
         finally:
+            if self._pending is not None:
+                self._not_confirmed()
             self.telemetry.state(self._clock.now_ns())
 
-    async def _confirmed_stop(self, mode: StopMode, verb: Verb) -> bool:
-        for _ in range(STOP_ROUNDS):
+    async def send_pending_stop(self) -> None:
+        """Send a stop again that the drive has not confirmed, whatever is known of the axis."""
+        if self._pending is None:
+            return
+        try:
+            if not self._seen:  # a stop would close the loop of a disabled axis: see how the drive was left
+                asked_s = self._clock.now_s()
+                reading = await self._read()
+                now_s = self._clock.now_s()
+                self.observed(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
+        except BusError as error:
+            log.warning("stop not sent again", axis=self.config.name, reason=error.message)
+            return
+        if await self._confirmed_stop(self._pending, Verb.STOP, rounds=1):
+            log.warning("stop confirmed late", axis=self.config.name)
+            self._note(self.config.name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")
+        self.telemetry.state(self._clock.now_ns())
+
+    def cannot_move(self) -> None:
+        """Its drive was reset or had no power: what it was told to stop has ended."""
+        self._pending = None
+        self.tracker.stop_confirmed()
+
+    async def _confirmed_stop(self, mode: StopMode, verb: Verb, rounds: int) -> bool:
+        if not self.tracker.energised:
+            mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
+        for _ in range(rounds):
             try:
                 await self.driver.stop(mode)
             except BusError as error:
@@ -390,8 +447,16 @@ class AxisService:
                 self.tracker.powered(on=False, now_s=self._clock.now_s())
             else:
                 self._commands.brought_to_rest(self._next_command_id(), verb)
+            if self._pending is None or STRENGTH[mode] >= STRENGTH[self._pending]:
+                self._pending = None
+                self.tracker.stop_confirmed()
             return True
         return False
+
+    def _not_confirmed(self) -> None:
+        """A stop stays to be sent: its line sends it again, before anything else to this drive."""
+        self.tracker.stop_unconfirmed(self._clock.now_ns())
+        self.stop_wanted.set()
 
     async def _obey(self, turn: Turn, command: AxisCommand[CommandReply]) -> CommandReply:
         turn.permit.ask()

@@ -41,7 +41,7 @@ from ldcnd.model.commands import (
     Track,
     Verb,
 )
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.model.samples import AxisState, LinkState, Moving
 
 STEP_RETRY_S = 0.2
 """A step whose packets were lost is taken again so much later,"""
@@ -222,7 +222,7 @@ class AxisCommands:
     async def _halt(self, turn: Turn) -> CommandReply:
         view = self._tracker.view()
         guards.check_reachable(view)
-        if view.state in guards.MOTION_STATES:
+        if view.state in guards.MOTION_STATES or self._moves_by_force():
             await self._driver.stop(StopMode.SMOOTH)
             self.brought_to_rest(turn.command_id, turn.verb)
         return self._motion.reply(turn)
@@ -232,7 +232,15 @@ class AxisCommands:
         tracker = self._tracker
         view = tracker.view()
         guards.check_reachable(view)
+        guards.check_stop_confirmed(view)
         guards.check_stands(view)  # a stop that is under way keeps its latch
+        if tracker.state is AxisState.ERROR_STOP and self._moves_by_force():
+            raise WrongState(
+                f"axis {view.name} still moves, or may: a reset would switch its motor off at speed",
+                axis=view.name,
+                value=tracker.moving.value,
+                remedy="send halt, wait until it stands, then send reset",
+            )
         if tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults):
             await self._driver.reset()
             self._drop_procedure()
@@ -242,6 +250,10 @@ class AxisCommands:
         tracker.cleared(self._motion.clock.now_s())
         self._motion.publish_state()
         return self._motion.reply(turn)
+
+    def _moves_by_force(self) -> bool:
+        """Tell whether the motor has voltage and turns, or may, whatever the state says."""
+        return self._tracker.energised and self._tracker.moving is not Moving.NO
 
     # -- motion ------------------------------------------------------------------------------------------------------
 

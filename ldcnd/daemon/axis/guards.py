@@ -32,6 +32,7 @@ class AxisView:
     stop_latched: bool
     link: LinkState
     faults: tuple[str, ...]
+    stop_pending: bool = False
 
 
 def check_reachable(axis: AxisView) -> None:
@@ -43,9 +44,20 @@ def check_reachable(axis: AxisView) -> None:
 
 
 def check_not_latched(axis: AxisView) -> None:
-    """Refuse while a stop is latched."""
+    """Refuse while a stop is latched, or not confirmed by the drive."""
+    check_stop_confirmed(axis)
     if axis.stop_latched:
         raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy="send reset")
+
+
+def check_stop_confirmed(axis: AxisView) -> None:
+    """Refuse while the drive has not confirmed a stop."""
+    if axis.stop_pending:
+        raise StopLatched(
+            f"axis {axis.name}: the drive has not confirmed a stop yet",
+            axis=axis.name,
+            remedy="wait: it is sent again until the drive confirms it; check the drive and its line",
+        )
 
 
 def check_not_in_error(axis: AxisView) -> None:

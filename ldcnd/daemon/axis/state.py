@@ -22,6 +22,11 @@ for rest."""
 MOST_REST_S = 2.0
 """A shaft that crept out of that band must stay in it for twice as long as it took, at most this."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
+STOP_UNCONFIRMED = Fault(
+    "stop_unconfirmed",
+    "a stop was asked for and the drive has not confirmed it; it is sent again until the drive does",
+    stops=False,
+)
 LOOP_OPENED = Fault("loop_opened", "the drive opened its position loop by itself; find out why, then send reset")
 
 JUMPED = Fault(
@@ -142,6 +147,7 @@ class AxisTracker:
         self.referenced = False
         self.position_lost = False
         self.stop_latched = False
+        self.stop_pending = False
         self.link = LinkState.DOWN
         self.command: ActiveCommand | None = None
         self.last_error: str | None = None
@@ -167,6 +173,7 @@ class AxisTracker:
             self.stop_latched,
             self.link,
             tuple(fault.text for fault in self.active_faults),
+            self.stop_pending,
         )
 
     @property
@@ -270,18 +277,9 @@ class AxisTracker:
 
     def _faults(self, faults: tuple[Fault, ...], now_ns: int) -> None:
         known = {entry.code: entry for entry in self.active_faults}
-        self.active_faults = tuple(
-            known.get(fault.code)
-            or FaultEntry(
-                code=fault.code,
-                text=fault.text,
-                since=now_ns,
-                source="daemon" if fault in (LINK_LOST, LOOP_OPENED, JUMPED) else "drive",
-                stops=fault.stops,
-                page=page_of(fault.code),
-            )
-            for fault in faults
-        )
+        if self.stop_pending:
+            faults = (*faults, STOP_UNCONFIRMED)
+        self.active_faults = tuple(known.get(fault.code) or _entry(fault, now_ns) for fault in faults)
         if self.first_fault is None and self.active_faults:
             self.first_fault = self.active_faults[0]
 
@@ -330,6 +328,17 @@ class AxisTracker:
         """A stop was asked for: nothing moves again before reset."""
         self.stop_latched = True
 
+    def stop_unconfirmed(self, now_ns: int) -> None:
+        """A stop was asked for and no drive has confirmed it."""
+        if not self.stop_pending:
+            self.stop_pending = True
+            self.active_faults = (*self.active_faults, _entry(STOP_UNCONFIRMED, now_ns))
+
+    def stop_confirmed(self) -> None:
+        """The drive has confirmed what was asked for, or cannot be moving: it was reset, or had no power."""
+        self.stop_pending = False
+        self.active_faults = tuple(fault for fault in self.active_faults if fault.code != STOP_UNCONFIRMED.code)
+
     def powered(self, *, on: bool, now_s: float) -> None:
         """The drive acknowledged a change of power."""
         self._effective_from_s = now_s
@@ -355,6 +364,17 @@ class AxisTracker:
         self.last_error = None
         if self.state is AxisState.ERROR_STOP:
             self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
+
+
+def _entry(fault: Fault, now_ns: int) -> FaultEntry:
+    return FaultEntry(
+        code=fault.code,
+        text=fault.text,
+        since=now_ns,
+        source="daemon" if fault in (LINK_LOST, LOOP_OPENED, JUMPED, STOP_UNCONFIRMED) else "drive",
+        stops=fault.stops,
+        page=page_of(fault.code),
+    )
 
 
 class ObservedTracker(AxisTracker):

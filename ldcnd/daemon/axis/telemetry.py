@@ -22,7 +22,7 @@ from ldcnd.model.samples import (
     VelocitySample,
 )
 
-StateKey = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, ActiveCommand | None, str | None]
+StateKey = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None]
 FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
 
 # five of each poll, of values that are checked when they come off the wire
@@ -170,13 +170,14 @@ def _state_of(tracker: AxisTracker) -> StateKey:
         tracker.moving,
         tracker.link,
         tracker.stop_latched,
+        tracker.stop_pending,
         tracker.command,
         tracker.last_error,
     )
 
 
 def _sample_of_state(known: StateKey, t: int, t_error_ns: int, seq: int) -> StateSample:
-    quality, state, enabled, referenced, moving, link, stop_latched, command, last_error = known
+    quality, state, enabled, referenced, moving, link, stop_latched, stop_pending, command, last_error = known
     return _state_sample(
         t=t,
         t_error_ns=t_error_ns,
@@ -188,6 +189,7 @@ def _sample_of_state(known: StateKey, t: int, t_error_ns: int, seq: int) -> Stat
         moving=moving,
         link=link,
         stop_latched=stop_latched,
+        stop_pending=stop_pending,
         command=command and _current(command),
         last_error=last_error,
     )

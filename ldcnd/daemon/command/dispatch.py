@@ -12,7 +12,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, Lease
 from ldcnd.daemon.command.events import EventLog
 from ldcnd.daemon.command.ledger import Entry, Ledger
-from ldcnd.daemon.command.loss import rehearse
+from ldcnd.daemon.command.loss import LeaseWatch, concerned, rehearse
 from ldcnd.daemon.command.why import explain
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import (
@@ -25,7 +25,6 @@ from ldcnd.errors import (
     OutcomeUnknown,
     RequestRefused,
 )
-from ldcnd.log import get_logger
 from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model.commands import (
     AxisCommand,
@@ -57,14 +56,13 @@ from ldcnd.model.rig_commands import (
     Renew,
 )
 
-log = get_logger("authority")
-
 
 class Dispatcher:
     """Hands every command to what carries it out, each command id at most once, and keeps the outcomes.
 
     Attributes:
         authority: the leases of the rig.
+        leases: gives control and ends it.
         events: what happens to its commands.
         rival: another daemon that serves the same rig; while there is one, nothing is moved.
     """
@@ -80,6 +78,7 @@ class Dispatcher:
         instance: str,
     ) -> None:
         self.authority = authority
+        self.leases = LeaseWatch(rig, authority, events, clock, next_command_id)
         self.events = events
         self.rival: str | None = None
         self._journal = Journal(rig)
@@ -116,6 +115,7 @@ class Dispatcher:
             case MoveTogether():
                 return MoveTogetherReply(replies=await self._move_together(command, login))
             case Rehearse():
+                self._admit_rehearsal(command)
                 return await rehearse(self._rig, command)
             case _:
                 return self._of_rig(command)
@@ -187,7 +187,10 @@ class Dispatcher:
             if not self._rig.axis(name).stoppable:
                 status, reason = CommandStatus.REFUSED, "its drive cannot be stopped over its line"
             elif name not in confirmed:
-                status, reason = CommandStatus.UNKNOWN, "the drive did not confirm it; the axis is latched"
+                status, reason = (
+                    CommandStatus.UNKNOWN,
+                    "the drive did not confirm it yet; the axis is latched",
+                )
             command_id = self._next_command_id()
             self._ledger.open(Entry(command_id, name, command, command.client, login, status, reason))
 
@@ -199,6 +202,12 @@ class Dispatcher:
             self.authority.admit(axis.config.name, request.lease, None, self._clock.now_s())
 
         return explain(axis.tracker, admit, absolute=request.absolute)
+
+    def _admit_rehearsal(self, command: Rehearse) -> None:
+        """Refuse a loss played on axes that its sender may not move."""
+        for axis in concerned(self._rig, command):
+            self._refuse_rival(axis)
+            self.authority.admit(axis, command.lease, None, self._clock.now_s())
 
     async def _answer_again(self, entry: Entry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""
@@ -270,9 +279,7 @@ class Dispatcher:
             case Renew():
                 return _reply(self.authority.renew(command.lease, now_s))
             case Release():
-                lease = self.authority.release(command.lease, now_s)
-                log.info("control released", client=lease.client, axes=sorted(lease.axes))
-                return _reply(lease)
+                return _reply(self.leases.release(command.lease, leave_running=command.leave_running))
             case ListHolders():
                 return self._holders()
             case ReadOutcome():
@@ -285,14 +292,8 @@ class Dispatcher:
                 raise InternalError(f"nothing carries out {command.verb}")
 
     def _acquire(self, request: Acquire) -> LeaseReply:
-        lease, displaced = self.authority.acquire(
-            request.client, self._rig.members(request.axes), request.lease_s, self._clock.now_s(), force=request.force
-        )
-        for other in displaced:
-            if other.client != lease.client:
-                log.warning("control taken over", axes=sorted(other.axes), from_client=other.client, by=lease.client)
+        lease = self.leases.acquire(request)
         self._journal.asked(RIG_ITSELF, request, lease.token)
-        log.info("control acquired", client=lease.client, axes=sorted(lease.axes))
         return _reply(lease)
 
     def _holders(self) -> HolderList:

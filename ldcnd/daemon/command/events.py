@@ -11,7 +11,7 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import LdcndError, SessionError
 from ldcnd.log import get_logger
 from ldcnd.messaging.codec import to_json
-from ldcnd.model.events import CommandEvent, EventList, ReadEvents
+from ldcnd.model.events import CommandEvent, CommandStatus, EventList, ReadEvents
 
 log = get_logger("events")
 
@@ -84,20 +84,56 @@ class EventLog:
             reason=entry.reason,
             code=error.code.value if error else None,
         )
+        self._deliver(event)
+
+    def note(
+        self,
+        command_id: str,
+        axis: str,
+        verb: str,
+        status: CommandStatus,
+        reason: str,
+        *,
+        client: str | None = None,
+        login: str | None = None,
+        code: str | None = None,
+    ) -> None:
+        """Enter what concerns an axis and is in no ledger: control that was lost or refused, a stop confirmed late."""
+        self.tell()
+        seq = self._sequence.get(axis, 0)
+        self._sequence[axis] = seq + 1
+        event = CommandEvent(
+            t=self._clock.now_ns(),
+            seq=seq,
+            run=self._run,
+            number=self._end,
+            axis=axis,
+            command_id=command_id,
+            verb=verb,
+            client=client,
+            login=login,
+            status=status,
+            reason=reason,
+            code=code,
+        )
+        self._end += 1
+        self._deliver(event)
+
+    def _deliver(self, event: CommandEvent) -> None:
         self._kept.append(event)
         try:
             self._publisher.publish_event(event)
         except SessionError as error:  # who asks for events still finds it
-            log.warning("event not published", axis=entry.axis, command_id=entry.command_id, reason=error.message)
+            log.warning("event not published", axis=event.axis, command_id=event.command_id, reason=error.message)
         log.info(
             "command",
-            axis=entry.axis,
-            command_id=entry.command_id,
-            verb=entry.verb.value,
-            client=entry.client,
-            login=entry.login,
-            status=entry.status.value,
-            reason=entry.reason,
+            axis=event.axis,
+            command_id=event.command_id,
+            verb=event.verb,
+            client=event.client,
+            login=event.login,
+            status=event.status.value,
+            reason=event.reason,
         )
 
     def page(self, request: ReadEvents) -> EventList:

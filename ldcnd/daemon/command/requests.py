@@ -5,7 +5,6 @@ from collections.abc import Awaitable, Callable
 
 from ldcnd.daemon.capture.flight_recorder import Journal
 from ldcnd.daemon.command.dispatch import Dispatcher
-from ldcnd.daemon.command.loss import LeaseWatch
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import InternalError, LdcndError, ShuttingDown, TooManyRequests, UnknownVerb
 from ldcnd.log import LogLimit, get_logger
@@ -27,12 +26,9 @@ PENDING_REQUESTS = 64
 class Requests:
     """Answers the command and stop queries of one rig, each exactly once."""
 
-    def __init__(
-        self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, dispatcher: Dispatcher, leases: LeaseWatch
-    ) -> None:
+    def __init__(self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, dispatcher: Dispatcher) -> None:
         self._rig = rig
         self._dispatcher = dispatcher
-        self._leases = leases
         self._keys = keys
         self._group = group
         self._journal = Journal(rig)
@@ -47,7 +43,7 @@ class Requests:
 
     def on_command(self, query: Query) -> None:
         """Take a query on `@cmd/**`."""
-        self._leases.expire()  # before anything that waited while this process or its client was frozen
+        self._dispatcher.leases.expire()  # before anything that waited while this process or its client was frozen
         if self._pending >= PENDING_REQUESTS:
             self._refuse(
                 query,

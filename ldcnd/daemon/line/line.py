@@ -61,6 +61,9 @@ class BusService:
         self._up = asyncio.Event()
         self._down = asyncio.Event()
         self._down.set()
+        self._stop_wanted = asyncio.Event()
+        for axis in axes:
+            axis.stop_wanted = self._stop_wanted
         bus.resync = network.resync
 
     async def run(self) -> None:
@@ -85,6 +88,8 @@ class BusService:
 
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
         """Stop axes with closed loops by one packet if they form groups; each must be stopped by itself besides."""
+        if self.report is None:
+            return
         try:
             await self.network.stop_together(mode, names)
         except BusError as error:
@@ -108,17 +113,23 @@ class BusService:
         retry_s = FIRST_RETRY_S
         while True:
             await self.bus.wait_opened()
+            await self._send_pending_stops()  # before anything else on a line that is back
             try:
-                self.report = await self.network.bring_up()
+                report = await self.network.bring_up()
             except LdcndError as error:  # also a stop that took one of its packets off the queue
                 if error.message != self.problem:
                     log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
                 self.problem = error.message
-                await asyncio.sleep(retry_s)
+                await self._pause(retry_s)
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue
             retry_s, self.problem = FIRST_RETRY_S, ""
-            self._connect(self.report)
+            if report.reset:
+                for axis in self.axes:
+                    axis.cannot_move()
+            await self._send_pending_stops()
+            self.report = report
+            self._connect(report)
             await self._look_after()
             self.report, self.problem = None, "the line was lost"
             self._up.clear()
@@ -126,12 +137,32 @@ class BusService:
             for axis in self.axes:
                 axis.disconnected()
 
+    async def _send_pending_stops(self) -> None:
+        """Send what no drive has confirmed, to all axes that wait for it at once."""
+        self._stop_wanted.clear()
+        async with asyncio.TaskGroup() as stops:
+            for axis in self.axes:
+                stops.create_task(axis.send_pending_stop(), name=f"pending stop {axis.config.name}")
+
+    async def _pause(self, pause_s: float) -> None:
+        """Wait before the next attempt to bring the line up; a stop that comes meanwhile is tried at once."""
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + pause_s
+        while loop.time() < until_s:
+            try:
+                async with asyncio.timeout_at(until_s):
+                    await self._stop_wanted.wait()
+            except TimeoutError:
+                return
+            await self._send_pending_stops()
+
     async def _look_after(self) -> None:
         """Look for drives that have lost power and came back; return when the line is lost."""
         pause_s = FIRST_LOOK_S
         loop = asyncio.get_running_loop()
         while not await self._closed_within(pause_s):
             pause_s = FIRST_LOOK_S
+            await self._send_pending_stops()
             if not self.network.incomplete():
                 continue
             began_s = loop.time()
@@ -158,18 +189,22 @@ class BusService:
                 log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
 
     async def _closed_within(self, pause_s: float) -> bool:
+        """Tell whether the line is lost within a time, or before a stop must be sent again."""
+        closed = asyncio.ensure_future(self.bus.wait_closed())
+        wanted = asyncio.ensure_future(self._stop_wanted.wait())
         try:
-            async with asyncio.timeout(pause_s):
-                await self.bus.wait_closed()
-        except TimeoutError:
-            return False
-        return True
+            await asyncio.wait((closed, wanted), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)
+            return closed.done()
+        finally:
+            closed.cancel()
+            wanted.cancel()
 
     def _restarted(self, name: str) -> None:
         """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
         log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
         axis = next(axis for axis in self.axes if axis.config.name == name)
         axis.disconnected()
+        axis.cannot_move()
         axis.tracker.powered(on=False, now_s=asyncio.get_running_loop().time())
         axis.tracker.finished()
 

@@ -30,6 +30,7 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.model.events import CommandStatus
 from ldcnd.planning.plan import with_probes_that_fit
 from ldcnd.sim.chain import Chain
 from ldcnd.transport.transport import Opener
@@ -84,8 +85,11 @@ def build_daemon(
     events = EventLog(publisher, clock, instance)
     ledger = Ledger(events.changed)
 
+    def note(axis: str, verb: str, status: CommandStatus, reason: str) -> None:
+        events.note(next_command_id(), axis, verb, status, reason)
+
     def make_axis(axis: AxisConfig, bus: Bus, driver: AxisDriver) -> AxisService:
-        return AxisService(axis, bus, driver, publisher, clock, next_command_id, ledger.ended)
+        return AxisService(axis, bus, driver, publisher, clock, next_command_id, ledger.ended, note)
 
     eeprom = open_ledger(config.state_dir)
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}

@@ -8,7 +8,7 @@ from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapsho
 from ldcnd.daemon.capture.watch import CaptureWatch
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.dispatch import Dispatcher
-from ldcnd.daemon.command.loss import LeaseWatch, apply_policy
+from ldcnd.daemon.command.loss import apply_policy
 from ldcnd.daemon.command.requests import Requests
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.health import EepromWrites, HealthWatch
@@ -113,15 +113,20 @@ class Daemon:
     async def run(self) -> None:
         """Serve until `end` is called or the caller is cancelled.
 
-        Start: lines first, then questions, then commands, so that whoever can ask finds an answer. Stop: commands are
-        refused, what moves comes to rest, tokens go, lines close.
+        Start: stops first, so that no line is open that cannot be stopped; then lines, questions, and commands. Stop:
+        commands are refused, what moves comes to rest, tokens go, lines close.
         """
         async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
             declared.callback(self._dispatcher.events.tell)  # last of all
-            leases = LeaseWatch(self.rig, self._dispatcher.authority, self._run.clock, group)
-            requests = Requests(self.rig, self._keys, group, self._dispatcher, leases)
-            serving = [group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses]
+            leases = self._dispatcher.leases
+            leases.group = group
+            requests = Requests(self.rig, self._keys, group, self._dispatcher)
+            serving: list[asyncio.Task[None]] = []
             try:
+                await self._declare_stops(declared, requests)
+                serving += [
+                    group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses
+                ]
                 await self._declare(declared, requests)
                 serving.append(group.create_task(self._watch_axes(group), name="liveliness"))
                 serving.append(group.create_task(leases.run(), name="leases"))
@@ -140,6 +145,12 @@ class Daemon:
                     self._publisher.withdraw(axis)
         log.info("ended", rig=self.rig.name)
 
+    async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
+        for stop in self._keys.all_stops:
+            declaration = await self._session.serve(stop, requests.on_stop, complete=True, urgent=True)
+            self._declarations.append(declaration)
+            declared.push_async_callback(declaration.close)
+
     async def _declare(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
         keys, session = self._keys, self._session
         describing = self._describing
@@ -150,8 +161,6 @@ class Daemon:
 
         await until_end(await session.serve_reads(keys.all_telemetry, describing.on_telemetry, complete=False))
         await until_end(await session.serve_reads(keys.all_meta, describing.on_meta, complete=True))
-        for stop in keys.all_stops:
-            await until_end(await session.serve(stop, requests.on_stop, complete=True, urgent=True))
         await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
         await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
         await until_end(await session.declare_token(keys.alive(self._run.instance)))

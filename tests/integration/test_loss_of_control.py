@@ -1,0 +1,145 @@
+"""However control over an axis is lost, what moves does what `loss.client` says; on the jumping clock."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.client.events import latest_events
+from ldcnd.client.lease import control
+from ldcnd.config.axis import LossConfig, LossPolicy
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.errors import LeaseHeld, LeaseRequired
+from ldcnd.model.commands import MoveVelocity, Power
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.rig_commands import Acquire, LeaseReply, Rehearsal, Rehearse
+from ldcnd.model.samples import AxisState
+from tests.support.rig import SIMULATED, RunningRig, running_rig
+
+BOTH = ("x", "y")
+REACTS_WITHIN_S = 0.05
+
+
+def config(policy: LossPolicy = LossPolicy.HALT) -> RigConfig:
+    rig = load_config(SIMULATED)
+    bus = rig.bus[0]
+    axes = tuple(axis.model_copy(update={"loss": LossConfig(client=policy)}) for axis in bus.axis)
+    return rig.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),), "authority": "leased"})
+
+
+async def acquired(rig: RunningRig, client: str, *axes: str, force: bool = False) -> LeaseReply:
+    request = Acquire(client=client, axes=axes, lease_s=60.0, force=force)
+    return await rig.client.ask(request)
+
+
+async def jogging(rig: RunningRig, lease: LeaseReply, axis: str) -> None:
+    await rig.until(axis, lambda state: state.link == "up")
+    await rig.client.command(axis, Power(on=True, lease=lease.lease))
+    await rig.client.command(axis, MoveVelocity(velocity=5.0, lease=lease.lease))
+
+
+async def jogs_on(rig: RunningRig, axis: str) -> bool:
+    await asyncio.sleep(REACTS_WITHIN_S)
+    return (await rig.client.state(axis)).state is AxisState.CONTINUOUS_MOTION
+
+
+async def test_who_takes_one_axis_by_force_stops_all_that_its_holder_moved():
+    async with running_rig(config()) as rig:
+        await jogging(rig, await acquired(rig, "ann", *BOTH), "y")
+        await acquired(rig, "bob", "x", force=True)
+        assert not await jogs_on(rig, "y")
+
+
+async def test_an_axis_taken_by_force_in_mid_motion_comes_to_rest():
+    async with running_rig(config()) as rig:
+        await jogging(rig, await acquired(rig, "ann", "x"), "x")
+        await acquired(rig, "bob", "x", force=True)
+        assert not await jogs_on(rig, "x")
+
+
+async def test_who_exchanges_a_lease_for_one_that_covers_less_stops_the_rest():
+    async with running_rig(config()) as rig:
+        await jogging(rig, await acquired(rig, "ann", *BOTH), "y")
+        await acquired(rig, "ann", "x")
+        assert not await jogs_on(rig, "y")
+
+
+async def test_who_exchanges_a_lease_for_one_that_covers_more_keeps_moving():
+    async with running_rig(config()) as rig:
+        await jogging(rig, await acquired(rig, "ann", "y"), "y")
+        await acquired(rig, "ann", *BOTH)
+        assert await jogs_on(rig, "y")
+
+
+@pytest.mark.parametrize("leave_running", [False, True])
+async def test_a_release_in_mid_motion_stops_unless_it_is_to_leave_it_running(leave_running):
+    async with running_rig(config()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x", lease_s=60.0, leave_running=leave_running) as held:
+            await held.command("x", Power(on=True))
+            await held.command("x", MoveVelocity(velocity=5.0))
+        assert await jogs_on(rig, "x") is leave_running
+
+
+async def test_the_policy_of_the_axis_decides_what_a_release_does():
+    async with running_rig(config(LossPolicy.POWER_OFF)) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x", lease_s=60.0) as held:
+            await held.command("x", Power(on=True))
+            await held.command("x", MoveVelocity(velocity=5.0))
+        await rig.until("x", lambda state: state.state is AxisState.DISABLED, within_s=1.0)
+
+
+async def test_a_release_at_rest_does_nothing_and_leaves_no_event():
+    async with running_rig(config()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x", lease_s=60.0) as held:
+            await held.command("x", Power(on=True))
+            await asyncio.sleep(0.5)
+        assert (await rig.client.state("x")).enabled
+        assert not [event for event in await latest_events(rig.client) if event.verb == "acquire"]
+
+
+async def test_events_tell_who_lost_control_and_who_was_refused_it():
+    async with running_rig(config()) as rig:
+        await jogging(rig, await acquired(rig, "ann", *BOTH), "y")
+        with pytest.raises(LeaseHeld):
+            await acquired(rig, "bob", "x")
+        await acquired(rig, "bob", "x", force=True)
+
+        events = [event for event in await latest_events(rig.client) if event.verb == "acquire"]
+        told = {(event.axis, event.client, event.status, event.code) for event in events}
+        assert told == {
+            ("x", "bob", CommandStatus.REFUSED, "lease_held"),
+            ("x", "ann", CommandStatus.ABORTED, "lease_expired"),
+            ("y", "ann", CommandStatus.ABORTED, "lease_expired"),
+        }
+        assert "taken by force by bob" in next(event.reason for event in events if event.client == "ann")
+
+
+async def test_refused_acquires_do_not_flood_the_events():
+    async with running_rig(config()) as rig:
+        await acquired(rig, "ann", "x")
+        for _ in range(200):
+            with pytest.raises(LeaseHeld):
+                await acquired(rig, "bob", "x")
+        assert len([event for event in await latest_events(rig.client) if event.verb == "acquire"]) <= 30
+
+
+@pytest.mark.parametrize("kind", list(Rehearsal))
+async def test_a_loss_is_rehearsed_under_a_lease_that_covers_what_it_concerns(kind):
+    async with running_rig(config()) as rig:
+        held = await acquired(rig, "ann", "x")
+        await jogging(rig, held, "x")
+
+        with pytest.raises(LeaseRequired):
+            await rig.client.ask(Rehearse(kind=kind, axis="x"), timeout_s=30.0)
+        mine = Rehearse(kind=kind, axis="x", lease=held.lease)
+        if kind is Rehearsal.BUS_LOSS:
+            with pytest.raises(LeaseHeld, match="does not cover axis y"):
+                await rig.client.ask(mine, timeout_s=30.0)
+            assert await jogs_on(rig, "x")
+            assert (await rig.client.state("x")).referenced
+            whole = await acquired(rig, "ann")
+            mine = Rehearse(kind=kind, axis="x", lease=whole.lease)
+        await rig.client.ask(mine, timeout_s=30.0)
+        assert not await jogs_on(rig, "x")

@@ -1,0 +1,272 @@
+"""A stop that no drive has confirmed is sent until one does, whatever policies and states say; on the jumping clock."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ldcnd.client.events import latest_events
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.axis import LossConfig, LossPolicy
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.daemon.axis.state import STOP_UNCONFIRMED
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.errors import BusDown, StopLatched, WrongState
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset, Verb
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
+
+RUN_ON = LossConfig(client=LossPolicy.RUN_TO_TARGET, bus=LossPolicy.RUN_TO_TARGET, daemon=LossPolicy.RUN_TO_TARGET)
+
+
+def chain_of_four() -> Chain:
+    return build_chain(ChainSpec(tuple(ModuleSpec(n) for n in ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4"))))
+
+
+def config(**bus: object) -> RigConfig:
+    rig = load_config(SIMULATED)
+    axes = tuple(axis.model_copy(update={"loss": RUN_ON}) for axis in rig.bus[0].axis)
+    return rig.model_copy(update={"bus": (rig.bus[0].model_copy(update={"axis": axes} | bus),)})
+
+
+def true_position(chain: Chain) -> float:
+    """Where the shaft of x really is, in counts."""
+    loop = asyncio.get_running_loop()
+    chain.advance(loop.time())
+    chain.modules[0].catch_up(loop.time())
+    return chain.modules[0].shaft.position_counts
+
+
+async def stands(chain: Chain) -> bool:
+    before = true_position(chain)
+    await asyncio.sleep(0.5)
+    return abs(true_position(chain) - before) < 5
+
+
+@asynccontextmanager
+async def jogging(chain: Chain, velocity: float = 5.0):
+    async with running_rig(config(), {"line0": chain}) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=velocity))
+        await asyncio.sleep(0.3)
+        yield rig
+
+
+async def unplugged(rig: RunningRig, chain: Chain) -> None:
+    chain.unplug(asyncio.get_running_loop().time())
+    await rig.until("x", lambda state: state.link is LinkState.DOWN)
+
+
+async def test_a_stop_sent_while_the_line_is_down_reaches_the_drive_when_it_is_back():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        await unplugged(rig, chain)
+
+        reply = await rig.client.stop("x")
+
+        assert reply.confirmed == ()
+        state = await rig.client.state("x")
+        assert (state.stop_latched, state.stop_pending) == (True, True)
+        faults = await rig.client.last("x", TelemetryItem.FAULT)
+        assert STOP_UNCONFIRMED.code in {fault.code for fault in faults.active}
+        await asyncio.sleep(3.0)
+        assert not await stands(chain)
+
+        chain.replug()
+        state = await rig.until("x", lambda state: not state.stop_pending)
+
+        assert await stands(chain)
+        assert state.stop_latched
+        faults = await rig.client.last("x", TelemetryItem.FAULT)
+        assert STOP_UNCONFIRMED.code not in {fault.code for fault in faults.active}
+        told = [event.status for event in await latest_events(rig.client) if event.verb == "stop"]
+        assert told[0] is CommandStatus.UNKNOWN
+        assert CommandStatus.DONE in told
+
+
+async def test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        await unplugged(rig, chain)
+        await rig.client.stop("x")
+        await asyncio.sleep(1.0)
+        packets = []
+        drive = chain.modules[0]
+        execute = drive.execute
+
+        def noted(packet):
+            packets.append(type(packet).__name__)
+            execute(packet)
+
+        drive.execute = noted
+        chain.replug()
+        await rig.until("x", lambda state: not state.stop_pending)
+
+        assert packets[0] == "StopMotor", packets[:5]
+
+
+async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
+    chain = chain_of_four()
+    async with jogging(chain, velocity=0.5) as rig:
+        await unplugged(rig, chain)
+        await rig.client.stop("x")
+        await asyncio.sleep(1.0)
+        rig.daemon.rig.axis("x").tracker._at_rest = True
+        chain.replug()
+        await rig.until("x", lambda state: not state.stop_pending)
+        await asyncio.sleep(0.3)
+        assert await stands(chain)
+
+
+async def test_a_drive_that_was_mute_is_stopped_as_soon_as_it_answers():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        axis = rig.daemon.rig.axis("x")
+        stop_of = axis.driver.stop
+
+        async def lost(_mode):
+            raise BusDown("no reply")
+
+        axis.driver.stop = lost
+        reply = await rig.client.stop("x")
+        assert reply.confirmed == ()
+        await asyncio.sleep(1.0)
+        assert (await rig.client.state("x")).stop_pending
+        assert not await stands(chain)
+
+        axis.driver.stop = stop_of
+        await rig.until("x", lambda state: not state.stop_pending, within_s=2.5)
+        await asyncio.sleep(0.5)
+        assert await stands(chain)
+
+
+async def test_nothing_moves_and_nothing_is_reset_while_a_stop_is_not_confirmed():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        axis = rig.daemon.rig.axis("x")
+
+        async def lost(_mode):
+            raise BusDown("no reply")
+
+        axis.driver.stop = lost
+        await rig.client.stop("x")
+        for verb, command in (
+            (Verb.RESET, Reset()),
+            (Verb.POWER, Power(on=True)),
+            (Verb.MOVE_ABSOLUTE, MoveAbsolute(position=0.0)),
+        ):
+            with pytest.raises(StopLatched, match="not confirmed"):
+                await rig.client.command("x", verb, command)
+        assert (await rig.client.state("x")).stop_latched
+
+
+async def test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        axis = rig.daemon.rig.axis("x")
+        axis.tracker.stop_unconfirmed(0)
+        axis._pending = next(iter(sorted(axis.driver._stops, key=str)))
+        axis.cannot_move()
+        assert not axis.tracker.stop_pending
+
+
+@asynccontextmanager
+async def starting(chain: Chain, **bus: object):
+    """Run a daemon that has not brought its line up yet."""
+    loop, broker, rig_config = asyncio.get_running_loop(), MemoryBroker(), config(**bus)
+    async with broker.session() as session, broker.session() as client_session:
+        daemon = build_daemon(
+            rig_config, session, lambda: EPOCH_NS + round(loop.time() * 1e9), "test", {"line0": chain}
+        )
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(daemon.run(), name="daemon")
+            try:
+                await daemon.wait_serving()
+                yield RunningRig(daemon, RigClient(client_session, rig_config.rig), client_session, broker)
+            finally:
+                daemon.end()
+                await running
+
+
+async def test_stops_during_bring_up_are_answered_at_once_and_do_not_restart_it():
+    loop = asyncio.get_running_loop()
+    async with starting(chain_of_four()) as rig:
+        began_s = loop.time()
+        await rig.daemon.wait_up()
+        undisturbed_s = loop.time() - began_s
+    async with starting(chain_of_four()) as rig:
+        began_s, longest_s = loop.time(), 0.0
+        up = asyncio.create_task(rig.daemon.wait_up())
+        while not up.done():
+            asked_s = loop.time()
+            await rig.client.stop()
+            longest_s = max(longest_s, loop.time() - asked_s)
+            await asyncio.wait((up,), timeout=0.02)
+        assert longest_s < 0.05
+        assert loop.time() - began_s < undisturbed_s + 0.3
+        assert (await rig.client.state("x")).stop_latched
+
+
+async def test_a_stop_before_a_line_is_taken_over_stops_what_still_moves_there():
+    chain = chain_of_four()
+    async with jogging(chain):
+        pass
+    assert not await stands(chain)
+    async with starting(chain, start="adopt") as rig:
+        reply = await rig.client.stop("x")
+        assert reply.confirmed == ()
+        await rig.daemon.wait_up()
+        await rig.until("x", lambda state: not state.stop_pending)
+        await asyncio.sleep(0.5)
+        assert await stands(chain)
+        assert (await rig.client.state("x")).enabled  # brought to rest, not switched off
+
+
+async def test_a_stop_reaches_drives_of_a_line_that_cannot_be_brought_up():
+    """One module is missing from the configuration's view, so the bring-up fails; the others can be stopped."""
+    chain = chain_of_four()
+    async with jogging(chain):
+        pass
+    axes = config().bus[0].axis
+    wrong = (*axes[:3], axes[3].model_copy(update={"address": 9}))
+    async with starting(chain, start="adopt", axis=wrong, adopt_fallback="refuse") as rig:
+        await asyncio.sleep(2.0)
+        await rig.client.stop("x")
+        await asyncio.sleep(2.5)
+        assert await stands(chain)
+
+
+async def test_a_moving_axis_in_error_stop_is_not_switched_off_by_a_reset():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        await unplugged(rig, chain)
+        chain.replug()
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(0.3)
+        state = await rig.client.state("x")
+        assert (state.state, state.enabled, state.moving) == (AxisState.ERROR_STOP, True, Moving.YES)
+
+        with pytest.raises(WrongState, match="at speed"):
+            await rig.client.command("x", Reset())
+        assert (await rig.client.state("x")).enabled
+
+        await rig.client.command("x", Halt())
+        await asyncio.sleep(1.0)
+        assert await stands(chain)
+        await rig.client.command("x", Reset())
+
+
+async def test_a_latched_axis_that_moves_when_its_line_is_back_comes_to_rest_whatever_the_policy_says():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        rig.daemon.rig.axis("x").tracker.latch_stop()  # latched and confirmed, as far as anyone knows
+        await unplugged(rig, chain)
+        chain.replug()
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(1.0)
+        assert await stands(chain)
