@@ -61,6 +61,7 @@ class BusService:
         self._up = asyncio.Event()
         self._down = asyncio.Event()
         self._down.set()
+        self._baud: int | None = None  # at which the line was up last
         self._stop_wanted = asyncio.Event()
         for axis in axes:
             axis.stop_wanted = self._stop_wanted
@@ -113,7 +114,8 @@ class BusService:
         retry_s = FIRST_RETRY_S
         while True:
             await self.bus.wait_opened()
-            await self._send_pending_stops()  # before anything else on a line that is back
+            if self.bus.baud == (self._baud or self.bus.baud):
+                await self._send_pending_stops()  # before anything else; at another rate the drives would not hear it
             try:
                 report = await self.network.bring_up()
             except LdcndError as error:  # also a stop that took one of its packets off the queue
@@ -128,7 +130,7 @@ class BusService:
                 for axis in self.axes:
                     axis.cannot_move()
             await self._send_pending_stops()
-            self.report = report
+            self.report, self._baud = report, report.baud
             self._connect(report)
             await self._look_after()
             self.report, self.problem = None, "the line was lost"
