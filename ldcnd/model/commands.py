@@ -21,6 +21,8 @@ LONGEST_NAME = 64
 """Characters of a name or an id that a client gives."""
 ANSWER_S = 5.0
 """Longest wait of a client for the reply to a command that is a few exchanges with its drive, in seconds."""
+REPLAYED_WITHIN_S = 3600.0
+"""A command id is remembered for so long, in seconds, once the command has come."""
 
 
 class Verb(StrEnum):
@@ -172,7 +174,9 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
     verb: ClassVar[Verb]
 
     command_id: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
-    """Names the command; the same id is carried out at most once and answered alike. Given by the daemon if missing."""
+    """Names the command; the same id is carried out at most once and answered alike. Given by the daemon if missing.
+    Remembered for an hour, and under a lease with a sequence for as long as the daemon runs; what may be delivered
+    later than that carries `not_after` or `instance`."""
     client: str | None = Field(default=None, max_length=LONGEST_NAME)
     """Who sends it: a name for people, in events and the log; not authenticated. A lease knows its own."""
     lease: str | None = None

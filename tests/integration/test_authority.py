@@ -248,7 +248,7 @@ async def test_a_stop_that_no_drive_confirms_is_told_as_that():
 
     assert reply.confirmed == ()
     assert (event.status, event.client) == (CommandStatus.UNKNOWN, "ann")
-    assert event.reason == "the drive did not confirm it; the axis is latched"
+    assert event.reason == "the drive did not confirm it yet; the axis is latched"
 
 
 async def test_two_daemons_on_one_rig_refuse_motion():

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import ldcnd.daemon
+from ldcnd.client.events import latest_events
 from ldcnd.client.lease import Control, control
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
@@ -19,8 +20,9 @@ from ldcnd.errors import (
     PositionLimit,
     StopLatched,
     ValueOutOfRange,
+    WrongState,
 )
-from ldcnd.model.commands import BufferMode, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop, Track
+from ldcnd.model.commands import BufferMode, Halt, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop, Track
 from ldcnd.model.samples import AxisState
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
@@ -234,6 +236,30 @@ async def test_limits_are_those_of_the_plan_at_the_start():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         with pytest.raises(PositionLimit):
             await held.command("x", MoveAbsolute(position=1e6, buffer_mode=BufferMode.BUFFERED), 30.0)
+
+
+async def test_a_replay_after_thousands_of_halts_is_answered_and_moves_nothing():
+    async with running_rig(config(authority="open")) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Power(on=True))
+        step = MoveRelative(distance=2.0, command_id="step")
+        first = await rig.client.command("x", step)
+        await rig.client.wait_for_end("x", first.command_id)
+        for number in range(600):
+            await rig.client.command("y", Halt(command_id=f"halt-{number}"))
+
+        assert await rig.client.command("x", step) == first
+        await asyncio.sleep(1.0)
+        assert (await rig.client.last("x", "position")).value == pytest.approx(2.0, abs=0.05)
+
+
+async def test_what_is_refused_at_once_leaves_one_event():
+    async with running_rig(config(authority="open")) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        with pytest.raises(WrongState):
+            await rig.client.command("x", MoveRelative(distance=2.0))
+        events = [event for event in await latest_events(rig.client, 100) if event.axis == "x"]
+        assert [(event.status, event.number) for event in events] == [("refused", 0)]
 
 
 MOVES = {"load", "start", "track", "power", "set_gains", "start_group"}

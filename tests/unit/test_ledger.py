@@ -1,8 +1,8 @@
 import pytest
 
-from ldcnd.daemon.command.ledger import REMEMBERED, Entry, Ledger
-from ldcnd.errors import CommandIdReused, StopLatched, UnknownCommand
-from ldcnd.model.commands import CommandReply, Halt, MoveAbsolute
+from ldcnd.daemon.command.ledger import ANSWERS_PER_SENDER, SENDERS, Entry, Ledger
+from ldcnd.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
+from ldcnd.model.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute
 from ldcnd.model.events import CommandStatus
 
 MOVE = MoveAbsolute(position=1.0)
@@ -19,7 +19,10 @@ def heard() -> list[tuple[str, str | None]]:
 
 @pytest.fixture
 def ledger(heard) -> Ledger:
-    return Ledger(lambda entry, error: heard.append((entry.status.value, error.code.value if error else None)))
+    return Ledger(
+        lambda entry, error: heard.append((entry.status.value, error.code.value if error else None)),
+        lambda: 0.0,
+    )
 
 
 def test_a_command_passes_through_its_states_once(ledger, heard):
@@ -72,13 +75,79 @@ def test_an_unknown_id_says_so(ledger):
         ledger.get("c9")
 
 
+def done(ledger, command_id, client="ann", **fields):
+    command = MoveAbsolute(position=1.0, command_id=command_id, client=client, **fields)
+    ledger.open(Entry(command_id, "x", command, client))
+    ledger.reached(command_id, CommandStatus.DONE)
+
+
 def test_what_is_not_over_is_never_forgotten(ledger):
     ledger.open(entry("running"))
-    for number in range(REMEMBERED + 10):
+    for number in range(ANSWERS_PER_SENDER + 10):
         ledger.open(entry(f"done-{number}"))
         ledger.reached(f"done-{number}", CommandStatus.DONE)
 
     assert ledger.get("running").status is CommandStatus.ACCEPTED
     with pytest.raises(UnknownCommand):
         ledger.get("done-0")
-    assert ledger.get(f"done-{REMEMBERED + 9}")
+    assert ledger.get(f"done-{ANSWERS_PER_SENDER + 9}")
+
+
+def test_a_replay_whose_answer_is_forgotten_is_refused(ledger):
+    for number in range(ANSWERS_PER_SENDER + 1):
+        done(ledger, f"c{number}")
+
+    with pytest.raises(CommandIdReused, match="forgotten"):
+        ledger.repeated("c0", "x", MOVE)
+    assert ledger.repeated("c1", "x", MoveAbsolute(position=1.0, command_id="c1")) == ledger.get("c1")
+
+
+def test_nobody_elses_commands_push_an_answer_out(ledger):
+    done(ledger, "mine")
+    for number in range(10 * ANSWERS_PER_SENDER):
+        done(ledger, f"b{number}", client="bob")
+        halt = Halt(command_id=f"h{number}", client="ann")
+        ledger.open(Entry(f"h{number}", "x", halt, "ann"))
+        ledger.reached(f"h{number}", CommandStatus.DONE)
+
+    assert ledger.get("mine").status is CommandStatus.DONE
+
+
+def test_senders_without_number_take_bounded_memory_and_their_replays_stay_refused(ledger):
+    for number in range(2 * SENDERS):
+        done(ledger, f"c{number}", client=f"client{number}")
+
+    assert len(ledger._entries) == SENDERS
+    with pytest.raises(CommandIdReused):
+        ledger.repeated("c0", "x", MOVE)
+
+
+def test_an_id_is_remembered_for_the_time_that_the_contract_names():
+    now_s = 0.0
+    ledger = Ledger(lambda _entry, _error: None, lambda: now_s)
+    for number in range(ANSWERS_PER_SENDER + 1):
+        done(ledger, f"c{number}")
+
+    now_s = REPLAYED_WITHIN_S - 1.0
+    with pytest.raises(CommandIdReused):
+        ledger.repeated("c0", "x", MOVE)
+    now_s = REPLAYED_WITHIN_S + 1.0
+    assert ledger.repeated("c0", "x", MOVE) is None
+
+
+def test_ids_that_could_not_be_remembered_are_refused_before_anything_is_done(ledger, monkeypatch):
+    monkeypatch.setattr("ldcnd.daemon.command.ledger.LARGEST_MEMORY", 3)
+    for number in range(3):
+        done(ledger, f"c{number}")
+
+    with pytest.raises(TooManyRequests):
+        done(ledger, "c3")
+    with pytest.raises(UnknownCommand):
+        ledger.get("c3")
+    done(ledger, "c4", lease="l", sequence=1)
+    ledger.open(entry("made by the daemon"))
+
+
+def test_an_id_under_a_lease_with_a_sequence_takes_no_memory(ledger):
+    done(ledger, "c1", lease="l", sequence=1)
+    assert not ledger._until_s

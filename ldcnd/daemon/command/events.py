@@ -9,7 +9,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.ledger import Entry
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import LdcndError, SessionError
-from ldcnd.log import get_logger
+from ldcnd.log import LogLimit, get_logger
 from ldcnd.messaging.codec import to_json
 from ldcnd.model.events import CommandEvent, CommandStatus, EventList, ReadEvents
 
@@ -51,9 +51,14 @@ class EventLog:
         self._kept: deque[CommandEvent] = deque(maxlen=KEPT_EVENTS)
         self._sequence: dict[str, int] = {}
         self._news: deque[_News] = deque()
+        self._refusals_logged = LogLimit(now_s=clock.now_s)
 
     def changed(self, entry: Entry, error: LdcndError | None) -> None:
-        """Take a change of the ledger."""
+        """Take a change of the ledger; what is refused at once was never accepted."""
+        if entry.status is CommandStatus.REFUSED and self._news and _is_acceptance(self._news[-1].entry, entry):
+            self._news.pop()
+            self._end -= 1
+            self._sequence[entry.axis] -= 1
         seq = self._sequence.get(entry.axis, 0)
         self._sequence[entry.axis] = seq + 1
         if not self._news:
@@ -125,8 +130,14 @@ class EventLog:
             self._publisher.publish_event(event)
         except SessionError as error:  # who asks for events still finds it
             log.warning("event not published", axis=event.axis, command_id=event.command_id, reason=error.message)
+        if event.status is CommandStatus.ACCEPTED:
+            return  # what became of it follows
+        passing = self._refusals_logged.admit() if event.status is CommandStatus.REFUSED else {}
+        if passing is None:
+            return
         log.info(
             "command",
+            **passing,
             axis=event.axis,
             command_id=event.command_id,
             verb=event.verb,
@@ -153,6 +164,10 @@ class EventLog:
         return EventList(
             run=self._run, first_number=first, next_number=following, end_number=self._end, events=tuple(events)
         )
+
+
+def _is_acceptance(latest: Entry, refused: Entry) -> bool:
+    return latest.command_id == refused.command_id and latest.status is CommandStatus.ACCEPTED
 
 
 def _fitting(events: Iterable[CommandEvent]) -> list[CommandEvent]:

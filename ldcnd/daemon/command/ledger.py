@@ -1,16 +1,30 @@
-"""What became of every command: the same id is carried out at most once, and always answered alike. Pure."""
+"""What became of every command: the same id is carried out at most once, and always answered alike. Pure.
 
+Two memories, because an answer is large and an id is small. Of each sender the latest commands are kept whole, with
+their answers; nobody else's traffic pushes them out. Of every id that a sender chose, a fingerprint is kept for
+`REPLAYED_WITHIN_S`: a command that comes again when its answer is forgotten is refused. Commands that carry a lease
+and a sequence need no fingerprint: an old sequence is refused as long as the lease lives, and the lease afterwards.
+"""
+
+import hashlib
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ldcnd.daemon.axis.state import ActiveCommand
-from ldcnd.errors import CommandIdReused, LdcndError, UnknownCommand
-from ldcnd.model.commands import AxisCommand, CommandReply, Verb
+from ldcnd.errors import CommandIdReused, LdcndError, TooManyRequests, UnknownCommand
+from ldcnd.model.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Effect, Verb
 from ldcnd.model.events import FINAL, CommandStatus
 
-REMEMBERED = 4096
-"""So many commands are remembered; those that are not final are never forgotten."""
+ANSWERS_PER_SENDER = 512
+"""Final commands of one sender whose answers are kept; those that are not final are never forgotten."""
+SENDERS = 64
+"""Senders whose answers are kept; then those of the sender that was silent longest are forgotten."""
+LARGEST_MEMORY = 250_000
+"""Ids that are remembered at most; with so many within `REPLAYED_WITHIN_S`, further ones are refused."""
+RESTING = "\0rest"
+"""Whatever brings an axis to rest is carried out as often as it is asked; its entries have a memory of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,22 +58,33 @@ class Entry:
 class Ledger:
     """The commands of one rig, latest last."""
 
-    def __init__(self, changed: Callable[[Entry, LdcndError | None], None]) -> None:
+    def __init__(self, changed: Callable[[Entry, LdcndError | None], None], now_s: Callable[[], float]) -> None:
         """Begin empty.
 
         Args:
-            changed: told of every entry and every change of status, with the error that goes with it.
+            changed: called with every entry and every change of status, and the error that goes with it.
+            now_s: returns the time, in seconds.
         """
-        self._entries: OrderedDict[str, Entry] = OrderedDict()
+        self._entries: dict[str, Entry] = {}
+        self._of_senders: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
+        self._until_s: dict[int, float] = {}  # by fingerprint, in the order in which they are forgotten
         self._changed = changed
+        self._now_s = now_s
 
     def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> Entry | None:
         """Return the entry that this id has already, or None when it is new.
 
         Raises:
-            CommandIdReused: the id belongs to another command.
+            CommandIdReused: the id belongs to another command, or to one whose answer is forgotten.
         """
         entry = self._entries.get(command_id)
+        if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
+            raise CommandIdReused(
+                f"command id {command_id!r} was taken before and its answer is forgotten; it is not carried out again",
+                axis=axis,
+                value=command_id,
+                remedy="look at the events; give every command an id of its own",
+            )
         if entry and (entry.axis, entry.verb, _content(entry.command)) != (axis, command.verb, _content(command)):
             raise CommandIdReused(
                 f"command id {command_id!r} belongs to {entry.verb} of axis {entry.axis}",
@@ -81,10 +106,21 @@ class Ledger:
         return entry
 
     def open(self, entry: Entry) -> None:
-        """Enter a new command."""
+        """Enter a new command.
+
+        Raises:
+            TooManyRequests: it has an id of its own, and there is no room to remember that.
+        """
+        self._remember(entry)
         self._entries[entry.command_id] = entry
-        if len(self._entries) > REMEMBERED:
-            self._forget_one()
+        sender = RESTING if entry.command.effect is Effect.REST else entry.login or entry.client or ""
+        entries = self._of_senders.setdefault(sender, OrderedDict())
+        self._of_senders.move_to_end(sender)
+        entries[entry.command_id] = None
+        if len(entries) > ANSWERS_PER_SENDER:
+            self._forget_one(entries)
+        if len(self._of_senders) > SENDERS:
+            self._forget_sender()
         self._changed(entry, None)
 
     def answered(self, command_id: str, answer: CommandReply | LdcndError, status: CommandStatus) -> None:
@@ -131,11 +167,43 @@ class Ledger:
         if news:
             self._changed(entry, error)
 
-    def _forget_one(self) -> None:
-        for command_id, entry in self._entries.items():
-            if entry.status in FINAL:
-                del self._entries[command_id]
+    def _remember(self, entry: Entry) -> None:
+        command = entry.command
+        if command.command_id is None or command.effect is Effect.REST:
+            return
+        if command.lease is not None and command.sequence is not None:
+            return
+        now_s = self._now_s()
+        while self._until_s and next(iter(self._until_s.values())) <= now_s:
+            del self._until_s[next(iter(self._until_s))]
+        if len(self._until_s) >= LARGEST_MEMORY:
+            raise TooManyRequests(
+                f"axis {entry.axis}: {LARGEST_MEMORY} command ids within {REPLAYED_WITHIN_S:g} s are more than can be"
+                " remembered",
+                axis=entry.axis,
+                limit=LARGEST_MEMORY,
+                remedy="send commands under a lease with a sequence, or without an id of their own",
+            )
+        self._until_s[_fingerprint(command.command_id)] = now_s + REPLAYED_WITHIN_S
+
+    def _forget_one(self, entries: OrderedDict[str, None]) -> None:
+        for command_id in entries:
+            if self._entries[command_id].status in FINAL:
+                del entries[command_id], self._entries[command_id]
                 return
+
+    def _forget_sender(self) -> None:
+        """Forget the answers of the sender that was silent longest, but for what is under way."""
+        for sender, entries in self._of_senders.items():
+            if all(self._entries[command_id].status in FINAL for command_id in entries):
+                for command_id in entries:
+                    del self._entries[command_id]
+                del self._of_senders[sender]
+                return
+
+
+def _fingerprint(command_id: str) -> int:
+    return int.from_bytes(hashlib.blake2b(command_id.encode(), digest_size=8).digest(), "big")
 
 
 def _content(command: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:

@@ -83,7 +83,7 @@ def build_daemon(
         return f"{instance}-{next(serial)}"
 
     events = EventLog(publisher, clock, instance)
-    ledger = Ledger(events.changed)
+    ledger = Ledger(events.changed, clock.now_s)
 
     def note(axis: str, verb: str, status: CommandStatus, reason: str) -> None:
         events.note(next_command_id(), axis, verb, status, reason)
