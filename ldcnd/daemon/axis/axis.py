@@ -161,6 +161,7 @@ class AxisService:
 
     Attributes:
         stop_wanted: set when a stop waits to be sent again; its line sees to that.
+        returned: called when the drive answers again after it was out of reach, with what it does known.
     """
 
     def __init__(
@@ -201,6 +202,7 @@ class AxisService:
         tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
         self.traces = TraceRecorder(config.name, tracer, publisher, clock)
         self.stop_wanted = asyncio.Event()
+        self.returned: Callable[[], None] | None = None
         self._pending: StopMode | None = None
         self._reachable = False
         self._seen = False
@@ -268,11 +270,14 @@ class AxisService:
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Digest a reading that is believed."""
+        was_away = self._seen and self.tracker.link is LinkState.DOWN
         self._seen = True
         if self._pending is not None:
             self.stop_wanted.set()  # it answers again
         was_referenced = self.tracker.referenced
         self.tracker.observed(reading, timing, self._clock.now_ns())
+        if was_away and self.returned:
+            self.returned()
         if was_referenced and not self.tracker.referenced:
             log.warning("reference lost", axis=self.config.name, faults=[fault.code for fault in reading.faults])
         self._changed.set()

@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+from functools import partial
 
 from ldcnd.config.rig import RigConfig
+from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
 from ldcnd.daemon.capture.watch import CaptureWatch
 from ldcnd.daemon.clock import Clock
@@ -121,6 +123,8 @@ class Daemon:
             leases = self._dispatcher.leases
             leases.group = group
             requests = Requests(self.rig, self._keys, group, self._dispatcher)
+            for axis in self.rig.axes.values():
+                axis.returned = partial(self._returned, axis, group)
             serving: list[asyncio.Task[None]] = []
             try:
                 await self._declare_stops(declared, requests)
@@ -128,7 +132,7 @@ class Daemon:
                     group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses
                 ]
                 await self._declare(declared, requests)
-                serving.append(group.create_task(self._watch_axes(group), name="liveliness"))
+                serving.append(group.create_task(self._watch_axes(), name="liveliness"))
                 serving.append(group.create_task(leases.run(), name="leases"))
                 serving.append(group.create_task(self._health.run(), name="health"))
                 if self.captures:
@@ -189,19 +193,19 @@ class Daemon:
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
 
-    async def _watch_axes(self, group: asyncio.TaskGroup) -> None:
-        """Keep one liveliness token for each axis whose drive answers; act when one is back that still moves."""
+    def _returned(self, axis: AxisService, group: asyncio.TaskGroup) -> None:
+        """A drive answers again that was out of reach: if it still moves, do what its policy says."""
+        policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
+        group.create_task(policy, name=f"bus loss {axis.config.name}")
+
+    async def _watch_axes(self) -> None:
+        """Keep one liveliness token for each axis whose drive answers."""
         tokens: dict[str, Declaration] = {}
-        known: set[str] = set()
         try:
             while True:
                 for name, axis in self.rig.axes.items():
                     alive = axis.tracker.link is not LinkState.DOWN
                     if alive and name not in tokens:
-                        if name in known:
-                            policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
-                            group.create_task(policy, name=f"bus loss {name}")
-                        known.add(name)
                         tokens[name] = await self._session.declare_token(
                             self._keys.alive_axis(self._run.instance, name)
                         )
