@@ -123,8 +123,8 @@ class Daemon:
             leases = self._dispatcher.leases
             leases.group = group
             requests = Requests(self.rig, self._keys, group, self._dispatcher)
-            for axis in self.rig.axes.values():
-                axis.returned = partial(self._returned, axis, group)
+            for each in self.rig.axes.values():
+                each.returned = partial(self._returned, each, group)
             serving: list[asyncio.Task[None]] = []
             try:
                 await self._declare_stops(declared, requests)
