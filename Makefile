@@ -5,7 +5,7 @@ PYTHON ?= python3
 # where byte code must not be written, each of the hundreds of programs that tests start would compile every module anew
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test check fix docs dist soak bench screenshots clean
+.PHONY: run test check fix docs dist soak mutants bench screenshots clean
 
 run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
@@ -43,6 +43,10 @@ dist: .venv/ready
 soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
 	$(PY) -m pytest -m soak -n 2 --timeout 3600
+
+# changes safety-relevant code in 300 ways and prints what no test notices; hours, see CONTRIBUTING.md
+mutants: .venv/ready
+	$(PY) -m tests.mutants
 
 bench: .venv/ready
 	$(PY) -m tests.bench --json docs/explanation/timing.json

@@ -42,20 +42,24 @@ class RunningRig:
 
 @asynccontextmanager
 async def running_rig(
-    config: RigConfig | None = None, chains: Mapping[str, Chain] = MappingProxyType({})
+    config: RigConfig | None = None,
+    chains: Mapping[str, Chain] = MappingProxyType({}),
+    *,
+    clock_off_s: Callable[[], float] = lambda: 0.0,
 ) -> AsyncIterator[RunningRig]:
     """Run a daemon until the context ends; its lines are up when the context begins.
 
     Args:
         config: the rig; the simulated one if missing.
         chains: simulated lines that exist already, by name.
+        clock_off_s: returns by how much the machine's clock is wrong; time itself goes on.
     """
     config = config or load_config(SIMULATED)
     loop = asyncio.get_running_loop()
     broker = MemoryBroker()
 
     def now_ns() -> int:
-        return EPOCH_NS + round(loop.time() * 1e9)
+        return EPOCH_NS + round((loop.time() + clock_off_s()) * 1e9)
 
     async with broker.session() as session, broker.session() as client_session:
         daemon = build_daemon(config, session, now_ns, "test", chains)

@@ -126,3 +126,15 @@ def test_a_released_axis_is_free(leased):
 def test_an_axis_that_does_not_exist_cannot_be_acquired(leased):
     with pytest.raises(UnknownAxis, match="'q'"):
         leased.acquire("ann", ["q"], 1.0, 0.0, force=False)
+
+
+def test_a_command_without_a_lease_does_not_begin_once_another_client_has_the_axis():
+    rig = Authority(["x", "y"], required=False)
+    rig.admit("x", None, None, 0.0)
+
+    rig.acquire("ann", ["x"], 1.0, 0.1, force=False)
+
+    with pytest.raises(LeaseHeld, match="ann"):
+        rig.check_held("x", None, 0.5)
+    rig.check_held("y", None, 0.5)
+    rig.check_held("x", None, 1.2)  # the lease has run out

@@ -152,12 +152,23 @@ def test_a_counter_that_wraps_has_not_jumped():
     assert axis.read(at(-(2**31) + 4), POLL_S) is Verdict.BELIEVED
 
 
-def test_after_a_gap_nothing_is_compared():
+def test_after_a_gap_another_position_is_confirmed_and_is_no_jump():
     axis = Axis()
-    axis.gate.forget()
+    axis.gate.after_gap()
 
-    assert axis.read(at(0)) is Verdict.BELIEVED
+    assert axis.read(at(999_999)) is Verdict.ASK_AGAIN
+    assert axis.read(at(999_999)) is Verdict.BELIEVED
     assert not axis.gate.jumped
+
+
+@pytest.mark.parametrize(("seconds", "jumped"), [(1.0, False), (0.1, True)])
+def test_what_is_a_jump_depends_on_the_time_in_between(*, seconds: float, jumped: bool):
+    axis = Axis()
+
+    axis.read(at(51_000), seconds)
+    axis.read(at(51_000))
+
+    assert axis.gate.jumped is jumped
 
 
 def test_readings_agree_within_what_the_axis_moves_meanwhile():

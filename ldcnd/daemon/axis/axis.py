@@ -248,7 +248,7 @@ class AxisService:
         """The line is gone."""
         self._reachable = False
         self.traces.disconnected()
-        self._plausibility.forget()
+        self._plausibility.after_gap()
         self.tracker.disconnected(self._clock.now_ns())
         self.telemetry.stale(self._clock.now_ns())
 
@@ -294,7 +294,7 @@ class AxisService:
         if self.tracker.link is not before:
             log.warning("drive does not answer", axis=self.config.name, link=self.tracker.link.value)
             if self.tracker.link is LinkState.DOWN:
-                self._plausibility.forget()
+                self._plausibility.after_gap()
             self.telemetry.stale(self._clock.now_ns())
 
     def monitored(self, value: MonitorValue, timing: Timing) -> None:

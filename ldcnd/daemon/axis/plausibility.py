@@ -63,7 +63,7 @@ class PlausibilityGate:
         self._known: _Seen | None = None
         self._doubtful: _Seen | None = None
         self._rounds = 0
-        self._sure = False  # the first reading after a gap is believed as it is, and nothing has jumped away from it
+        self._sure = False  # nothing jumps away from the very first reading, which is believed as it is
         self._scale = scale
         self.reconfigure(config)
 
@@ -74,10 +74,9 @@ class PlausibilityGate:
         self._acceleration = ACCELERATIONS * counts * max(config.acceleration, limits.acceleration or 0.0)
         self._following = config.gains.el if config.gains else 0
 
-    def forget(self) -> None:
-        """Begin anew: the drive was out of reach, and may have done anything meanwhile."""
-        self._known = self._doubtful = None
-        self._rounds, self._sure = 0, False
+    def after_gap(self) -> None:
+        """The drive was out of reach, and may have been moved: no jump is called one until two readings agree again."""
+        self._doubtful, self._rounds, self._sure = None, 0, False
 
     def judge(self, reading: AxisReading, timing: Timing, *, standing: bool) -> Verdict:
         """Judge a reading.
