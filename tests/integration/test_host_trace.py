@@ -34,6 +34,7 @@ async def test_fastest_trace_follows_a_move_with_a_true_time_for_every_sample():
             channels=("position", "velocity", "following_error"), samples=400, pre_trigger=50, trigger=rising(2.0)
         )
         reply = await arm_trace(rig.client, "x", request)
+        await asyncio.sleep(1.0)  # a trigger counts once the samples before it are there
         await rig.client.command("x", MoveAbsolute(position=5.0))
         await wait_for_trace(rig.client, "x", reply.trace_id, 60)
         trace = await fetch_trace(rig.client, "x", reply.trace_id)

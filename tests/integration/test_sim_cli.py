@@ -246,7 +246,7 @@ def test_a_fault_plan_spoils_the_line(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "complaint"),
     [
-        (["--chain", "ls182ap nonsense"], 78, "no such module: nonsense; known are ls182ap"),
+        (["--chain", "ls182ap nonsense"], 78, "no such module: nonsense; known are ls-182ap"),
         ([], 2, "either by --chain or by --file"),
         (["--chain", "ls182ap", "--pty", "/nowhere/at.all"], 1, "no terminal"),
     ],
