@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from ldcnd.drivers.ldcn.pic_io import LINES
-from ldcnd.drivers.ldcn.profiles import PIC_IO, Support
+from ldcnd.drivers.ldcn.profiles import PIC_IO, Support, identify
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.model.frozen import Frozen
 from ldcnd.sim.chain import Delivery
@@ -209,6 +209,11 @@ class SimulatedModuleConfig(Frozen):
     def _what_it_can_have(self) -> Self:
         if self.conditions and not self.is_drive:
             raise ValueError(f"conditions: a {self.model} has no motor")
+        profile, version = MODELS[self.model][0], self.behaviour.version
+        if version is not None and version not in profile.versions:
+            known = identify(profile.device_id, version)
+            other = f"that is a {known.name}" if known else "no such device is known"
+            raise ValueError(f"behaviour.version: a {self.model} has no version {version}; {other}")
         if self.io is not None and not self.has_terminals:
             raise ValueError(f"io: a {self.model} has no terminals")
         return self

@@ -375,3 +375,51 @@ def test_same_seed_gives_the_same_phases():
     assert phases(3) == phases(3)
     assert phases(3) != phases(4)
     assert len(set(phases(3))) == 2
+
+
+# -- hosts that do what the manuals warn of ---------------------------------------------------------------------------
+
+
+def led_group(*names):
+    """Give the first module the lead of group 81 and let the others be members of it."""
+    host = host_on(*names)
+    for address in range(1, len(names) + 1):
+        host.send(address, Command.SET_ADDRESS, address, 0x01 if address == 1 else 0x81)
+    return host
+
+
+def test_a_leader_answers_set_baud_at_the_new_rate_which_the_host_does_not_understand():
+    host = led_group("pic-servo-v4", "pic-servo-v4")
+
+    reply = host.send(0x81, Command.SET_BAUD_RATE, 0x0A)
+
+    assert reply not in {b"", b"\x18\x18", b"\x19\x19"}
+    assert host.send(1, Command.NO_OPERATION) == b""
+
+
+def test_set_baud_to_one_group_splits_the_line():
+    host = host_on("pic-servo-v4", "pic-servo-v4", "ls-182ap")
+    host.send(1, Command.SET_ADDRESS, 1, 0x81)
+
+    host.send(0x81, Command.SET_BAUD_RATE, 0x0A)
+    at_19200 = [address for address in (1, 2, 3) if host.send(address, Command.NO_OPERATION)]
+    host.chain.baud = 115_200
+    at_115200 = [address for address in (1, 2, 3) if host.send(address, Command.NO_OPERATION)]
+
+    assert (at_19200, at_115200) == ([2, 3], [1])
+
+
+def test_a_reset_at_the_working_rate_leaves_behind_who_is_in_another_group():
+    host = host_on("ls-182ap", "pic-servo-v4")
+    host.send(2, Command.SET_ADDRESS, 2, 0x81)
+    host.send(0xFF, Command.SET_BAUD_RATE, 0x0A)
+    host.send(0x81, Command.SET_BAUD_RATE, 0x0A)
+    host.chain.baud = 115_200
+
+    host.send(0xFF, Command.HARD_RESET)
+    host.chain.baud = 19_200
+
+    assert [module.address for module in host.chain.modules] == [0, 2]
+    assert host.chain.modules[1].baud == pytest.approx(113_636, abs=1)
+    assert len(host.send(0, Command.SET_ADDRESS, 1, 0xFF)) == 2
+    assert host.send(0, Command.SET_ADDRESS, 2, 0xFF) == b""  # at the rate of a reset module 2 hears noise

@@ -13,7 +13,7 @@ from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
-from ldcnd.sim.ldcn.chain import MODELS, build_chain
+from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.plant import MotorPlant
@@ -138,7 +138,7 @@ def test_a_line_of_a_rig_takes_the_same_modules():
 
 
 @pytest.mark.parametrize(
-    "block", re.findall(r"```toml\n(.*?)```", HOW_TO.read_text(), re.DOTALL), ids=["chain", "fault plan"]
+    "block", re.findall(r"```toml\n(.*?)```", HOW_TO.read_text(), re.DOTALL), ids=["chain", "cabinet", "fault plan"]
 )
 def test_files_of_the_how_to_are_accepted(tmp_path, block):
     file = tmp_path / "block.toml"
@@ -164,7 +164,30 @@ def test_the_reference_lists_the_modules_as_they_are():
 
 def test_the_reference_names_tests_that_exist():
     named = set(re.findall(r"`(test_\w+)`", REFERENCE.read_text()))
-    text = "".join(path.read_text() for path in TESTS.rglob("test_rough_hosts.py"))
+    text = "".join(path.read_text() for path in TESTS.rglob("test_*.py"))
 
     assert named
     assert named <= set(re.findall(r"def (test_\w+)", text))
+
+
+def test_the_reference_lists_every_quirk_with_its_default():
+    page = REFERENCE.read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| .+ \| `test_\w+` \|$", page[page.index("## Quirks") :], re.MULTILINE)
+    defaults = {field.name: field.default for field in fields(ModuleSettings)}
+
+    assert [name for name, _ in rows] == list(defaults)
+    for name, told in rows:
+        if isinstance(defaults[name], bool) and told in {"true", "false"}:
+            assert (told == "true") is defaults[name], name
+
+
+def test_a_version_of_another_model_is_refused():
+    with pytest.raises(ValueError, match="version 5; that is a pic-servo-cmc"):
+        SimulatedChainConfig.model_validate({"module": [{"model": "pic-servo-v4", "behaviour": {"version": 5}}]})
+
+
+def test_older_spellings_of_the_models_stay_valid():
+    for old, name in OLD_NAMES.items():
+        (module,) = SimulatedChainConfig.model_validate({"module": [{"model": old}]}).module
+        assert module.model == name
+        assert name in MODELS
