@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from ldcnd.config.toml import DeviceIdentity, Name
-from ldcnd.drivers.ldcn.profiles import PROFILES, Support
+from ldcnd.drivers.ldcn.profiles import PROFILES, HomingSource, Support
 from ldcnd.drivers.smartstep import config as smartstep_config
 from ldcnd.drivers.smartstep.config import SmartStepUnitConfig
 from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
@@ -178,6 +178,9 @@ class AxisConfig(Frozen):
 come now and then."""
     loss: LossConfig = LossConfig()
     """What the axis does when somebody disappears in mid-motion."""
+    limit_switches: Literal["ignore", "stop"] = "ignore"
+    """stop: the drive itself decelerates when a motion runs onto the limit switch ahead, also if the host is dead; \
+moving off a switch stays possible. Not for `track`, nor on drives that do not stop on their limit inputs."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
     """A motion at constant velocity that no software limit ends is ended by the drive itself after so many seconds."""
     adc_volts: float = Field(default=5.0, gt=0)
@@ -221,7 +224,22 @@ come now and then."""
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
         self._check_tracking()
+        self._check_limit_switches()
         return self
+
+    @property
+    def switch_active(self) -> Literal["high", "low"]:
+        """Level of a limit switch input while the switch is actuated."""
+        return self.home.switch_active if self.home else "high"
+
+    def _check_limit_switches(self) -> None:
+        """Refuse limit switches that the drive cannot stop on."""
+        profile = PROFILES.get(self.model)
+        needed = HomingSource.LIMIT1 | HomingSource.LIMIT2
+        if self.limit_switches == "stop" and not (
+            profile and profile.stops_on_home and profile.homing_sources & needed == needed
+        ):
+            raise ValueError(f"limit_switches: {self.model} does not stop on its limit inputs by itself")
 
     def _check_tracking(self) -> None:
         """Refuse bounds of `track` that would trip the drive or outrun the axis."""

@@ -65,6 +65,7 @@ class AxisReading:
         faults: what the drive complains about.
         reverse_limit: level of that limit switch input, `forward_limit` of the other; None while it is not shown.
         asked: the items that this poll was for; the line may have asked for others since.
+        cut_short: why the drive ended the motion before its end, by itself; empty when it did not.
     """
 
     position_counts: int
@@ -79,6 +80,7 @@ class AxisReading:
     reverse_limit: bool | None = None
     forward_limit: bool | None = None
     asked: frozenset[TelemetryItem] = frozenset()
+    cut_short: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +171,8 @@ class AxisSpec:
         model: profile name of the family.
         gains: loaded at power-on; without them the loop stays open.
         identity: id and version that this drive reports although the family's table does not know them for the model.
+        limit_stop: level of the limit switch inputs at which the drive itself stops a motion towards them; None when
+            they are left alone.
     """
 
     name: str
@@ -176,6 +180,7 @@ class AxisSpec:
     model: str
     gains: Gains | None
     identity: tuple[int, int] | None = None
+    limit_stop: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

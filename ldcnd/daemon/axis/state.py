@@ -225,6 +225,8 @@ class AxisTracker:
         if not self.concerns(timing):
             return  # asked before the latest command took effect: says nothing about it
         self._rest.observed(reading, timing.sent_at_s)
+        if reading.cut_short and self.command:
+            self._failure = reading.cut_short
         self.enabled = reading.enabled
         if faults and any(fault.stops for fault in faults):
             self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")

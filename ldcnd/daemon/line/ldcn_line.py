@@ -50,7 +50,8 @@ def build_ldcn_line(
 
 def _spec(axis: AxisConfig) -> AxisSpec:
     gains = Gains(**axis.gains.model_dump()) if axis.gains else None
-    return AxisSpec(axis.name, axis.address, axis.model, gains, axis.identity)
+    limit_stop = axis.switch_active == "high" if axis.limit_switches == "stop" else None
+    return AxisSpec(axis.name, axis.address, axis.model, gains, axis.identity, limit_stop)
 
 
 def _line(settings: BusConfig) -> LineSpec:

@@ -299,6 +299,8 @@ class DriveState:
             error flag, which every open loop shows, is no fault.
         motion_locked: the drive refuses motion since it homed on a limit switch.
         servo_divisor: servo rate divisor in force.
+        guard: the limit switch at which the drive stops the present motion by itself; empty without one.
+        guard_hit: it has.
     """
 
     def __init__(self, name: str, profile: Profile) -> None:
@@ -316,6 +318,8 @@ class DriveState:
         self.loop_may_open = False
         self.motion_locked = False
         self.servo_divisor = 1
+        self.guard = ""
+        self.guard_hit = False
 
     def taken_over(self, status: Status) -> None:
         """The drive is adopted as it is, and this host has never known it; the status packet has the auxiliary byte."""
@@ -365,6 +369,7 @@ class DriveState:
         flags, aux = int(status.flags), int(status.aux)
         if not flags & _HOMING:
             self.homing_armed = False
+            self.guard_hit = bool(self.guard)
         self.motion_locked = self._profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED)
         faults = self.faults(status)
         shows_limits = self._shows_limits(flags)
@@ -383,6 +388,7 @@ class DriveState:
             reverse_limit=bool(flags & reverse) if shows_limits else None,
             forward_limit=bool(flags & forward) if shows_limits else None,
             asked=asked,
+            cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
         )
 
     def faults(self, status: Status) -> tuple[driver.Fault, ...]:

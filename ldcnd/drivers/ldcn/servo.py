@@ -92,6 +92,22 @@ def opens_loop(profile: Profile, capture: HomeCapture) -> bool:
     return profile.stops_on_home and capture.stop is StopMode.OFF
 
 
+def _limits_ahead(motion: Motion | AnalogMotion | PwmOutput, here_counts: int) -> tuple[HomeMethod, ...]:
+    """Return the limit switches that a motion may run onto; both where the drive finds the direction itself."""
+    match motion:
+        case AnalogMotion():
+            return (HomeMethod.FORWARD_LIMIT, HomeMethod.REVERSE_LIMIT)
+        case PwmOutput():
+            way = motion.duty
+        case Motion(None):
+            way = motion.velocity_counts_per_s
+        case Motion():
+            way = (motion.target_counts or 0) - here_counts
+    if way == 0:
+        return ()
+    return (HomeMethod.FORWARD_LIMIT if way > 0 else HomeMethod.REVERSE_LIMIT,)
+
+
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""
 STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
@@ -294,6 +310,7 @@ class LdcnAxis(AxisDriver):
         if self.state.homing_armed:
             await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
             self.state.homing_armed = False
+        self.state.guard, self.state.guard_hit = "", False
 
     async def reset(self) -> None:
         """See `AxisDriver`: power driver off, sticky bits cleared (LS-182AP manual, "To restore the normal operation").
@@ -330,15 +347,57 @@ class LdcnAxis(AxisDriver):
             await self._put_acceleration_in_force(trajectory)
         if self.state.motion_locked:
             await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE))
-        if home is not None:
-            self._check_pin(home.method)
-            self.state.homing_armed = True  # before it is, so that a stop in between disarms it
-            await self._bus.execute(commands.set_homing(self._node, homing_control(self.profile, home)))
+        await self._arm(motion, home)
         await self._load(trajectory)
         self.state.loaded(
             absolute=isinstance(motion, AnalogMotion),
             opens_loop=isinstance(motion, PwmOutput) or (home is not None and opens_loop(self.profile, home)),
         )
+
+    async def _arm(self, motion: Motion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
+        """Arm the capture that is asked for, or the one that stops the motion at the limit switch ahead, or none.
+
+        It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode"). Only the drive's home
+        register changes: the reference is the host's.
+        """
+        self.state.guard, self.state.guard_hit = "", False
+        control, guard = HomingControl(0), ""
+        if home is not None:
+            self._check_pin(home.method)
+            control = homing_control(self.profile, home)
+        elif self.spec.limit_stop is not None:
+            control, guard = await self._guard(motion, active=self.spec.limit_stop)
+        if control or self.state.homing_armed:
+            self.state.homing_armed = True  # before it is, so that a stop in between disarms it
+            await self._bus.execute(commands.set_homing(self._node, control))
+        self.state.homing_armed = bool(control)
+        self.state.guard = guard
+
+    async def _guard(self, motion: Motion | AnalogMotion | PwmOutput, *, active: bool) -> tuple[HomingControl, str]:
+        """Return what stops a motion at the limit switches that it may run onto, and their name.
+
+        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one.
+
+        Raises:
+            WrongState: the axis stands on the switch ahead, or its pin is an output.
+        """
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        reading = self.state.reading(status)
+        ahead = _limits_ahead(motion, reading.position_counts)
+        levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
+        control = HomingControl(0)
+        for method in ahead:
+            self._check_pin(method)
+            if levels[method] is active and len(ahead) == 1:
+                raise WrongState(
+                    f"axis {self.spec.name} stands on its {method.value.replace('_', ' ')} switch",
+                    axis=self.spec.name,
+                    value=method.value,
+                    remedy="move the other way",
+                )
+            stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
+            control |= homing_control(self.profile, HomeCapture(method, stop))
+        return control, " or ".join(f"{method.value.replace('_', ' ')} switch" for method in ahead)
 
     async def _load(self, trajectory: Trajectory) -> None:
         self._loaded = trajectory

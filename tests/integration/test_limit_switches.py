@@ -1,0 +1,89 @@
+"""`limit_switches = "stop"`: the drive stops a motion at the switch ahead, with or without a daemon."""
+
+import asyncio
+
+import pytest
+from pydantic import ValidationError
+
+from ldcnd.errors import WrongState
+from ldcnd.model.commands import MoveAbsolute, MoveRelative, MoveVelocity
+from ldcnd.model.samples import AxisState
+from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, LS_182AP_22, SC, V2, V3, V4, dialect_rig
+
+GUARDED = {"limit_switches": "stop"}
+dialects = pytest.mark.parametrize("dialect", [V3, V4, SC, LS_182AP, LS_182AP_22], ids=lambda dialect: dialect.name)
+
+
+@dialects
+@pytest.mark.parametrize("side", [1, -1])
+async def test_a_move_past_the_switch_stops_there_and_says_so(dialect, side):
+    async with dialect_rig(dialect, **GUARDED) as rig:
+        await rig.power_on()
+
+        state = await rig.done(MoveAbsolute(position=30.0 * side, velocity=10.0))
+
+        switch = "forward limit switch" if side > 0 else "reverse limit switch"
+        assert (state.state, state.last_error) == (
+            AxisState.STANDSTILL,
+            f"move_absolute: the drive stopped at the {switch}",
+        )
+        assert state.referenced
+        assert abs(rig.position_mm) == pytest.approx(20.0 + 10.0**2 / 200 / 2, abs=0.05)
+
+
+@dialects
+async def test_leaving_the_switch_is_possible_and_going_on_is_refused(dialect):
+    async with dialect_rig(dialect, **GUARDED) as rig:
+        await rig.power_on()
+        await rig.done(MoveAbsolute(position=30.0, velocity=10.0))
+
+        with pytest.raises(WrongState, match="stands on its forward limit switch") as refusal:
+            await rig.send(MoveRelative(distance=1.0))
+        back = await rig.done(MoveAbsolute(position=5.0))
+
+        assert refusal.value.remedy == "move the other way"
+        assert (back.state, back.last_error) == (AxisState.STANDSTILL, None)
+        assert rig.position_mm == pytest.approx(5.0, abs=0.05)
+        assert (await rig.done(MoveVelocity(velocity=10.0))).last_error.endswith("the forward limit switch")
+
+
+async def test_a_move_between_the_switches_ends_at_its_target():
+    async with dialect_rig(LS_182AP, **GUARDED) as rig:
+        await rig.power_on()
+
+        for position in (15.0, -15.0, 0.0):
+            state = await rig.done(MoveAbsolute(position=position))
+            assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+            assert rig.position_mm == pytest.approx(position, abs=0.05)
+
+
+@dialects
+async def test_the_drive_stops_at_the_switch_when_the_host_is_dead(dialect):
+    async with dialect_rig(dialect, **GUARDED) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=10.0))
+        await asyncio.sleep(0.5)
+
+        rig.chain.unplug(asyncio.get_running_loop().time())
+        await asyncio.sleep(10.0)
+
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+        assert rig.position_mm == pytest.approx(20.25, abs=0.05)
+
+
+async def test_without_the_setting_the_switches_stop_nothing():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+
+        state = await rig.done(MoveAbsolute(position=21.5, velocity=10.0))
+
+        assert state.last_error is None
+        assert rig.position_mm == pytest.approx(21.5, abs=0.05)
+        assert (await rig.rig.client.state(AXIS)).referenced
+
+
+@pytest.mark.parametrize("dialect", [V2, LS_173AP], ids=lambda dialect: dialect.name)
+async def test_a_drive_that_does_not_stop_on_its_limits_is_refused_in_the_configuration(dialect):
+    with pytest.raises(ValidationError, match="does not stop on its limit inputs"):
+        async with dialect_rig(dialect, **GUARDED):
+            pass
