@@ -40,6 +40,7 @@ from ldcnd.model.parameters import (
     CounterReply,
     DriveProfile,
     ReadAlarms,
+    ReadMonitors,
     ReadProfile,
 )
 from ldcnd.model.samples import MonitorName, MonitorSample, PositionSample, Sample, StateSample, TelemetryItem
@@ -280,6 +281,20 @@ def alarms(target: Target, axis: str) -> None:
     reply = target.run(work)
     past = (f"  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
     target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}", *past)
+
+
+@command.command("read-monitors")
+@click.argument("axis")
+@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice([name.value for name in MonitorName]))
+@with_target
+def read_monitors(target: Target, axis: str, names: tuple[str, ...]) -> None:
+    """Read monitors of AXIS once, published or not; all of them without a NAME."""
+    command = ReadMonitors(monitors=tuple(MonitorName(name) for name in names))
+    reply = target.run(lambda client: client.command(axis, command))
+    for each in reply.readings:
+        on = "" if each.active is None else f"  on: {', '.join(each.active) or 'none'}"
+        high = f"  high: {', '.join(each.high)}" if each.high else ""
+        target.show(each, f"{each.monitor:24} {each.value:>8} {each.unit:14}{each.title}{high}{on}")
 
 
 @command.command("clear-counter")

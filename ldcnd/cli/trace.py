@@ -54,6 +54,18 @@ def _trigger(_context: click.Context, _parameter: click.Parameter, value: str | 
         raise click.BadParameter(f"{value!r} is not CHANNEL:KIND:LEVEL with one of {kinds}") from None
 
 
+def _full_scale(_context: click.Context, _parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, float]:
+    """Return full scales that are given as CHANNEL:LARGEST."""
+    scales = {}
+    for value in values:
+        channel, _, largest = value.partition(":")
+        try:
+            scales[channel] = float(largest)
+        except ValueError:
+            raise click.BadParameter(f"{value!r} is not CHANNEL:LARGEST") from None
+    return scales
+
+
 def _file(_context: click.Context, _parameter: click.Parameter, value: Path | None) -> Path | None:
     return require_suffix(value) if value else None
 
@@ -74,7 +86,8 @@ def command() -> None:
 @click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
 @click.option("--samples", type=click.IntRange(2, MOST_SAMPLES), default=500, help="How many samples [500].")
 @click.option("--pre", type=click.IntRange(0), default=0, help="So many of them before the trigger [0].")
-@click.option("--trigger", callback=_trigger, help="CHANNEL:KIND:LEVEL; kinds: rising, falling, either, above, below.")
+@click.option("--trigger", callback=_trigger, help=f"CHANNEL:KIND:LEVEL; kinds: {', '.join(TriggerKind)}.")
+@click.option("--full-scale", multiple=True, callback=_full_scale, help="CHANNEL:LARGEST, to resolve it finer.")
 @click.option("--timeout", type=Finite(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")
 @out_option
 @with_target
@@ -87,6 +100,7 @@ def take(
     samples: int,
     pre: int,
     trigger: TraceTrigger | None,
+    full_scale: dict[str, float],
     timeout: float,
     out: Path | None,
 ) -> None:
@@ -97,6 +111,7 @@ def take(
         samples=samples,
         pre_trigger=pre,
         trigger=trigger,
+        full_scale=full_scale,
         timeout_s=timeout,
     )
 
@@ -166,6 +181,8 @@ def _summary(trace: Trace) -> list[str]:
     if header.trigger and header.trigger_index is not None:
         trigger = header.trigger
         lines.append(f"trigger at sample {header.trigger_index}: {trigger.channel} {trigger.kind} {trigger.level:g}")
+    if header.trigger_late_s:
+        lines.append(f"the condition was met at most {header.trigger_late_s * 1e3:.1f} ms before")
     lines += [_extremes(channel, column) for channel, column in zip(header.channels, trace.values, strict=True)]
     if header.drive:
         lines.append(f"words taken as {header.drive.word_layout}, {header.drive.byte_order} byte first")

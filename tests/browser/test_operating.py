@@ -186,7 +186,10 @@ async def test_gains_are_written_by_a_click_only(house):
 
 async def test_parameters_are_read_compared_and_written(house, tmp_path):
     dump = tmp_path / "feed.toml"
-    dump.write_text('axis = "feed"\n\n[parameters]\nPn100 = 90  # Speed loop gain\nPn102 = 40\n', encoding="utf-8")
+    dump.write_text(
+        'axis = "feed"\ndriver_type = 0x000C\n\n[parameters]\nPn100 = 90  # Speed loop gain\nPn102 = 40\n',
+        encoding="utf-8",
+    )
     async with house.desk() as desk:
         await desk.open("parameters/mixed/feed")
         await desk.button("Take control").click()
@@ -197,10 +200,11 @@ async def test_parameters_are_read_compared_and_written(house, tmp_path):
 
         await desk.page.get_by_label("Compare with a file").set_input_files(dump)
         await expect(row).to_contain_text("differs")
+        await desk.button("Plan").click()
         await expect(desk.panel("Restore from the file")).to_contain_text("Pn100")
-        await desk.button("Write 1 value").click()
+        await desk.button("Write 2 values").click()
 
-        await expect(desk.panel("Restore from the file")).to_contain_text("1 of 1 written.")
+        await expect(desk.panel("Restore from the file")).to_contain_text("the drive holds the values")
         request = ReadParameter(parameter="Pn100")
         reading = await house.mixed.rig.command("feed", request, 60)
-        assert (reading.value.active, reading.value.stored) == (90, 80)
+        assert (reading.value.active, reading.value.stored) == (90, 90)

@@ -211,7 +211,9 @@ async def test_monitors_come_at_their_rates():
             MonitorName.INPUT_COUNTER: 0.5,
             MonitorName.INPUT_SIGNALS: 0.1,
         }
-        listeners = Listeners(lambda *_: None, lambda value, _: told.append(value), lambda *_: None, lambda _: None)
+        listeners = Listeners(
+            lambda *_: None, lambda value, _: told.append(value), lambda *_: None, lambda _: None, lambda: None
+        )
         line.bus.add_poller(UnitPoller(line.bus, 1, axis.profile, rates, 0.0, listeners))
         await asyncio.sleep(20.0)
 
@@ -240,3 +242,26 @@ async def test_motion_is_refused_whatever_it_is():
         for refused in (axis.power(on=True), axis.start(), axis.reset(), axis.captured_home()):
             with pytest.raises(NotSupported, match="over its line"):
                 await refused
+
+
+async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_only():
+    drive = simulated(2, SimulatedVariant(hears_itself=True))
+    drive.power_off(0.0)
+    async with smartstep_line([simulated(1), drive]) as line:
+        await line.network.bring_up()
+        axis = line.axis("u2")
+        ignore = ReadingListeners(lambda *_: None, lambda *_: None, lambda *_: None)
+        line.bus.add_poller(axis.own_poller(asyncio.get_running_loop().time(), ignore))
+        await asyncio.sleep(20.0)
+        now_s = asyncio.get_running_loop().time()
+        drive.power_on(now_s)
+        await asyncio.sleep(30.0)
+        sent = [
+            record.data
+            for record in line.bus.wire_log.records()
+            if record.event is WireEvent.SENT and record.at_s > now_s and record.data.startswith(b"W2")
+        ]
+
+    assert axis.words.self_hearing
+    assert sent[-1].startswith(b"W20850A")
+    assert {data[3:7] for data in sent} == {b"850A"}

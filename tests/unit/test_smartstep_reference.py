@@ -9,7 +9,7 @@ from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
 from ldcnd.drivers.smartstep.monitors import ALARMS, MONITORS
 from ldcnd.drivers.smartstep.packet import ResponseStatus
 from ldcnd.drivers.smartstep.parameters import PARAMETERS, Fact, Parameter
-from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Confidence
+from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Confidence, SmartStepProfile
 from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject
 
 ROOT = Path(__file__).parents[2]
@@ -19,7 +19,7 @@ NAMED = sorted(set(re.findall(r"`(test_\w+)`", PAGE)))
 
 
 def defined_tests() -> set[str]:
-    sources = ROOT.glob("tests/*/test_smartstep_*.py")
+    sources = [*ROOT.glob("tests/*/test_smartstep_*.py"), ROOT / "tests" / "unit" / "test_cli_params.py"]
     return {
         name for path in sources for name in re.findall(r"^(?:async )?def (test_\w+)", path.read_text(), re.MULTILINE)
     }
@@ -95,7 +95,8 @@ def test_page_lists_the_assumption_with_its_confidence(assumption):
 
 
 def test_every_row_of_every_table_names_its_test():
-    entries = [row for row in ROWS if row[-1] != "test" and set(row[0]) != {"-"}]
+    pins = {"direction", "-", "host to drive", "drive to host", "---"}
+    entries = [row for row in ROWS if row[-1] not in {"test", *pins} and set(row[0]) != {"-"}]
 
     assert [row for row in entries if not re.fullmatch(r"`test_\w+`", row[-1])] == []
     assert len(entries) > 150
@@ -103,3 +104,58 @@ def test_every_row_of_every_table_names_its_test():
 
 def test_page_explains_every_mark():
     assert [mark.value for mark in Confidence if f"`{mark.value}`" not in PAGE] == []
+
+
+FINDINGS = [row for row in ROWS if re.match(r"\d+ ", row[0])]
+
+
+def test_every_finding_of_the_audit_has_its_test():
+    assert {int(row[0].split()[0]) for row in FINDINGS} == set(range(1, 26))
+    assert all(re.fullmatch(r"`test_\w+`", row[2]) for row in FINDINGS)
+
+
+def test_the_page_has_the_pins_of_both_connectors():
+    assert has_row("20, 21", "RXD+, RXD-", "host to drive")
+    assert has_row("22, 23", "TXD+, TXD-", "drive to host")
+    assert has_row("1", "/TXD", "drive to host")
+    assert has_row("2", "/RXD", "host to drive")
+
+
+def test_no_page_promises_a_sampling_rate():
+    assert "2,000 times" not in (ROOT / "docs" / "how-to" / "take-a-trace.md").read_text()
+
+
+def test_alarm_pages_say_what_the_manual_documents():
+    pages = [path.read_text() for path in (ROOT / "ldcnd" / "fault_pages").glob("alarm_*.md")]
+
+    assert not [page for page in pages if "port has no command" in page]
+    assert sum("manual\ndocuments no command" in page for page in pages) >= 15
+
+
+def test_every_field_of_the_profile_is_used():
+    sources = [
+        path.read_text() for path in (ROOT / "ldcnd").rglob("*.py") if path.name not in {"profiles.py", "config.py"}
+    ]
+    fields = [name for name in SmartStepProfile.__slots__ if name != "assumptions"]
+    unused = [name for name in fields if not any(re.search(rf"\.{name}\b", text) for text in sources)]
+
+    assert unused == []
+
+
+def test_the_console_offers_no_reset_where_the_drive_has_none():
+    page = (ROOT / "ldcnd" / "console" / "static" / "pages" / "axis_faults.js").read_text()
+
+    assert 'axis.can("reset")' in page
+    assert "motor off" not in page
+
+
+def test_the_console_marks_factory_values_as_hints():
+    page = (ROOT / "ldcnd" / "console" / "static" / "pages" / "parameters.js").read_text()
+
+    assert "#Factory (a hint)" in page
+
+
+def test_the_alarm_history_is_numbered_as_in_the_manual():
+    page = (ROOT / "ldcnd" / "console" / "static" / "pages" / "parameters_alarms.js").read_text()
+
+    assert "[`${nth}`, entry]" in page

@@ -62,7 +62,11 @@ class UnitSpec:
 
 
 class SmartStepAxis(ReadOnlyAxis):
-    """A drive at one unit number."""
+    """A drive at one unit number.
+
+    Attributes:
+        wires_checked: it was seen not to take its own replies for commands; False for one that has not answered yet.
+    """
 
     def __init__(self, spec: UnitSpec, bus: Bus, others: Mapping[int, str] = MappingProxyType({})) -> None:
         """Prepare the axis; asks nothing.
@@ -84,6 +88,7 @@ class SmartStepAxis(ReadOnlyAxis):
         self.tracer = self._tracer = SmartStepTracer(bus, self.words, spec.profile)
         self._rates_hz = spec.rates_hz
         self._bus = bus
+        self.wires_checked = True
         self._poller: UnitPoller | None = None
 
     @property
@@ -113,7 +118,8 @@ class SmartStepAxis(ReadOnlyAxis):
             self.profile,
             self._rates_hz,
             start_at_s,
-            Listeners(read, monitored, self.identified, listeners.missed),
+            Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself),
+            wires_checked=self.wires_checked,
         )
         return self._poller
 
@@ -140,6 +146,9 @@ class SmartStepAxis(ReadOnlyAxis):
             homing=False,
             faults=tuple(faults),
         )
+
+    def _hears_itself(self) -> None:
+        self.words.self_hearing = True
 
     def _cleared(self) -> None:
         if self._poller:

@@ -21,14 +21,15 @@ from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drivers.smartstep.modes import end_mode
 from ldcnd.drivers.smartstep.monitors import DriverType, FunctionSwitch, function_switches
-from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, ReplyReader, add_parity, strip_parity
+from ldcnd.drivers.smartstep.packet import add_parity, strip_parity
 from ldcnd.drivers.smartstep.parameters import PN000, PN100, unit_number
+from ldcnd.drivers.smartstep.poller import STRAY_WAIT_S
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile
+from ldcnd.drivers.smartstep.words import stray_packets
 from ldcnd.errors import DriveFault, NetworkMismatch, ReplyTimeout, TransportLost, WrongState
 from ldcnd.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.transport.transport import Opener, Receiver, Transport
-from ldcnd.wirelog.recorder import WireEvent
 
 BAUD = 9600
 """The only rate (manual 2.1)."""
@@ -131,9 +132,6 @@ def smartstep_opener(opener: Opener, profile: SmartStepProfile) -> Opener:
 
 log = get_logger("smartstep")
 
-STRAY_WAIT_S = 0.3
-"""A drive that heard itself has answered by then: its longest response time and some margin."""
-
 
 class SmartStepNetwork(Network):
     """The units of one line."""
@@ -158,6 +156,8 @@ class SmartStepNetwork(Network):
         """
         self._answering.clear()
         remarks: list[str] = []
+        for unit in self._units.values():
+            unit.wires_checked = False
         for number, unit in self._units.items():
             try:
                 await self._bus.execute(commands.with_response_time(commands.probe(number), unit.profile))
@@ -167,6 +167,7 @@ class SmartStepNetwork(Network):
             self._answering.append(number)
             try:
                 await self._check_wires(unit)
+                unit.wires_checked = True
                 remarks += await self._meet(unit)
             except (ReplyTimeout, DriveFault) as error:
                 remarks.append(f"unit {number} (axis {unit.spec.name}): {error.message}")
@@ -238,10 +239,4 @@ async def hears_itself(bus: Bus, unit: SmartStepAxis) -> bool:
     loop = asyncio.get_running_loop()
     heard_at_s = loop.time()
     await asyncio.sleep(STRAY_WAIT_S)
-    stray = b"".join(
-        record.data
-        for record in bus.wire_log.records()
-        if record.event is WireEvent.STRAY and record.at_s >= heard_at_s
-    )
-    packets = ReplyReader(PACKET_CHARACTERS).feed(stray)  # a port may deliver them in pieces
-    return any(commands.is_self_hearing(unit.spec.address, packet) for packet in packets)
+    return any(commands.is_self_hearing(unit.spec.address, packet) for packet in stray_packets(bus, heard_at_s))

@@ -13,7 +13,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import Register
-from ldcnd.drivers.smartstep.commands import Refusal, reference, with_response_time
+from ldcnd.drivers.smartstep.commands import Refusal, is_self_hearing, reference, with_response_time
 from ldcnd.drivers.smartstep.monitors import (
     COUNTERS,
     INPUT_SIGNALS,
@@ -28,6 +28,7 @@ from ldcnd.drivers.smartstep.monitors import (
     word_value,
 )
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
+from ldcnd.drivers.smartstep.words import stray_packets
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
@@ -39,6 +40,8 @@ MISSES_BEFORE_BACKOFF = 3
 FIRST_BACKOFF_S = 1.0
 LONGEST_BACKOFF_S = 10.0
 NEVER_S = float("inf")
+STRAY_WAIT_S = 0.3
+"""A drive that heard itself has answered by then: its longest response time and some margin."""
 PUT_OFF_S = 1.0
 """Longer than an exchange takes beside the drive's response; not for ever, because the bus keeps the date till then."""
 
@@ -88,12 +91,14 @@ class Listeners:
         monitored: of a monitor.
         identified: of driver type and software version, whenever the drive may be another one.
         missed: of a poll that brought nothing.
+        self_hearing: of a drive that takes its own replies for commands.
     """
 
     read: Callable[[UnitWords, TelemetryItem, Timing], None]
     monitored: Callable[[MonitorValue, Timing], None]
     identified: Callable[[int, int], None]
     missed: Callable[[BusError], None]
+    self_hearing: Callable[[], None]
 
 
 class UnitPoller(Poller[int | Refusal]):
@@ -107,7 +112,21 @@ class UnitPoller(Poller[int | Refusal]):
         rates_hz: Mapping[Item, float],
         start_at_s: float,
         listeners: Listeners,
+        *,
+        wires_checked: bool = True,
     ) -> None:
+        """Prepare the polls; asks nothing.
+
+        Args:
+            bus: the owner of the line.
+            unit: the unit number.
+            profile: how the drive is taken to behave.
+            rates_hz: how often each item is read.
+            start_at_s: from when on, in loop time.
+            listeners: who is told.
+            wires_checked: that the drive does not hear itself is known; otherwise it is looked for before a word is
+                read that may be zero.
+        """
         self.node = unit
         self.due_at_s = start_at_s
         self._bus = bus
@@ -127,7 +146,8 @@ class UnitPoller(Poller[int | Refusal]):
         self._counter: CounterReading | None = None
         self._address = 0
         self._low_timing: Timing | None = None
-        self._misses = 0
+        self._one_word_only = False
+        self._misses = 0 if wires_checked else MISSES_BEFORE_BACKOFF
 
     def forget_position(self) -> None:
         """The counter was cleared: what it said before is no help any more."""
@@ -142,7 +162,7 @@ class UnitPoller(Poller[int | Refusal]):
         the turn after this one is put off until then.
         """
         queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.first_character_s + PUT_OFF_S
-        if self._misses >= MISSES_BEFORE_BACKOFF:
+        if self._misses >= MISSES_BEFORE_BACKOFF or self._one_word_only:
             self._address = Register.PRESENT_ALARM
         else:
             if self._item is None:
@@ -154,8 +174,13 @@ class UnitPoller(Poller[int | Refusal]):
     def deliver(self, reply: int | Refusal, timing: Timing) -> None:
         """See `Poller`."""
         if self._misses >= MISSES_BEFORE_BACKOFF:
+            self._misses = 0
             self._back(timing.received_at_s)
+            return
         self._misses = 0
+        if self._one_word_only:
+            self._next_turn(timing.received_at_s + LONGEST_BACKOFF_S)
+            return
         if self._item and isinstance(reply, Refusal):
             self._give_up(self._item, reply)
         elif self._counter and isinstance(reply, int):
@@ -236,6 +261,22 @@ class UnitPoller(Poller[int | Refusal]):
             if self._due_s[item] < NEVER_S:
                 self._due_s[item] = now_s
         self._due_s[Basic.IDENTITY] = now_s
+        # The word that it was asked for is never zero, so a drive that takes its own replies for commands shows now.
+        self._one_word_only = True
+        self._next_turn(now_s + LONGEST_BACKOFF_S)
+        self._loop.call_later(STRAY_WAIT_S, self._heard, now_s)
+
+    def _heard(self, answered_at_s: float) -> None:
+        """Go on with a drive that has come back, unless it hears itself: then nothing more is asked of it."""
+        if self._hears_itself(answered_at_s):
+            log.error("drive takes its own replies for commands; nothing is asked any more", unit=self.node)
+            self._listeners.self_hearing()
+        else:
+            self._one_word_only = False
+            self._next_turn(self._loop.time())
+
+    def _hears_itself(self, since_s: float) -> bool:
+        return any(is_self_hearing(self.node, packet) for packet in stray_packets(self._bus, since_s))
 
     def _finish(self, item: Item, timing: Timing) -> None:
         self._abandon()

@@ -10,6 +10,7 @@ from ldcnd.bus.queue import Lane
 from ldcnd.drivers.smartstep import commands
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import Refusal, RefusalReason
+from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, ReplyReader
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
 from ldcnd.errors import (
     AddressRefused,
@@ -24,6 +25,7 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.exchange import Exchange
+from ldcnd.wirelog.recorder import WireEvent
 
 
 def drive_error(axis: str, refusal: Refusal, mode: OperatingMode | int = OperatingMode.NORMAL) -> DriveFault:
@@ -54,6 +56,14 @@ ValueT = TypeVar("ValueT")
 
 READ_BACK_ROUNDS = 4
 """Rounds of the bus's own attempts before a write whose reply was lost stays unknown."""
+
+
+def stray_packets(bus: Bus, since_s: float) -> list[bytes]:
+    """Return the packets that came unasked since an instant of the loop's clock."""
+    stray = b"".join(
+        record.data for record in bus.wire_log.records() if record.event is WireEvent.STRAY and record.at_s >= since_s
+    )
+    return ReplyReader(PACKET_CHARACTERS).feed(stray)  # a port may deliver them in pieces
 
 
 class Words:

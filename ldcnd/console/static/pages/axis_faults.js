@@ -23,8 +23,12 @@ export function FaultPanel({ axis }) {
         <a href=${faultPage(first.code)}>${words(first.code)}</a> at ${clock(first.since)}: ${first.text}.</p>`
       }
       <ul>${faults.map((fault) => html`<${FaultItem} fault=${fault} first=${first} />`)}</ul>
-      <p class="row"><${Action} act=${() => command(axis, "reset")}
-        obstacle=${obstacle(axis, "reset")}>Reset ${axis.name}<//></p>
+      ${
+        axis.can("reset")
+          ? html`<p class="row"><${Action} act=${() => command(axis, "reset")}
+        obstacle=${obstacle(axis, "reset")}>Reset ${axis.name}<//></p>`
+          : html`<p class="quiet">This drive is reset at the drive, not over its line.</p>`
+      }
     </section>`
     }
   </div>`;
@@ -32,7 +36,7 @@ export function FaultPanel({ axis }) {
 
 function FaultItem({ fault, first }) {
   return html`<li>
-    <${Mark} level=${fault.stops ? "bad" : "warn"}>${fault.stops ? "motor off" : "warning"}<//>
+    <${Mark} level=${fault.stops ? "bad" : "warn"}>${fault.stops ? "stops the axis" : "warning"}<//>
     ${" "}<b>${words(fault.code)}</b>${first?.code === fault.code && html` <span class="quiet">first fault</span>`}
     <p>${fault.text}.</p>
     <p class="quiet">Since ${clock(fault.since)}, says the ${fault.source}.

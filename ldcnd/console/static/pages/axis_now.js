@@ -61,9 +61,9 @@ function Monitors({ axis }) {
       sample.title,
       sample.unit || !sample.high
         ? html`${number(sample.value, 0)} <span class="unit">${sample.unit}</span>`
-        : sample.high.length
-          ? sample.high.join(", ")
-          : "none high",
+        : sample.active
+          ? `${sample.active.join(", ") || "none"} on (high: ${sample.high.join(", ") || "none"})`
+          : sample.high.join(", ") || "none on",
     ])} />`;
 }
 

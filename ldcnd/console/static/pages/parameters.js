@@ -6,7 +6,7 @@ import { Action, Choice, Field, Panel, RefusalText, Table, Tick } from "../parts
 import { Mark } from "../parts/state.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
-import { asToml, fromToml } from "../session/parameter_file.js";
+import { asToml, driverTypeOf, fromToml } from "../session/parameter_file.js";
 import { useRigs } from "../session/rigs.js";
 import { AuthorityPanel } from "./axis_authority.js";
 import { AlarmPanel } from "./parameters_alarms.js";
@@ -14,8 +14,6 @@ import { AxisChoice } from "./trace.js";
 
 /** All parameters of a slow drive on a bad line. */
 const PATIENCE_MS = 65_000;
-/** It holds the unit number: a restored one would make two drives answer at once. */
-const UNIT_NUMBER = "Pn000";
 
 export function ParametersPage({ at }) {
   const axes = [...useRigs().values()]
@@ -33,7 +31,8 @@ export function ParametersPage({ at }) {
 
 function Memories({ axis }) {
   const [listed, setListed] = useState([]);
-  const [values, setValues] = useState(null);
+  const [dump, setDump] = useState(null);
+  const values = dump?.values ?? null;
   const [file, setFile] = useState(null);
   const [only, setOnly] = useState({ text: "", differing: false });
   const [refusal, setRefusal] = useState(null);
@@ -41,17 +40,21 @@ function Memories({ axis }) {
     command(axis, "list_parameters").then((reply) => setListed(reply.parameters), setRefusal);
   }, [axis]);
 
-  const renew = (value) => setValues(values.map((each) => (each.parameter === value.parameter ? value : each)));
-  const readAll = async () => (await command(axis, "read_all_parameters", {}, PATIENCE_MS)).values;
+  const renew = (value) =>
+    setDump((last) => ({
+      ...last,
+      values: last.values.map((each) => (each.parameter === value.parameter ? value : each)),
+    }));
+  const readAll = () => command(axis, "read_all_parameters", {}, PATIENCE_MS);
   const rows = merged(listed, values, file).filter((row) => matches(row, only));
 
   return html`
     <${Panel} title=${`Memories of ${axis.name}`}
       note="RAM is in use and forgotten at power-off. EEPROM endures 10,000 writes.">
       <p class="row">
-        <${Action} act=${readAll} onDone=${setValues} obstacle=${obstacle(axis, "parameters")}
+        <${Action} act=${readAll} onDone=${setDump} obstacle=${obstacle(axis, "parameters")}
           kind="main">${values ? "Read all again" : "Read all"}<//>
-        <${Action} act=${() => save(new Blob([asToml(axis.name, values)], { type: "text/plain" }), `${axis.name}.toml`)}
+        <${Action} act=${() => save(new Blob([asToml(axis.name, dump)], { type: "text/plain" }), `${axis.name}.toml`)}
           obstacle=${values ? null : "Read all first."}>Save to a file<//>
       </p>
       <${FilePicker} file=${file} onFile=${setFile} />
@@ -62,11 +65,11 @@ function Memories({ axis }) {
           onChange=${(differing) => setOnly({ ...only, differing })} />
       </div>
       <${RefusalText} refusal=${refusal} />
-      <${Table} label="Parameters" head=${["Number", "Name", "#RAM", "#EEPROM", "#File", "#Factory", "Range", "#EEPROM writes"]}
+      <${Table} label="Parameters" head=${["Number", "Name", "#RAM", "#EEPROM", "#File", "#Factory (a hint)", "Range", "#EEPROM writes"]}
         rows=${rows.map((row) => html`<${Row} key=${row.parameter} row=${row} />`)} />
     <//>
     ${values && html`<${Change} axis=${axis} values=${values} listed=${listed} onWritten=${renew} />`}
-    ${values && file && html`<${Restore} axis=${axis} values=${values} file=${file} onWritten=${renew} />`}
+    ${values && file && html`<${Restore} axis=${axis} file=${file} onWritten=${renew} />`}
     <${AuthorityPanel} axis=${axis} />
     <${AlarmPanel} axis=${axis} />`;
 }
@@ -95,7 +98,7 @@ function matches(row, { text, differing }) {
 /** Settings that are read digit by digit are shown so. */
 function shown(value, info) {
   if (value === undefined || value === null) return "–";
-  return info?.digits ? `${value.toString(16).toUpperCase().padStart(4, "0")}H` : `${value}`;
+  return info?.digits ? hex(value) : `${value}`;
 }
 
 function Row({ row }) {
@@ -121,7 +124,8 @@ function FilePicker({ file, onFile }) {
     const [picked] = event.target.files;
     if (!picked) return;
     try {
-      onFile({ name: picked.name, values: fromToml(await picked.text()) });
+      const text = await picked.text();
+      onFile({ name: picked.name, values: fromToml(text), driverType: driverTypeOf(text) });
       setProblem(null);
     } catch (error) {
       onFile(null);
@@ -141,6 +145,7 @@ const MEMORIES = [
 
 function Change({ axis, values, listed, onWritten }) {
   const [set, setSet] = useState({ parameter: values[0].parameter, memory: "ram" });
+  const [remarks, setRemarks] = useState([]);
   const info = listed.find((each) => each.parameter === set.parameter);
   const way =
     obstacle(axis, "write_parameter") ?? (set.value === null || set.value === undefined ? "A value is missing." : null);
@@ -153,39 +158,79 @@ function Change({ axis, values, listed, onWritten }) {
         hint=${info?.digits ? `as a number; it is shown by digits: ${shown(set.value, info)}` : null} />
       <${Choice} label="Memory" options=${MEMORIES} value=${set.memory}
         onChange=${(memory) => setSet({ ...set, memory })} />
+      ${
+        info?.digits &&
+        html`<${Field} label="New unit number, if it changes" value=${set.confirm_unit} min="0" max="15" step="1"
+        onChange=${(unit) => setSet({ ...set, confirm_unit: unit ?? null })} />`
+      }
     </div>
+    ${info?.digits && html`<${Digits} info=${info} value=${set.value} />`}
     <p class="row"><${Action} act=${() => command(axis, "write_parameter", set)}
-      onDone=${(reply) => onWritten(reply.value)} obstacle=${way}
+      onDone=${(reply) => (onWritten(reply.value), setRemarks(reply.remarks))} obstacle=${way}
       kind="main">Write ${set.parameter}<//></p>
+    <div role="status">${remarks.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
 }
 
-function Restore({ axis, values, file, onWritten }) {
-  const [memory, setMemory] = useState("ram");
+/** What the digits of a parameter set, from the right. */
+function Digits({ info, value }) {
+  if (!info.digit_meanings?.length) return null;
+  return html`<ul aria-label="Digits">${info.digit_meanings.map((digit) => {
+    const own = value == null ? null : ((value >> (4 * digit.digit)) & 0xf).toString(16).toUpperCase();
+    return html`<li>${info.parameter}.${digit.digit}${own === null ? "" : ` = ${own}`}: ${digit.title}${
+      own !== null && digit.values[own] ? `, ${digit.values[own]}` : ""
+    } <small>[${digit.confidence}]</small></li>`;
+  })}</ul>`;
+}
+
+/** The daemon plans; this page shows the plan, sends its writes one by one, and plans again to prove them. */
+function Restore({ axis, file, onWritten }) {
+  const [plan, setPlan] = useState(null);
   const [told, setTold] = useState([]);
-  const changes = values.filter(({ parameter, active, stored }) => {
-    const wanted = file.values.get(parameter);
-    return parameter !== UNIT_NUMBER && wanted !== undefined && wanted !== (memory === "ram" ? active : stored);
-  });
-  const way = obstacle(axis, "write_parameter") ?? (changes.length ? null : "Nothing differs.");
+  const ask = async () => {
+    const wanted = { values: Object.fromEntries(file.values), driver_type: file.driverType };
+    return (await command(axis, "plan_parameters", wanted, PATIENCE_MS)).plan;
+  };
+  const way =
+    obstacle(axis, "write_parameter") ??
+    (!plan ? "Plan it first." : plan.problems.length ? plan.problems[0] : plan.writes.length ? null : "Nothing differs.");
   async function restore() {
-    const failed = [];
-    for (const { parameter } of changes) {
+    const lines = [];
+    for (const [place, { parameter, value, memory }] of plan.writes.entries()) {
+      setTold([`${place + 1} of ${plan.writes.length}: ${parameter} to ${memory}`]);
       try {
-        onWritten(
-          (await command(axis, "write_parameter", { parameter, value: file.values.get(parameter), memory })).value,
-        );
+        const reply = await command(axis, "write_parameter", { parameter, value, memory }, PATIENCE_MS);
+        onWritten(reply.value);
+        lines.push(...reply.remarks);
       } catch (error) {
-        failed.push(`${parameter}: ${error.message}`);
+        lines.push(`${parameter} failed: ${error.message}. ${plan.writes.length - place - 1} not tried.`);
+        break;
       }
     }
-    setTold([`${changes.length - failed.length} of ${changes.length} written.`, ...failed]);
+    const left = await ask();
+    setPlan(left);
+    setTold([left.writes.length ? "Read back: not all is written. The same again completes it." :
+      "Read back: the drive holds the values.", ...new Set(lines)]);
   }
-  return html`<${Panel} title="Restore from the file" note=${`${UNIT_NUMBER} is left out: it holds the unit number.`}>
-    <${Choice} label="Memory" options=${MEMORIES} value=${memory} onChange=${setMemory} />
-    <p>${changes.map(({ parameter }) => parameter).join(", ")}</p>
+  return html`<${Panel} title="Restore from the file" note="The unit number in Pn000 stays as it is in the drive.">
+    <p class="row"><${Action} act=${ask} onDone=${setPlan} obstacle=${obstacle(axis, "parameters")}>Plan<//></p>
+    ${plan?.problems.map((each) => html`<p><${Mark} level="bad">cannot be done<//> ${each}</p>`)}
+    ${
+      plan?.writes.length > 0 &&
+      html`<${Table} label="Writes" head=${["Parameter", "Memory", "#Now", "#New", "Takes effect"]}
+      rows=${plan.writes.map(
+        (write) => html`<tr><th scope="row">${write.parameter} ${write.name}</th><td>${write.memory}</td>
+        <td class="number">${write.before}</td><td class="number">${write.value} (${hex(write.value)})</td>
+        <td>${write.effective}${write.digits.map((digit) => html`<br /><small>${digit}</small>`)}</td></tr>`,
+      )} />`
+    }
+    ${plan?.remarks.map((each) => html`<p class="quiet">${each}</p>`)}
     <p class="row"><${Action} act=${restore} obstacle=${way}
-      kind="main">Write ${changes.length === 1 ? "1 value" : `${changes.length} values`}<//></p>
+      kind="main">Write ${plan?.writes.length === 1 ? "1 value" : `${plan?.writes.length ?? 0} values`}<//></p>
     <div role="status">${told.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
+}
+
+function hex(value) {
+  return `${value.toString(16).toUpperCase().padStart(4, "0")}H`;
 }

@@ -12,6 +12,7 @@ const LEVELS = { alarm: "bad", warning: "warn", unknown: "warn" };
 export function AlarmPanel({ axis }) {
   const [report, setReport] = useState(null);
   const [profile, setProfile] = useState(null);
+  const [cleared, setCleared] = useState(null);
   return html`<${Panel} title="Alarms and assumptions">
     <p class="row">
       <${Action} act=${() => command(axis, "read_alarms")} onDone=${setReport}
@@ -19,10 +20,18 @@ export function AlarmPanel({ axis }) {
       <${Action} act=${() => command(axis, "read_profile")} onDone=${setProfile}
         obstacle=${obstacle(axis, "none")}>Show assumptions<//>
     </p>
+    <p class="row">${["command", "feedback"].map(
+      (counter) => html`<${Action} act=${() => command(axis, "clear_counter", { counter })} onDone=${setCleared}
+        obstacle=${obstacle(axis, "write_parameter")}>Clear the ${counter} counter<//>`,
+    )}</p>
+    ${
+      cleared &&
+      html`<p role="status">The ${cleared.counter} counter reads ${cleared.value}. ${cleared.remarks.join(" ")}</p>`
+    }
     ${
       report &&
       html`<${Table} label="Alarms" head=${["When", "#Code", "Meaning", "Kind"]}
-      rows=${[["now", report.present], ...report.history.map((entry, nth) => [`${nth + 1}`, entry])].map(
+      rows=${[["now", report.present], ...report.history.map((entry, nth) => [`${nth}`, entry])].map(
         ([when, entry]) => html`<tr>
         <th scope="row">${when}</th><td class="number">${entry.code.toString(16).toUpperCase().padStart(2, "0")}</td>
         <td>${entry.text}</td><td><${Mark}

@@ -16,7 +16,7 @@ export const GAINS = {
 export const HOME_METHODS = ["index", "forward_limit", "reverse_limit", "position_error", "current"];
 export const HOME_STOPS = ["smooth", "abrupt", "off"];
 
-export const TRIGGER_KINDS = ["rising", "falling", "either", "above", "below"];
+export const TRIGGER_KINDS = ["rising", "falling", "either", "change", "above", "below"];
 /** Phases in which a trace is still on its way. */
 export const TRACE_UNDER_WAY = ["filling", "waiting", "recording", "uploading"];
 export const MOST_CHANNELS = 8;

@@ -3,13 +3,21 @@
 const LINE = /^\s*"?(Pn[0-9A-Fa-f]{3})"?\s*=\s*(0x[0-9A-Fa-f]+|\d+)\s*(#.*)?$/;
 const LARGEST = 0xffff;
 
-/** Return a dump: what is stored, with a remark where another value is in use. */
-export function asToml(axis, values) {
-  const lines = values.map(
-    ({ parameter, stored, active, name }) =>
-      `${parameter} = ${stored}  # ${name}${stored === active ? "" : `, in use ${active}`}`,
-  );
-  return `axis = "${axis}"\n\n[parameters]\n${lines.join("\n")}\n`;
+/** Return a dump: from which drive it is, and what both memories hold. */
+export function asToml(axis, { values, facts }) {
+  const stored = values.map(({ parameter, stored, name }) => `${parameter} = ${stored}  # ${name}`);
+  const inUse = values.map(({ parameter, active }) => `${parameter} = ${active}`);
+  const about = facts
+    ? `driver_type = ${facts.driver_type}\nsoftware_version = ${facts.software_version}\nunit = ${facts.unit}\n`
+    : "";
+  const head = `axis = "${axis}"\nread_at = ${new Date().toISOString()}\n${about}`;
+  return `${head}\n[parameters]\n${stored.join("\n")}\n\n[in_use]\n${inUse.join("\n")}\n`;
+}
+
+/** Return the type of the drive that a dump is from; null where it does not say. */
+export function driverTypeOf(text) {
+  const [, number] = /^\s*driver_type\s*=\s*(0x[0-9A-Fa-f]+|\d+)/m.exec(text) ?? [];
+  return number === undefined ? null : Number(number);
 }
 
 /** Return the values of a dump by parameter; raises an Error that names the line which is none. */
