@@ -5,6 +5,7 @@ import sys
 
 import click
 
+from ldcnd.cli.remedies import in_typed_terms
 from ldcnd.errors import ConfigError, LdcndError, SessionError
 from ldcnd.printable import printable
 
@@ -49,7 +50,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def _remedy(error: LdcndError) -> list[str]:
-    return [f"  {error.remedy}"] if error.remedy else []
+    return [f"  {in_typed_terms(error.remedy, error.axis)}"] if error.remedy else []
 
 
 def _single(group: BaseExceptionGroup[BaseException]) -> BaseException:

@@ -8,6 +8,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.names import axis_of
 from ldcnd.cli.numbers import Finite
 from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.client.rig_client import RigClient
@@ -104,7 +105,7 @@ def take(
     timeout: float,
     out: Path | None,
 ) -> None:
-    """Record channels of AXIS; what it has is in `ldcnd axis list --json`. Ctrl-C and SIGTERM end the trace."""
+    """Record channels of AXIS; `ldcnd trace channels` shows what it has. Ctrl-C and SIGTERM end the trace."""
     request = TakeTrace(
         channels=channels,
         interval_s=FASTEST if isinstance(interval, str) else interval,
@@ -142,6 +143,15 @@ def abort(target: Target, axis: str) -> None:
     """End the trace of AXIS that is under way, or one that was left armed in its drive."""
     reply = target.run(lambda client: client.command(axis, AbortTrace(), ENDING_S))
     target.show(reply, f"{axis}: trace ended")
+
+
+@command.command()
+@click.argument("axis")
+@with_target
+def channels(target: Target, axis: str) -> None:
+    """Show what a trace of AXIS can record."""
+    info = target.run(lambda client: axis_of(client, axis))
+    target.show(info, *info.trace_channels)
 
 
 @command.command()

@@ -5,6 +5,10 @@ import sys
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.names import axis_of
+from ldcnd.cli.remedies import in_typed_terms
+from ldcnd.client.rig_client import RigClient
+from ldcnd.model.commands import WhyReply
 
 
 @click.command()
@@ -12,10 +16,15 @@ from ldcnd.cli.connection import Target, with_target
 @with_target
 def command(target: Target, axis: str) -> None:
     """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
-    reply = target.run(lambda client: client.why(axis))
-    lines = [f"{axis}: {'nothing is in the way of a motion' if reply.can_move else 'cannot move now'}"]
+
+    async def work(client: RigClient) -> WhyReply:
+        await axis_of(client, axis)
+        return await client.why(axis)
+
+    reply = target.run(work)
+    lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]
     for cause in reply.causes:
-        lines.append(f"  {cause.text}{f' -> {cause.remedy}' if cause.remedy else ''}")
+        lines.append(f"  {cause.text}{f': {in_typed_terms(cause.remedy, axis)}' if cause.remedy else ''}")
         if cause.page:
             lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
     if reply.first_fault:

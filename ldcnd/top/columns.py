@@ -9,6 +9,8 @@ MARKS = {Severity.FINE: " ", Severity.NOTICE: "!", Severity.WRONG: "X"}
 """A mark beside the colour: nobody has to tell colours apart."""
 
 AXIS_TITLES = ("", "bus", "axis", "state", "position", "velocity", "target", "A/D", "age", "rate", "control", "trouble")
+NARROW = (0, 2, 3, 4, 10, 11)
+"""Which of them a narrow terminal shows: that control and trouble can be seen comes before rates and ages."""
 BUS_TITLES = ("", "bus", "line", "busy", "exchanges", "errors", "resent", "poll p99", "stop max", "trouble")
 
 

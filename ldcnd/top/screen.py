@@ -13,12 +13,15 @@ from textual.widgets import DataTable, Footer, Static
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trouble import Severity
 from ldcnd.errors import LdcndError
-from ldcnd.model.commands import StopReply
-from ldcnd.top.columns import AXIS_TITLES, BUS_TITLES, axis_cells, bus_cells, headline
+from ldcnd.model.commands import Halt, Reset, StopReply
+from ldcnd.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, bus_cells, headline
 from ldcnd.top.follow import follow
 from ldcnd.top.rig_view import RigView
 
 REDRAW_S = 0.25
+WIDE = 130
+"""Columns of a terminal that has room for everything."""
+NAME = "ldcnd top"
 STYLES = {Severity.FINE: "", Severity.NOTICE: "yellow", Severity.WRONG: "bold red"}
 
 
@@ -32,7 +35,9 @@ class TopScreen(App[None]):
     TITLE = "ldcnd"
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[Binding | tuple[str, str] | tuple[str, str, str]]] = [
-        Binding("s", "stop_all", "Stop all axes (no emergency stop)", priority=True),
+        Binding("s", "stop_all", "STOP all (no emergency stop)", priority=True),
+        Binding("h", "halt_axis", "Halt axis"),
+        Binding("r", "reset_axis", "Reset axis"),
         Binding("q", "quit", "Quit"),
     ]
     CSS = """
@@ -47,6 +52,8 @@ class TopScreen(App[None]):
         super().__init__()
         self._client = client
         self._view = RigView(client.rig, asyncio.get_running_loop().time())
+        self._shown: list[str] = []
+        self._laid_out: tuple[int, ...] = ()
 
     def compose(self) -> ComposeResult:
         """Lay out the screen."""
@@ -58,7 +65,6 @@ class TopScreen(App[None]):
 
     def on_mount(self) -> None:
         """Begin to follow the rig."""
-        self.query_one("#axes", DataTable).add_columns(*AXIS_TITLES)
         self.query_one("#buses", DataTable).add_columns(*BUS_TITLES)
         self.run_worker(follow(self._client, self._view), name="follow")
         self.set_interval(REDRAW_S, self._redraw)
@@ -68,13 +74,35 @@ class TopScreen(App[None]):
         """Stop every axis; what became of it is shown above the tables."""
         self.run_worker(self._stop_all(), name="stop")
 
+    def action_halt_axis(self) -> None:
+        """Halt the axis of the row under the cursor."""
+        self.run_worker(self._send(Halt(client=NAME), "halted"), name="halt")
+
+    def action_reset_axis(self) -> None:
+        """Clear stop latch and faults of the axis of the row under the cursor; nothing moves."""
+        self.run_worker(self._send(Reset(client=NAME), "reset"), name="reset")
+
+    async def _send(self, command: Halt | Reset, done: str) -> None:
+        row = self.query_one("#axes", DataTable).cursor_row
+        if row >= len(self._shown):
+            return
+        axis = self._shown[row]
+        try:
+            await self._client.command(axis, command)
+            self._say(f"{axis}: {done}")
+        except LdcndError as error:
+            self._say(f"{axis}: not {done}: {error.message}")
+
     async def _stop_all(self) -> None:
         self._say("stopping all axes ...")
         try:
-            answer = _stopped(await self._client.stop(client="ldcnd top"))
+            answer = _stopped(await self._client.stop(client=NAME))
         except LdcndError as error:
             answer = f"STOP NOT CONFIRMED: {error.message}. Use the machine's emergency stop."
         self._say(answer)
+
+    def _columns(self) -> tuple[int, ...]:
+        return NARROW if self.size.width < WIDE else tuple(range(len(AXIS_TITLES)))
 
     def _say(self, what: str) -> None:
         answer = self.query_one("#answer", Static)
@@ -85,7 +113,14 @@ class TopScreen(App[None]):
         glance = self._view.glance(asyncio.get_running_loop().time())
         urgent = glance.trouble or glance.count(Severity.WRONG)
         self.query_one("#headline", Static).update(Text(headline(glance), STYLES[Severity.WRONG] if urgent else ""))
-        _fill(self.query_one("#axes", DataTable), [(axis_cells(row), row.severity) for row in glance.axes])
+        self._shown = [row.axis for row in glance.axes]
+        axes, columns = self.query_one("#axes", DataTable), self._columns()
+        if columns != self._laid_out:
+            axes.clear(columns=True)
+            axes.add_columns(*(AXIS_TITLES[column] for column in columns))
+            self._laid_out = columns
+        cells = [(axis_cells(row), row.severity) for row in glance.axes]
+        _fill(axes, [(tuple(row[column] for column in columns), severity) for row, severity in cells])
         _fill(self.query_one("#buses", DataTable), [(bus_cells(row), row.severity) for row in glance.buses])
 
 

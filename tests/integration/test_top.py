@@ -7,6 +7,7 @@ import pytest
 from textual.widgets import DataTable, Static
 
 from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.top.columns import NARROW
 from ldcnd.top.glance import RigGlance
 from ldcnd.top.screen import TopScreen
 from tests.support.process import LDCND, ROOT, client, daemon
@@ -38,10 +39,20 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
             await pilot.press("s")
             await until(pilot, lambda: "stopped and latched: x, y, z, c" in str(answer.content))
             await until(pilot, lambda: states()["x"] != "discrete_motion")
-        state = await rig.state("x")
+
+            await pilot.resize_terminal(80, 24)
+            await until(pilot, lambda: len(axes.columns) == len(NARROW))
+            titles = [str(column.label) for column in axes.columns.values()]
+            left = sum(column.get_render_width(axes) for column in list(axes.columns.values())[:-1])
+            await until(pilot, lambda: "a stop is latched" in axes.get_row_at(0)[-1].plain)
+            await pilot.press("r")
+            await until(pilot, lambda: ": reset" in str(answer.content))
+        states_after = [await rig.state(axis) for axis in "xyzc"]
         printed, _ = await printing.communicate()
 
     glance = RigGlance.model_validate_json(printed)
-    assert state.stop_latched
-    assert [axis.axis for axis in glance.axes] == ["x", "y", "z", "c"]
+    assert titles == ["", "axis", "state", "position", "control", "trouble"]
+    assert left < 60  # of 80 columns; the trouble has the rest
+    assert [each.stop_latched for each in states_after].count(False) == 1
+    assert {axis.axis for axis in glance.axes} == set("xyzc")
     assert all(axis.rate_hz for axis in glance.axes)

@@ -14,7 +14,7 @@ from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import COMMANDS, cli, main
 from ldcnd.messaging.memory_session import MemoryBroker
 
-VALUES = ("nan", "inf", "-inf", "0", "-1", "", "1e308", "9" * 30, "\x1b[2J", "no/such", "*", "x")
+VALUES = ("nan", "inf", "0", "-1", "", "9" * 30, "\x1b[2J", "no/such")
 DOCUMENTED = {0, 1, 2, 3, 78, 130}
 SERVES = {"run", "sim", "console", "metrics", "foxglove"}
 """These run until they are ended when all they are given can be used; what they refuse has tests of its own."""
@@ -78,12 +78,13 @@ def called(monkeypatch, words):
             main()
         except SystemExit as end:
             return end.code, printed.getvalue()
-        except BaseException:  # noqa: BLE001 - what comes here is what this test is about
+        except Exception:  # noqa: BLE001 - what comes here is what this test is about
             return "traceback", traceback.format_exc()
 
 
+@pytest.mark.timeout(300)
 def test_every_option_of_every_command_bears_every_value(monkeypatch):
-    tried, wrong = 0, []
+    tried, wrong = 0, list[str]()
     for words, command in leaves():
         for param in command.params:
             flag = isinstance(param, click.Option) and param.is_flag
