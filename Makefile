@@ -21,11 +21,13 @@ check: .venv/ready
 	.venv/bin/ldcnd schema check
 
 fix: .venv/ready
+	.venv/bin/ldcnd schema client
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
 	.venv/bin/ldcnd schema write
 	.venv/bin/ldcnd schema configuration
 	.venv/bin/ldcnd schema cli
+	.venv/bin/ldcnd schema python
 	.venv/bin/ldcnd schema keys docs/reference/keys.md
 	.venv/bin/ldcnd schema errors docs/reference/errors.md
 

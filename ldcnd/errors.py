@@ -45,6 +45,7 @@ class ErrorCode(StrEnum):
     WRONG_STATE = "wrong_state"
     NOT_REFERENCED = "not_referenced"
     STOP_LATCHED = "stop_latched"
+    ABORTED = "aborted"
     AXIS_UNREACHABLE = "axis_unreachable"
     TOO_MANY_REQUESTS = "too_many_requests"
     DUPLICATE_DAEMON = "duplicate_daemon"
@@ -317,6 +318,13 @@ class StopLatched(RequestRefused):
 
     code = ErrorCode.STOP_LATCHED
     way_out = "send `reset`"
+
+
+class CommandAborted(LdcndError):
+    """Another command, a stop or a loss policy ended the command early; the client raises it where a program waits."""
+
+    code = ErrorCode.ABORTED
+    way_out = "look at the events: they tell what ended it"
 
 
 class AxisUnreachable(RequestRefused):

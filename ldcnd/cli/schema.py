@@ -4,8 +4,10 @@ from pathlib import Path
 
 import click
 
+from ldcnd.cli.client_reference import client_reference
 from ldcnd.cli.manual import as_markdown as as_reference
 from ldcnd.cli.manual import man_pages
+from ldcnd.cli.verb_methods import verb_methods, with_blocking_methods
 from ldcnd.config.reference import config_reference
 from ldcnd.daemon.publish.asyncapi import asyncapi_text
 from ldcnd.daemon.publish.contract import all_schemas, as_markdown
@@ -82,6 +84,24 @@ def asyncapi() -> None:
 def keys(page: Path | None) -> None:
     """Print all keys as a Markdown table, or renew the table at the end of PAGE (docs/reference/keys.md)."""
     _print_or_renew(as_markdown(), page)
+
+
+@command.command("client")
+@click.argument("folder", type=click.Path(path_type=Path), default=Path("ldcnd/client"))
+def client_methods(folder: Path) -> None:
+    """Write the methods of the Python client into the modules in FOLDER; `make fix` formats them."""
+    (folder / "verbs.py").write_text(verb_methods(), encoding="utf-8")
+    blocking = folder / "blocking.py"
+    blocking.write_text(with_blocking_methods(blocking.read_text(encoding="utf-8")), encoding="utf-8")
+    click.echo(str(folder))
+
+
+@command.command("python")
+@click.argument("page", type=click.Path(path_type=Path), default=Path("docs/reference/python.md"))
+def python_client(page: Path) -> None:
+    """Write the reference of the Python client to PAGE."""
+    page.write_text(client_reference(), encoding="utf-8")
+    click.echo(str(page))
 
 
 @command.command("errors")

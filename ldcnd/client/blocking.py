@@ -1,27 +1,26 @@
 """The client for programs without an event loop: the same calls, each of which waits for its result.
 
 Nothing is implemented twice: a call runs the asyncio client's own method on a loop in a thread of its own, and has its
-arguments, its result and its errors. Safe to use from several threads.
+arguments, its result and its errors. Safe to use from several threads. An interrupted wait for a motion halts the axis.
 """
 
 import asyncio
 import concurrent.futures
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from contextlib import AbstractAsyncContextManager, contextmanager
+from contextlib import AbstractAsyncContextManager, AbstractContextManager, contextmanager
 from functools import wraps
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from html import escape
+from pathlib import Path
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
-from ldcnd.client import connecting, events, lease, progress
+from ldcnd.client import axis as asynchronous
+from ldcnd.client import motion, rig
 from ldcnd.client.fleet import RigReport, survey
-from ldcnd.client.rig_client import RigClient
-from ldcnd.client.traces import Trace, take_trace
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import CommandReply
 from ldcnd.model.events import CommandEvent
-from ldcnd.model.samples import Sample
-from ldcnd.model.traces import TakeTrace
+from ldcnd.model.samples import PositionSample, Sample
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
@@ -98,76 +97,194 @@ def _waiting(
     return call
 
 
-class Control(Facade[lease.Control]):
-    """See `ldcnd.client.lease.Control`; the lease is renewed in the background."""
+def _moving(
+    method: Callable[Concatenate[WrappedT, P], Coroutine[Any, Any, motion.Motion]],
+) -> Callable[Concatenate[Facade[WrappedT], P], "Motion"]:
+    """Return a method that waits until the drive has acknowledged a motion."""
 
-    command = _waiting(lease.Control.command)
+    @wraps(method)
+    def call(facade: Facade[WrappedT], /, *args: P.args, **kwargs: P.kwargs) -> Motion:
+        return Motion(facade._loop, facade._loop.run(method(facade._wrapped, *args, **kwargs)))  # noqa: SLF001
+
+    return call
 
 
-class Rig(Facade[RigClient]):
-    """See `ldcnd.client.rig_client.RigClient`; made by `open_rig`."""
+class Motion(Facade[motion.Motion]):
+    """A command that the drive has acknowledged and that ends later."""
 
-    daemon = _waiting(RigClient.daemon)
-    axes = _waiting(RigClient.axes)
-    buses = _waiting(RigClient.buses)
-    line_plan = _waiting(RigClient.line_plan)
-    command_list = _waiting(RigClient.command_list)
-    last = _waiting(RigClient.last)
-    last_published = _waiting(RigClient.last_published)
-    descriptions = _waiting(RigClient.descriptions)
-    monitors = _waiting(RigClient.monitors)
-    state = _waiting(RigClient.state)
-    states = _waiting(RigClient.states)
-    faults = _waiting(RigClient.faults)
-    last_health = _waiting(RigClient.last_health)
-    last_bus_health = _waiting(RigClient.last_bus_health)
-    command = _waiting(RigClient.command)
-    why = _waiting(RigClient.why)
-    plan = _waiting(RigClient.plan)
-    stop = _waiting(RigClient.stop)
-    wait_for_end = _waiting(RigClient.wait_for_end)
+    done = _waiting(motion.Motion.done)
+
+    def __iter__(self) -> Iterator[motion.Progress]:
+        """Yield the progress with each value that arrives until the command has ended."""
+        return self._loop.each(aiter(self._wrapped))
+
+    def __repr__(self) -> str:
+        return repr(self._wrapped)
+
+
+class Axis(Facade[asynchronous.Axis]):
+    """An axis that a program controls or watches; a method for each verb, as `ldcnd.Axis` has."""
+
+    # made by `ldcnd schema client`: begin
+    power = _waiting(asynchronous.Axis.power)
+    move_absolute = _moving(asynchronous.Axis.move_absolute)
+    move_relative = _moving(asynchronous.Axis.move_relative)
+    move_velocity = _moving(asynchronous.Axis.move_velocity)
+    halt = _moving(asynchronous.Axis.halt)
+    quick_stop = _waiting(asynchronous.Axis.quick_stop)
+    home = _moving(asynchronous.Axis.home)
+    reset = _waiting(asynchronous.Axis.reset)
+    set_position = _waiting(asynchronous.Axis.set_position)
+    set_gains = _waiting(asynchronous.Axis.set_gains)
+    list_parameters = _waiting(asynchronous.Axis.list_parameters)
+    read_parameter = _waiting(asynchronous.Axis.read_parameter)
+    read_all_parameters = _waiting(asynchronous.Axis.read_all_parameters)
+    write_parameter = _waiting(asynchronous.Axis.write_parameter)
+    clear_counter = _waiting(asynchronous.Axis.clear_counter)
+    read_alarms = _waiting(asynchronous.Axis.read_alarms)
+    read_profile = _waiting(asynchronous.Axis.read_profile)
+    move_analog = _moving(asynchronous.Axis.move_analog)
+    set_pwm = _moving(asynchronous.Axis.set_pwm)
+    track = _moving(asynchronous.Axis.track)
+    set_outputs = _waiting(asynchronous.Axis.set_outputs)
+    abort_trace = _waiting(asynchronous.Axis.abort_trace)
+    why = _waiting(asynchronous.Axis.why)
+    preview = _waiting(asynchronous.Axis.preview)
+
+    # made by `ldcnd schema client`: end
+
+    stop = _waiting(asynchronous.Axis.stop)
+    take_trace = _waiting(asynchronous.Axis.take_trace)
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self._wrapped.name
+
+    @property
+    def state(self) -> motion.State:
+        """The last state."""
+        return self._wrapped.state
+
+    @property
+    def position(self) -> motion.Position:
+        """The last position."""
+        return self._wrapped.position
+
+    def positions(self) -> Iterator[PositionSample]:
+        """Iterate over the positions that come from now on."""
+        return self._loop.each(self._wrapped.positions())
+
+    def __repr__(self) -> str:
+        return repr(self._wrapped)
+
+
+class Rig(Facade[rig.Rig]):
+    """A rig that a program uses; made by `connect`."""
+
+    stop = _waiting(rig.Rig.stop)
+    daemon = _waiting(rig.Rig.daemon)
+    describe = _waiting(rig.Rig.describe)
+    buses = _waiting(rig.Rig.buses)
+    faults = _waiting(rig.Rig.faults)
+    holders = _waiting(rig.Rig.holders)
+    outcome = _waiting(rig.Rig.outcome)
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self._wrapped.name
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The names of its axes."""
+        return self._wrapped.axes
+
+    def move_together(
+        self, targets: dict[str, float], *, velocity: float | None = None, acceleration: float | None = None
+    ) -> tuple[Motion, ...]:
+        """Start absolute moves of the members of one group in the same servo cycle; see `ldcnd.Rig.move_together`."""
+        moves = self._wrapped.move_together(targets, velocity=velocity, acceleration=acceleration)
+        return tuple(Motion(self._loop, move) for move in self._loop.run(moves))
+
+    @overload
+    def control(
+        self, axis: str, /, *, client: str, lease_s: float = 1.0, force: bool = False
+    ) -> AbstractContextManager[Axis]: ...
+
+    @overload
+    def control(
+        self, first: str, second: str, /, *more: str, client: str, lease_s: float = 1.0, force: bool = False
+    ) -> AbstractContextManager[tuple[Axis, ...]]: ...
+
+    def control(
+        self, *axes: str, client: str, lease_s: float = 1.0, force: bool = False
+    ) -> AbstractContextManager[Axis] | AbstractContextManager[tuple[Axis, ...]]:
+        """Control axes until the context ends; see `ldcnd.Rig.control`."""
+        held = self._axes(self._wrapped.controlled(axes, client, lease_s, force=force))
+        return _only(held) if len(axes) == 1 else held
+
+    @overload
+    def watch(self, axis: str, /) -> AbstractContextManager[Axis]: ...
+
+    @overload
+    def watch(self, first: str, second: str, /, *more: str) -> AbstractContextManager[tuple[Axis, ...]]: ...
+
+    def watch(self, *axes: str) -> AbstractContextManager[Axis] | AbstractContextManager[tuple[Axis, ...]]:
+        """Watch axes until the context ends; see `ldcnd.Rig.watch`."""
+        watched = self._axes(self._wrapped.watched(axes))
+        return _only(watched) if len(axes) == 1 else watched
 
     @contextmanager
-    def control(self, name: str, *axes: str, lease_s: float = 1.0, force: bool = False) -> Iterator[Control]:
-        """See `ldcnd.client.lease.control`."""
-        held = lease.control(self._wrapped, name, *axes, lease_s=lease_s, force=force)
-        with self._loop.inside(held) as control:
-            yield Control(self._loop, control)
+    def events(self, axis: str | None = None, *, history: bool = False) -> Iterator[Iterator[CommandEvent]]:
+        """Follow what happens to commands; see `ldcnd.Rig.events`."""
+        with self._loop.inside(self._wrapped.events(axis, history=history)) as following:
+            yield self._loop.each(following)
 
     @contextmanager
     def samples(self, axis: str = "*", item: str = "*") -> Iterator[Iterator[tuple[str, Sample]]]:
-        """See `RigClient.samples`."""
+        """Take telemetry of any item: pairs of the axis and its sample."""
         with self._loop.inside(self._wrapped.samples(axis, item)) as samples:
             yield self._loop.each(samples)
 
     @contextmanager
-    def follow(self, command: CommandReply) -> Iterator[Iterator[progress.Progress]]:
-        """See `ldcnd.client.progress.follow`; the iteration ends with the command."""
-        with self._loop.inside(progress.follow(self._wrapped, command)) as motion:
-            yield self._loop.each(motion)
+    def _axes(self, context: AbstractAsyncContextManager[tuple[asynchronous.Axis, ...]]) -> Iterator[tuple[Axis, ...]]:
+        with self._loop.inside(context) as axes:
+            yield tuple(Axis(self._loop, axis) for axis in axes)
 
-    @contextmanager
-    def events(self, axis: str | None = None, *, history: bool = False) -> Iterator[Iterator[CommandEvent]]:
-        """See `ldcnd.client.events.follow_events`."""
-        with self._loop.inside(events.follow_events(self._wrapped, axis, history=history)) as following:
-            yield self._loop.each(following)
+    def __repr__(self) -> str:
+        return repr(self._wrapped)
 
-    def take_trace(self, axis: str, request: TakeTrace, within_s: float) -> Trace:
-        """See `ldcnd.client.traces.take_trace`."""
-        return self._loop.run(take_trace(self._wrapped, axis, request, within_s))
+    def _repr_html_(self) -> str:
+        """Return the axes as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><td>{escape(axis.axis)}</td><td>{escape(axis.model)}</td><td>{escape(axis.unit)}</td></tr>"
+            for axis in self.describe()
+        )
+        head = "<tr><th>axis</th><th>drive</th><th>unit</th></tr>"
+        return f"<table><caption>rig {escape(self.name)}</caption>{head}{rows}</table>"
 
 
 @contextmanager
-def open_rig(settings: ZenohSettings, rig: str | None = None) -> Iterator[Rig]:
-    """See `ldcnd.client.connecting.open_rig`."""
-    with _running_loop() as loop, loop.inside(connecting.open_rig(settings, rig)) as client:
-        yield Rig(loop, client)
+def connect(endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None) -> Iterator[Rig]:
+    """Use one rig for as long as the context lasts; see `ldcnd.connect`."""
+    with _running_loop() as loop, loop.inside(_connect(endpoint, rig=rig, config=config)) as found:
+        yield Rig(loop, found)
 
 
 def fleet(settings: ZenohSettings, rig: str | None = None) -> tuple[RigReport, ...]:
-    """See `ldcnd.client.fleet.survey`."""
+    """Return how every rig is that can be reached."""
     with _running_loop() as loop, loop.inside(open_zenoh_session(settings)) as session:
         return loop.run(survey(session, rig))
+
+
+_connect = rig.connect
+
+
+@contextmanager
+def _only(axes: AbstractContextManager[tuple[Axis, ...]]) -> Iterator[Axis]:
+    with axes as found:
+        yield found[0]
 
 
 @contextmanager

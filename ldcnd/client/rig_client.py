@@ -22,6 +22,7 @@ from ldcnd.model.samples import (
     LinkState,
     MonitorName,
     MonitorSample,
+    PositionSample,
     StateSample,
     TelemetryItem,
 )
@@ -231,6 +232,23 @@ class RigClient:
             self._keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True
         )
         return self._one(answers, StopReply)
+
+    async def position(self, axis: str) -> PositionSample | None:
+        """Return the axis's last position, or None when there is none yet."""
+        sample = await self.last(axis, TelemetryItem.POSITION)
+        return sample if isinstance(sample, PositionSample) else None
+
+    @asynccontextmanager
+    async def values(
+        self, axis: str, item: str, take: Callable[[Sample], None], linger_s: float
+    ) -> AsyncIterator[None]:
+        """Hand one item of an axis to `take`, encoded as it came, for the time of the context."""
+        key = self._keys.telemetry_pattern(axis, item)
+        declaration = await self._session.subscribe(key, take, KEPT_SAMPLES, linger_s=linger_s)
+        try:
+            yield
+        finally:
+            await declaration.close()
 
     @asynccontextmanager
     async def samples(self, axis: str = "*", item: str = "*") -> AsyncIterator[Samples]:

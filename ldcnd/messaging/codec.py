@@ -87,7 +87,7 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
     try:
         request = model.model_validate_json(as_json(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
     except pydantic.ValidationError as error:
-        raise _explained(model, error) from None
+        raise explained(error, model) from None
     for field, text in _texts(request):
         if not is_printable(text):
             raise MalformedRequest(
@@ -119,7 +119,7 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
             text = _with_escapes(text)
         return model.model_validate_json(text, strict=True, extra="ignore")
     except pydantic.ValidationError as error:
-        raise _explained(model, error) from None
+        raise explained(error, model) from None
 
 
 def decode_error(payload: bytes, encoding: str) -> LdcndError:
@@ -261,7 +261,7 @@ def _from_msgpack(payload: bytes) -> bytes:
         ) from None
 
 
-def _explained(model: type[Frozen], error: pydantic.ValidationError) -> MalformedRequest:
+def explained(error: pydantic.ValidationError, model: type[Frozen] = Frozen) -> MalformedRequest:
     """Say in one sentence what is wrong with the first field that is."""
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"])

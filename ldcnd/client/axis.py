@@ -1,0 +1,273 @@
+"""One axis as a program sees it: a method for each verb, its last values, its positions as they come."""
+
+import asyncio
+import contextlib
+import weakref
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from typing import TypeVar
+
+import pydantic
+
+from ldcnd.client.lease import Control
+from ldcnd.client.motion import Motion, Position, State, Watched
+from ldcnd.client.rig_client import RigClient
+from ldcnd.client.traces import Trace, take_trace
+from ldcnd.client.verbs import AxisVerbs
+from ldcnd.errors import LdcndError, LeaseExpired, SessionError
+from ldcnd.messaging.codec import decode_received, explained
+from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.model.commands import AxisCommand, Command, CommandReply, Halt, StopReply
+from ldcnd.model.events import CommandOutcome, ReadOutcome
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
+from ldcnd.model.traces import TakeTrace, TraceTrigger
+
+LINGER_S = 0.02
+"""A sample may wait for so long for others: to wake a program up for each costs more than all else."""
+KEPT_SAMPLES = 256
+"""A reader that is too slow keeps so many samples; the oldest give way."""
+HALT_S = 2.0
+"""Longest time that a cancelled wait takes to halt its axis, in seconds."""
+
+ReplyT = TypeVar("ReplyT", bound=Frozen)
+AxisReplyT = TypeVar("AxisReplyT", bound=CommandReply)
+
+
+class Positions:
+    """The positions of an axis from now on, as an endless iterator; made by `Axis.positions`.
+
+    Attributes:
+        dropped: how many samples its reader was too slow for.
+    """
+
+    def __init__(self, axis: "Axis") -> None:
+        self.dropped = 0
+        self._axis = axis
+        self._kept: deque[Sample] = deque()
+
+    def take(self, sample: Sample) -> None:
+        """Take a sample from the axis."""
+        if len(self._kept) == KEPT_SAMPLES:
+            self._kept.popleft()
+            self.dropped += 1
+        self._kept.append(sample)
+
+    def __aiter__(self) -> "Positions":
+        return self
+
+    async def __anext__(self) -> PositionSample:
+        """Return the next position.
+
+        Raises:
+            LeaseExpired: control of the axis was lost.
+        """
+        while not self._kept:
+            await self._axis.news(None)
+        sample = self._kept.popleft()
+        return decode_received(PositionSample, sample.payload, sample.encoding)
+
+
+class Axis(AxisVerbs, Watched):
+    """An axis that a program controls or watches; made by `Rig.control` and `Rig.watch`.
+
+    Attributes:
+        name: of the axis.
+    """
+
+    def __init__(self, name: str, client: RigClient, loop: asyncio.AbstractEventLoop) -> None:
+        self.name = name
+        self.control: Control | None = None
+        self._client = client
+        self._loop = loop
+        self._state: tuple[StateSample, float] | None = None
+        self._position: tuple[Sample | PositionSample, float] | None = None
+        self._changed = asyncio.Event()
+        self._readers: weakref.WeakSet[Positions] = weakref.WeakSet()
+        self._motions: weakref.WeakSet[Motion] = weakref.WeakSet()
+
+    # -- what it says ------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """The last state.
+
+        Raises:
+            SessionError: none has come yet.
+        """
+        if self._state is None:
+            raise self._silent()
+        sample, at_s = self._state
+        return State(sample, self._loop.time() - at_s)
+
+    @property
+    def position(self) -> Position:
+        """The last position.
+
+        Raises:
+            SessionError: none has come yet.
+        """
+        if self._position is None:
+            raise self._silent()
+        sample, at_s = self._position
+        if isinstance(sample, Sample):
+            sample = decode_received(PositionSample, sample.payload, sample.encoding)
+            self._position = sample, at_s
+        return Position(sample, self._loop.time() - at_s)
+
+    def positions(self) -> Positions:
+        """Iterate over the positions that come from now on; several readers do not disturb each other."""
+        reader = Positions(self)
+        self._readers.add(reader)
+        return reader
+
+    async def news(self, within_s: float | None) -> bool:
+        """Wait until a state or a position arrives; tell whether that was in time.
+
+        Raises:
+            LeaseExpired: control was lost.
+        """
+        self._refuse_lost()
+        self._changed.clear()
+        try:
+            async with asyncio.timeout(within_s):
+                await self._changed.wait()
+        except TimeoutError:
+            return False
+        self._refuse_lost()
+        return True
+
+    # -- what it does ------------------------------------------------------------------------------------------------
+
+    async def stop(self) -> StopReply:
+        """Stop at once and latch: nothing moves again before `reset`. Needs no control and is never refused."""
+        return await self._client.stop(self.name, client=self._who)
+
+    async def take_trace(
+        self,
+        *channels: str,
+        samples: int = 500,
+        interval_s: float | None = None,
+        pre_trigger: int = 0,
+        trigger: TraceTrigger | None = None,
+        within_s: float = 60.0,
+    ) -> Trace:
+        """Record channels against time and return the complete trace; one that is cancelled ends in the drive, too.
+
+        Args:
+            channels: what to record; `meta/axes/<axis>` lists what the axis has.
+            samples: how many.
+            interval_s: time between two of them; as fast as the line allows when missing.
+            pre_trigger: so many of them before the trigger.
+            trigger: what to wait for; starts at once when missing.
+            within_s: longest time from its arming to its end.
+        """
+        command = _made(
+            lambda: TakeTrace(
+                channels=channels,
+                samples=samples,
+                interval_s="fastest" if interval_s is None else interval_s,
+                pre_trigger=pre_trigger,
+                trigger=trigger,
+            )
+        )
+        stamped = self.control.stamped(command, self.name) if self.control else command
+        return await take_trace(self._client, self.name, stamped, within_s)
+
+    async def outcome(self, command_id: str) -> CommandOutcome:
+        """Ask the daemon what became of a command."""
+        return await self._client.ask(ReadOutcome(command_id=command_id))
+
+    async def halt_now(self) -> None:
+        """Halt, in a bounded time and without raising; nothing is sent once control was lost."""
+        if self.control is None or self.control.lost:
+            return
+        with contextlib.suppress(LdcndError, TimeoutError):
+            async with asyncio.timeout(HALT_S):
+                await self._client.command(self.name, Halt(client=self._who))
+
+    async def halt_unfinished(self) -> None:
+        """Halt if a motion that was begun here may not have ended."""
+        if any(motion.ended is None for motion in self._motions):
+            await self.halt_now()
+
+    def begun(self, reply: CommandReply) -> Motion:
+        """Return the motion that a command has begun."""
+        motion = Motion(reply, self)
+        self._motions.add(motion)
+        return motion
+
+    async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
+        command = _made(make)
+        if self.control:
+            return await self.control.command(self.name, command)
+        return await self._client.command(self.name, command)
+
+    async def _start(self, make: Callable[[], AxisCommand[CommandReply]]) -> Motion:
+        return self.begun(await self._send(make))
+
+    async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
+        command = _made(make)
+        if self.control and "lease" in type(command).model_fields:
+            command = command.model_copy(update={"lease": self.control.lease.lease})
+        return await self._client.ask(command, self.name)
+
+    # -- life --------------------------------------------------------------------------------------------------------
+
+    @contextlib.asynccontextmanager
+    async def watched(self) -> AsyncIterator["Axis"]:
+        """Take states and positions for the time of the context; the last ones are there when it begins."""
+        async with (
+            self._client.values(self.name, TelemetryItem.STATE, self._take_state, LINGER_S),
+            self._client.values(self.name, TelemetryItem.POSITION, self._take_position, LINGER_S),
+        ):
+            now_s = self._loop.time()
+            state, position = await self._client.state(self.name), await self._client.position(self.name)
+            if state and self._state is None:
+                self._state = state, now_s
+            if position and self._position is None:
+                self._position = position, now_s
+            yield self
+
+    def lost(self) -> None:
+        """Wake up those who wait: control was lost."""
+        self._changed.set()
+
+    def _take_state(self, sample: Sample) -> None:
+        if sample.kind is SampleKind.PUT:
+            self._state = decode_received(StateSample, sample.payload, sample.encoding), self._loop.time()
+            self._changed.set()
+
+    def _take_position(self, sample: Sample) -> None:
+        if sample.kind is SampleKind.PUT:
+            self._position = sample, self._loop.time()
+            for reader in self._readers:
+                reader.take(sample)
+            self._changed.set()
+
+    @property
+    def _who(self) -> str | None:
+        return self.control.lease.client if self.control else None
+
+    def _refuse_lost(self) -> None:
+        if self.control and self.control.lost:
+            raise LeaseExpired(
+                f"axis {self.name}: control was lost: {self.control.lost.message}",
+                axis=self.name,
+                remedy="take control again",
+            )
+
+    def _silent(self) -> SessionError:
+        return SessionError(f"axis {self.name}: nothing was heard of it yet", axis=self.name)
+
+    def __repr__(self) -> str:
+        if self._state is None or self._position is None:
+            return f"<axis {self.name}: not heard of yet>"
+        return f"<axis {self.name}: {self.position}, {self.state}>"
+
+
+def _made(make: Callable[[], ReplyT]) -> ReplyT:
+    try:
+        return make()
+    except pydantic.ValidationError as error:
+        raise explained(error) from None

@@ -1,0 +1,244 @@
+"""What an axis is doing, as a program sees it: its last values with their age, and a motion from start to end."""
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+
+from ldcnd.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
+from ldcnd.model.commands import CommandReply
+from ldcnd.model.events import FINAL, CommandOutcome, CommandStatus
+from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
+
+SILENT_S = 10.0
+"""A motion whose axis is not heard of for so long has an unknown outcome, in seconds."""
+LOOK_S = 0.2
+"""Longest time between two looks at the outcome of a command that its axis does not name any more, in seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where an axis was.
+
+    Attributes:
+        sample: as it was published.
+        age_s: for how long it is known here, in seconds; how old it was on arrival, `sample.t` tells.
+    """
+
+    sample: PositionSample
+    age_s: float
+
+    @property
+    def value(self) -> float:
+        """Position in axis units."""
+        return self.sample.value
+
+    @property
+    def unit(self) -> str:
+        """The axis unit."""
+        return self.sample.unit
+
+    @property
+    def quality(self) -> Quality:
+        """How much the value is worth."""
+        return self.sample.quality
+
+    def __float__(self) -> float:
+        return self.sample.value
+
+    def __str__(self) -> str:
+        doubt = "" if self.quality is Quality.GOOD else f", {self.quality}"
+        return f"{self.value:.4f} {self.unit} ({self.age_s:.2f} s old{doubt})"
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """In which state an axis was.
+
+    Attributes:
+        sample: as it was published.
+        age_s: for how long it is known here, in seconds.
+    """
+
+    sample: StateSample
+    age_s: float
+
+    @property
+    def state(self) -> AxisState:
+        """PLCopen state."""
+        return self.sample.state
+
+    @property
+    def enabled(self) -> bool:
+        """The position loop is closed."""
+        return self.sample.enabled
+
+    @property
+    def referenced(self) -> bool:
+        """The position means something."""
+        return self.sample.referenced
+
+    @property
+    def moving(self) -> Moving:
+        """Whether it moves; unknown when the drive does not answer."""
+        return self.sample.moving
+
+    @property
+    def link(self) -> LinkState:
+        """Whether the drive answers."""
+        return self.sample.link
+
+    @property
+    def stop_latched(self) -> bool:
+        """A stop is latched; only reset clears it."""
+        return self.sample.stop_latched
+
+    def __str__(self) -> str:
+        latched = ", stop latched" if self.stop_latched else ""
+        link = "" if self.link is LinkState.UP else f", link {self.link}"
+        return f"{self.state}{latched}{link} ({self.age_s:.2f} s old)"
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a motion is.
+
+    Attributes:
+        position: where the axis is, in its units.
+        left: how far it still has to go, signed; None for a motion without an end of its own.
+        unit: of both.
+    """
+
+    position: float
+    left: float | None
+    unit: str
+
+
+class Watched(ABC):
+    """An axis whose state and position arrive; `Axis` is one."""
+
+    name: str
+
+    @property
+    @abstractmethod
+    def state(self) -> State:
+        """The last state."""
+
+    @property
+    @abstractmethod
+    def position(self) -> Position:
+        """The last position."""
+
+    @abstractmethod
+    async def news(self, within_s: float) -> bool:
+        """Wait until a state or a position arrives, or control is lost; tell whether that was in time.
+
+        Raises:
+            LeaseExpired: control was lost.
+        """
+
+    @abstractmethod
+    async def outcome(self, command_id: str) -> CommandOutcome:
+        """Ask the daemon what became of a command."""
+
+    @abstractmethod
+    async def halt_now(self) -> None:
+        """Halt, in a bounded time and without raising; nothing is sent once control was lost."""
+
+
+@dataclass(slots=True, eq=False, weakref_slot=True)
+class Motion:
+    """A command that the drive has acknowledged and that ends later.
+
+    Attributes:
+        reply: what the drive's registers make of what was asked: target, velocity, duration.
+        ended: the state after it; None until `done` has returned.
+    """
+
+    reply: CommandReply
+    _axis: Watched
+    ended: State | None = field(default=None, init=False)
+
+    @property
+    def command_id(self) -> str:
+        """Names the command in events and in the log."""
+        return self.reply.command_id
+
+    async def done(self) -> State:
+        """Wait until the motion has ended as it was asked, and return the state after it.
+
+        A wait that is cancelled, by Ctrl-C or a time-out for example, halts the axis.
+
+        Raises:
+            CommandAborted: another command, a stop or a loss policy ended it.
+            DriveFault: the drive failed.
+            LeaseExpired: control was lost; the axis does what its configuration says for that.
+            OutcomeUnknown: the drive, the daemon or the network went silent, or the daemon was restarted.
+        """
+        try:
+            outcome = await self._outcome()
+        except asyncio.CancelledError:
+            await self._axis.halt_now()
+            raise
+        if outcome.status is not CommandStatus.DONE:
+            raise _error(outcome)
+        await self._arrival()
+        self.ended = self._axis.state
+        return self.ended
+
+    async def __aiter__(self) -> AsyncIterator[Progress]:
+        """Yield the progress with each value that arrives until the command has ended; `done` tells how."""
+        while self._under_way() or not await self._over():
+            here = self._axis.position
+            left = None if self.reply.position is None else self.reply.position - here.value
+            yield Progress(here.value, left, here.unit)
+            await self._axis.news(LOOK_S)
+
+    async def _over(self) -> bool:
+        return (await self._axis.outcome(self.command_id)).status in FINAL
+
+    async def _outcome(self) -> CommandOutcome:
+        while True:
+            while self._under_way():
+                if not await self._axis.news(SILENT_S):
+                    raise OutcomeUnknown(
+                        f"axis {self._axis.name}: nothing was heard of it for {SILENT_S:g} s", axis=self._axis.name
+                    )
+            try:
+                outcome = await self._axis.outcome(self.command_id)
+            except UnknownCommand:
+                raise OutcomeUnknown(
+                    f"axis {self._axis.name}: the daemon was restarted; it does not know how {self.reply.verb} went",
+                    axis=self._axis.name,
+                ) from None
+            if outcome.status in FINAL:
+                return outcome
+            await self._axis.news(LOOK_S)  # the state that names the command is still on its way
+
+    async def _arrival(self) -> None:
+        """Wait, but not for long, for a position that is as new as the state after the end."""
+        ended_at = self._axis.state.sample.t
+        while self._axis.position.sample.t < ended_at:
+            if not await self._axis.news(LOOK_S):
+                return
+
+    def _under_way(self) -> bool:
+        state = self._axis.state.sample
+        if state.link is LinkState.DOWN:
+            raise OutcomeUnknown(f"axis {self._axis.name}: the drive does not answer any more", axis=self._axis.name)
+        return state.command is not None and state.command.command_id == self.command_id
+
+    def __repr__(self) -> str:
+        target = "" if self.reply.position is None else f" to {self.reply.position:g}"
+        return f"<{self.reply.verb} of {self.reply.axis}{target}: {'ended' if self.ended else 'accepted'}>"
+
+
+def _error(outcome: CommandOutcome) -> LdcndError:
+    text = f"axis {outcome.axis}: {outcome.verb} ended as {outcome.status}: {outcome.reason or 'no reason is known'}"
+    match outcome.status:
+        case CommandStatus.UNKNOWN:
+            return OutcomeUnknown(text, axis=outcome.axis)
+        case CommandStatus.FAILED:
+            return DriveFault(text, axis=outcome.axis)
+        case _:
+            return CommandAborted(text, axis=outcome.axis)

@@ -1,0 +1,282 @@
+"""The Python client: from an endpoint to a rig, and from a rig to axes that a program controls."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import AsyncIterator, Mapping
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import overload
+
+from ldcnd.client.axis import Axis
+from ldcnd.client.events import Events, follow_events
+from ldcnd.client.lease import Control
+from ldcnd.client.motion import Motion
+from ldcnd.client.rig_client import RigClient, Samples, find_rigs
+from ldcnd.errors import LeaseRequired, SessionError, UnknownAxis
+from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.model.commands import StopReply
+from ldcnd.model.events import CommandOutcome, ReadOutcome
+from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
+from ldcnd.model.rig_commands import Acquire, AxisMove, HolderList, ListHolders, MoveTogether
+from ldcnd.model.samples import FaultSample
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+ENDPOINT_VARIABLE = "LDCND_CONNECT"
+
+
+@asynccontextmanager
+async def connect(
+    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None
+) -> AsyncIterator["Rig"]:
+    """Use one rig for as long as the context lasts.
+
+    A lost connection is opened again by itself; values arrive again, and a lease that has ended meanwhile is reported
+    by `LeaseExpired`.
+
+    Args:
+        endpoint: of the daemon or a router, such as `tcp/127.0.0.1:7447` or `127.0.0.1:7447`; $LDCND_CONNECT, then
+            `tcp/127.0.0.1:7447`, when missing.
+        rig: which one; needed only when several can be reached.
+        config: a Zenoh configuration file with a login, as `ldcnd pki` makes it; its endpoint counts without one.
+
+    Raises:
+        SessionError: no connection, or no daemon answers.
+        UnknownAxis: several rigs can be reached and none was named.
+    """
+    async with open_zenoh_session(_settings(endpoint, config)) as session:
+        daemons = {daemon.rig: daemon for daemon in await find_rigs(session)}
+        if rig is None and len(daemons) > 1:
+            raise UnknownAxis(f"there are several rigs: {', '.join(sorted(daemons))}", remedy="name one with rig=")
+        found = daemons.get(rig) if rig else next(iter(daemons.values()), None)
+        if found is None:
+            raise SessionError(
+                f"no daemon serves rig {rig}; reachable: {', '.join(sorted(daemons)) or 'none'}"
+                if rig
+                else "no daemon answers",
+                remedy="start one with `ldcnd run`, or name its endpoint; a login without a role sees none either",
+            )
+        yield Rig(RigClient(session, found.rig), found)
+
+
+def _settings(endpoint: str | None, config: Path | str | None) -> ZenohSettings:
+    wanted = endpoint or os.environ.get(ENDPOINT_VARIABLE) or (None if config else DEFAULT_ENDPOINT)
+    endpoints = () if wanted is None else (wanted if "/" in wanted else f"tcp/{wanted}",)
+    return ZenohSettings(
+        mode="client" if endpoints else None, connect=endpoints, config_file=Path(config) if config else None
+    )
+
+
+class Rig:
+    """A rig that a program uses; made by `connect`.
+
+    Attributes:
+        name: of the rig.
+        axes: the names of its axes.
+    """
+
+    def __init__(self, client: RigClient, daemon: DaemonInfo) -> None:
+        self.name = daemon.rig
+        self.axes = daemon.axes
+        self._client = client
+        self._held: dict[str, Axis] = {}
+
+    # -- axes --------------------------------------------------------------------------------------------------------
+
+    @overload
+    def control(
+        self, axis: str, /, *, client: str, lease_s: float = 1.0, force: bool = False
+    ) -> AbstractAsyncContextManager[Axis]: ...
+
+    @overload
+    def control(
+        self, first: str, second: str, /, *more: str, client: str, lease_s: float = 1.0, force: bool = False
+    ) -> AbstractAsyncContextManager[tuple[Axis, ...]]: ...
+
+    def control(
+        self, *axes: str, client: str, lease_s: float = 1.0, force: bool = False
+    ) -> AbstractAsyncContextManager[Axis] | AbstractAsyncContextManager[tuple[Axis, ...]]:
+        """Control axes until the context ends: nobody else moves them, and they halt when this program disappears.
+
+        Yields the axis, or a tuple when several are named. When control is lost, `LeaseExpired` is raised where the
+        program waits. An exception that leaves the context halts the axes whose motions have not ended.
+
+        Args:
+            axes: what to control; a group stands for its members.
+            client: who this is, a name for people.
+            lease_s: how soon the daemon acts when this program disappears, 0.2 to 60 s.
+            force: take control away from its holder.
+
+        Raises:
+            LeaseHeld: another program controls one of the axes.
+            UnknownAxis: there is no such axis.
+        """
+        held = self.controlled(axes, client, lease_s, force=force)
+        return _only(held) if len(axes) == 1 else held
+
+    @overload
+    def watch(self, axis: str, /) -> AbstractAsyncContextManager[Axis]: ...
+
+    @overload
+    def watch(self, first: str, second: str, /, *more: str) -> AbstractAsyncContextManager[tuple[Axis, ...]]: ...
+
+    def watch(self, *axes: str) -> AbstractAsyncContextManager[Axis] | AbstractAsyncContextManager[tuple[Axis, ...]]:
+        """Watch axes until the context ends, without control over them; yields as `control` does.
+
+        Raises:
+            UnknownAxis: there is no such axis.
+        """
+        watched = self.watched(axes)
+        return _only(watched) if len(axes) == 1 else watched
+
+    async def stop(self) -> StopReply:
+        """Stop every axis at once and latch: nothing moves again before `reset`. Needs no control."""
+        return await self._client.stop()
+
+    async def move_together(
+        self, targets: Mapping[str, float], *, velocity: float | None = None, acceleration: float | None = None
+    ) -> tuple[Motion, ...]:
+        """Start absolute moves of the members of one group in the same servo cycle, or none of them.
+
+        Args:
+            targets: by axis, in axis units; exactly the members of a configured group, all controlled here.
+            velocity: of each of them, in its units a second; the axis default when missing.
+            acceleration: likewise.
+
+        Raises:
+            LeaseRequired: one of them is not controlled by this program.
+        """
+        moves = []
+        for name, position in targets.items():
+            control = self._axis(name).control
+            if control is None:
+                raise LeaseRequired(f"axis {name} is not controlled here", axis=name, remedy="use Rig.control")
+            move = AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
+            moves.append(control.stamped(move, name))
+        reply = await self._client.ask(MoveTogether(moves=tuple(moves)))
+        return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
+
+    # -- what it says ------------------------------------------------------------------------------------------------
+
+    async def daemon(self) -> DaemonInfo:
+        """Return what the daemon says about itself."""
+        return await self._client.daemon()
+
+    async def describe(self) -> list[AxisInfo]:
+        """Return what every axis is: unit, limits, capabilities, in the order of lines and addresses."""
+        return await self._client.axes()
+
+    async def buses(self) -> list[BusInfo]:
+        """Return what every line is and how it does."""
+        return await self._client.buses()
+
+    async def faults(self) -> dict[str, FaultSample]:
+        """Return what is wrong with every axis."""
+        return await self._client.faults()
+
+    async def holders(self) -> HolderList:
+        """Return who controls what."""
+        return await self._client.ask(ListHolders())
+
+    async def outcome(self, command_id: str) -> CommandOutcome:
+        """Return what became of a command."""
+        return await self._client.ask(ReadOutcome(command_id=command_id))
+
+    def events(self, axis: str | None = None, *, history: bool = False) -> AbstractAsyncContextManager[Events]:
+        """Follow what happens to commands, each event once: what the network drops is fetched.
+
+        Args:
+            axis: only this one.
+            history: begin with what the daemon remembers instead of now.
+        """
+        return follow_events(self._client, axis, history=history)
+
+    def samples(self, axis: str = "*", item: str = "*") -> AbstractAsyncContextManager[Samples]:
+        """Take telemetry of any item: pairs of the axis and its sample."""
+        return self._client.samples(axis, item)
+
+    # -- making axes -------------------------------------------------------------------------------------------------
+
+    def _axis(self, name: str) -> Axis:
+        try:
+            return self._held[name]
+        except KeyError:
+            raise UnknownAxis(f"axis {name!r} is not controlled here", axis=name, value=name) from None
+
+    @asynccontextmanager
+    async def watched(self, names: tuple[str, ...]) -> AsyncIterator[tuple[Axis, ...]]:
+        """Watch axes; always a tuple."""
+        loop = asyncio.get_running_loop()
+        async with AsyncExitStack() as watching:
+            axes = []
+            for name in names:
+                if name not in self.axes:
+                    raise UnknownAxis(
+                        f"rig {self.name} has no axis {name!r}; it has {', '.join(self.axes)}", axis=name, value=name
+                    )
+                axes.append(await watching.enter_async_context(Axis(name, self._client, loop).watched()))
+            yield tuple(axes)
+
+    @asynccontextmanager
+    async def controlled(
+        self, names: tuple[str, ...], who: str, lease_s: float, *, force: bool
+    ) -> AsyncIterator[tuple[Axis, ...]]:
+        """Control axes; always a tuple."""
+        lease = await self._client.ask(Acquire(client=who, axes=names, lease_s=lease_s, force=force))
+        control = Control(self._client, lease)
+        try:
+            async with self.watched(lease.axes) as covered, asyncio.TaskGroup() as group:
+                axes = (
+                    covered
+                    if set(names) != set(lease.axes)
+                    else tuple(next(axis for axis in covered if axis.name == name) for name in names)
+                )
+                for axis in axes:
+                    axis.control = control
+                    self._held[axis.name] = axis
+                keeper = group.create_task(_keep(control, axes), name=f"lease of {who}")
+                try:
+                    yield axes
+                except BaseException:
+                    await _halt_unfinished(axes)
+                    raise
+                finally:
+                    keeper.cancel()
+                    for axis in axes:
+                        self._held.pop(axis.name, None)
+        except BaseExceptionGroup as errors:
+            if len(errors.exceptions) > 1:
+                raise
+            raise errors.exceptions[0] from None
+        finally:
+            await control.release()
+
+    def __repr__(self) -> str:
+        return f"<rig {self.name}: axes {', '.join(self.axes)}>"
+
+
+@asynccontextmanager
+async def _only(axes: AbstractAsyncContextManager[tuple[Axis, ...]]) -> AsyncIterator[Axis]:
+    async with axes as found:
+        yield found[0]
+
+
+async def _keep(control: Control, axes: tuple[Axis, ...]) -> None:
+    """Renew until cancelled.
+
+    Raises:
+        LeaseExpired: control was lost; this ends the program's context.
+    """
+    await control.keep()
+    for axis in axes:
+        axis.lost()
+    if control.lost:
+        raise control.lost
+
+
+async def _halt_unfinished(axes: tuple[Axis, ...]) -> None:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.TaskGroup() as group:
+            for axis in axes:
+                group.create_task(axis.halt_unfinished(), name=f"halt {axis.name}")

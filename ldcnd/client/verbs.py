@@ -1,0 +1,355 @@
+"""The verbs of an axis as methods; made from the command classes by `ldcnd schema client`, not edited."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TypeVar
+
+from ldcnd.client.motion import Motion
+from ldcnd.model.commands import (
+    AxisCommand,
+    BufferMode,
+    Command,
+    CommandReply,
+    Halt,
+    Home,
+    HomeMethod,
+    HomeStop,
+    MoveAbsolute,
+    MoveAnalog,
+    MoveRelative,
+    MoveVelocity,
+    PinMode,
+    PlanReply,
+    Power,
+    Preview,
+    QuickStop,
+    Reset,
+    SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
+    Track,
+    Why,
+    WhyReply,
+)
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.parameters import (
+    AlarmReport,
+    ClearCounter,
+    CounterName,
+    CounterReply,
+    DriveProfile,
+    ListParameters,
+    Memory,
+    ParameterDump,
+    ParameterList,
+    ParameterReply,
+    ReadAlarms,
+    ReadAllParameters,
+    ReadParameter,
+    ReadProfile,
+    WriteParameter,
+)
+from ldcnd.model.traces import AbortTrace, TraceAbortReply
+
+ReplyT = TypeVar("ReplyT", bound=Frozen)
+AxisReplyT = TypeVar("AxisReplyT", bound=CommandReply)
+
+
+class AxisVerbs(ABC):
+    """One method for each command; it returns once the drive has acknowledged the command, or raises why not."""
+
+    @abstractmethod
+    async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
+        """Send a command that ends with its reply."""
+
+    @abstractmethod
+    async def _start(self, make: Callable[[], AxisCommand[CommandReply]]) -> Motion:
+        """Send a command that ends later."""
+
+    @abstractmethod
+    async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
+        """Ask the daemon about the axis."""
+
+    async def power(self, *, on: bool) -> CommandReply:
+        """Close or open the position loop; nothing moves.
+
+        Args:
+            on: True closes the loop at the present position, false opens it and disables the amplifier.
+        """
+        return await self._send(lambda: Power(on=on))
+
+    async def move_absolute(
+        self,
+        position: float,
+        *,
+        buffer_mode: BufferMode = BufferMode.REFUSE,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+    ) -> Motion:
+        """Move to a position on a trapezoidal profile.
+
+        Args:
+            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
+                new move.
+            position: Target in axis units.
+            velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
+        """
+        return await self._start(
+            lambda: MoveAbsolute(
+                buffer_mode=buffer_mode, position=position, velocity=velocity, acceleration=acceleration
+            )
+        )
+
+    async def move_relative(
+        self,
+        distance: float,
+        *,
+        buffer_mode: BufferMode = BufferMode.REFUSE,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+    ) -> Motion:
+        """Move by a distance from where the axis is told to be; becomes absolute when it is admitted.
+
+        Args:
+            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
+                new move.
+            distance: Distance in axis units, signed.
+            velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
+        """
+        return await self._start(
+            lambda: MoveRelative(
+                buffer_mode=buffer_mode, distance=distance, velocity=velocity, acceleration=acceleration
+            )
+        )
+
+    async def move_velocity(
+        self, velocity: float, *, buffer_mode: BufferMode = BufferMode.REFUSE, acceleration: float | None = None
+    ) -> Motion:
+        """Move at a constant velocity until told otherwise or until the software limit.
+
+        Args:
+            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
+                new move.
+            velocity: Velocity in units a second, positive forward, not 0.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
+        """
+        return await self._start(
+            lambda: MoveVelocity(buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration)
+        )
+
+    async def halt(self) -> Motion:
+        """Decelerate to standstill; another command may follow."""
+        return await self._start(Halt)
+
+    async def quick_stop(self) -> CommandReply:
+        """Stop without a ramp, holding position, and latch: nothing moves again before reset."""
+        return await self._send(QuickStop)
+
+    async def home(
+        self,
+        *,
+        method: HomeMethod | None = None,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        position: float | None = None,
+        timeout_s: float | None = None,
+        distance: float | None = None,
+        stop: HomeStop | None = None,
+        move_to: float | None = None,
+    ) -> Motion:
+        """Find the reference position; what is missing comes from the axis's configuration.
+
+        Args:
+            method: What marks the reference position.
+            velocity: Search velocity in units a second, positive forward, not 0.
+            acceleration: Acceleration in units a second squared.
+            position: What the position is called there, in axis units.
+            timeout_s: Longest search, in seconds; moving off a limit switch first counts as a search of its own.
+            distance: Longest search, in axis units; a missing one is as far as the velocity goes in that time.
+            stop: How the motor stops there.
+            move_to: Where to go afterwards, in axis units; a missing one stays where the motor stopped.
+        """
+        return await self._start(
+            lambda: Home(
+                method=method,
+                velocity=velocity,
+                acceleration=acceleration,
+                position=position,
+                timeout_s=timeout_s,
+                distance=distance,
+                stop=stop,
+                move_to=move_to,
+            )
+        )
+
+    async def reset(self) -> CommandReply:
+        """Clear the stop latch and the drive's faults; after a drive fault the axis is disabled. Nothing moves."""
+        return await self._send(Reset)
+
+    async def set_position(self, position: float) -> CommandReply:
+        """Tell a standing axis where it is; afterwards it is referenced.
+
+        Args:
+            position: What the present position is called, in axis units.
+        """
+        return await self._send(lambda: SetPosition(position=position))
+
+    async def set_gains(
+        self,
+        *,
+        kp: int | None = None,
+        kd: int | None = None,
+        ki: int | None = None,
+        il: int | None = None,
+        ol: int | None = None,
+        cl: int | None = None,
+        el: int | None = None,
+        deadband: int | None = None,
+        sr: int | None = None,
+    ) -> CommandReply:
+        """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
+
+        Args:
+            kp: Position gain.
+            kd: Velocity gain.
+            ki: Integral gain.
+            il: Integration limit.
+            ol: Output limit.
+            cl: Current limit: 0 is off; odd where the sense voltage rises with the current, even where it falls.
+            el: Position error limit.
+            deadband: Amplifier deadband compensation.
+            sr: Servo rate divisor; it changes what velocities mean to the drive, so only a standing axis takes it.
+        """
+        return await self._send(
+            lambda: SetGains(kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr)
+        )
+
+    async def list_parameters(self) -> ParameterList:
+        """List what is known of the drive's parameters; asks nothing of the drive."""
+        return await self._send(ListParameters)
+
+    async def read_parameter(self, parameter: str, *, unlisted: bool = False) -> ParameterReply:
+        """Read one parameter from both memories.
+
+        Args:
+            parameter: Its number, such as Pn100, or the manual's name in any case.
+            unlisted: Allow a number that the manual does not list.
+        """
+        return await self._send(lambda: ReadParameter(parameter=parameter, unlisted=unlisted))
+
+    async def read_all_parameters(self) -> ParameterDump:
+        """Read every listed parameter from both memories; takes seconds on a slow line."""
+        return await self._send(ReadAllParameters)
+
+    async def write_parameter(
+        self,
+        parameter: str,
+        value: int,
+        *,
+        memory: Memory = Memory.RAM,
+        unlisted: bool = False,
+        confirm_unit: int | None = None,
+    ) -> ParameterReply:
+        """Write one parameter, in RAM unless EEPROM is named; nothing is sent when it has the value already.
+
+        Args:
+            parameter: Its number, such as Pn100, or the manual's name in any case.
+            value: The new value, a word without sign.
+            memory: RAM forgets at power-off; EEPROM endures 10,000 writes and must be asked for by name.
+            unlisted: Allow a number that the manual does not list.
+            confirm_unit: The unit number that the drive will have after its next power-on, when this write changes it.
+        """
+        return await self._send(
+            lambda: WriteParameter(
+                parameter=parameter, value=value, memory=memory, unlisted=unlisted, confirm_unit=confirm_unit
+            )
+        )
+
+    async def clear_counter(self, counter: CounterName) -> CounterReply:
+        """Set a pulse counter to 0; command pulses must be stopped, and for the feedback counter the motor must stand.
+
+        Args:
+            counter: Which counter.
+        """
+        return await self._send(lambda: ClearCounter(counter=counter))
+
+    async def read_alarms(self) -> AlarmReport:
+        """Read the present alarm and the alarm history."""
+        return await self._send(ReadAlarms)
+
+    async def read_profile(self) -> DriveProfile:
+        """Tell how the drive is taken to behave, assumptions included; asks nothing of the drive."""
+        return await self._send(ReadProfile)
+
+    async def move_analog(
+        self, target: int, *, velocity: float | None = None, acceleration: float | None = None
+    ) -> Motion:
+        """Move until the analog position sensor reads a value; the drive finds the direction itself.
+
+        Args:
+            target: A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused.
+            velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
+        """
+        return await self._start(lambda: MoveAnalog(target=target, velocity=velocity, acceleration=acceleration))
+
+    async def set_pwm(self, duty: float, duration_s: float) -> Motion:
+        """Put a raw duty on the motor, with the position loop open, for a limited time; then the axis stops and holds.
+
+        Args:
+            duty: Share of the supply voltage, positive forward.
+            duration_s: How long, in seconds.
+        """
+        return await self._start(lambda: SetPwm(duty=duty, duration_s=duration_s))
+
+    async def track(self, position: float) -> Motion:
+        """Go to a position at once, without a profile: one set-point of a stream.
+
+        Args:
+            position: Set-point in axis units.
+        """
+        return await self._start(lambda: Track(position=position))
+
+    async def set_outputs(self, *, limit1: PinMode | None = None, limit2: PinMode | None = None) -> CommandReply:
+        """Use limit switch pins as outputs, or as inputs again; a missing pin stays as it is.
+
+        Args:
+            limit1: The pin of limit switch 1 (reverse).
+            limit2: The pin of limit switch 2 (forward).
+        """
+        return await self._send(lambda: SetOutputs(limit1=limit1, limit2=limit2))
+
+    async def abort_trace(self) -> TraceAbortReply:
+        """End the trace that is under way, or one that was left armed in the drive; its samples are lost."""
+        return await self._send(AbortTrace)
+
+    async def why(self, *, absolute: bool = True) -> WhyReply:
+        """Ask why an axis cannot move.
+
+        Args:
+            absolute: Whether the motion would name a position, which needs a referenced axis.
+        """
+        return await self._ask(lambda: Why(absolute=absolute))
+
+    async def preview(
+        self,
+        *,
+        position: float | None = None,
+        distance: float | None = None,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+    ) -> PlanReply:
+        """Ask what a motion would do; exactly one of position, distance and velocity-alone says which motion is meant.
+
+        Args:
+            position: A move to this position, in axis units.
+            distance: A move by this distance, in axis units.
+            velocity: Speed of the move; alone: a motion at this velocity, signed. Units a second.
+            acceleration: Units a second squared; the axis default when missing.
+        """
+        return await self._ask(
+            lambda: Preview(position=position, distance=distance, velocity=velocity, acceleration=acceleration)
+        )

@@ -1,0 +1,241 @@
+"""The Python client against a whole daemon: control, verbs, ends of motions, loss of control, cancellation."""
+
+import ast
+import asyncio
+import inspect
+import os
+import sys
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+import ldcnd
+from ldcnd.cli.client_reference import client_reference
+from ldcnd.cli.verb_methods import method_name, verb_methods, with_blocking_methods
+from ldcnd.client import blocking
+from ldcnd.client.axis import Axis
+from ldcnd.client.rig import Rig
+from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedRequest, SessionError, UnknownAxis
+from ldcnd.model.catalogue import COMMANDS
+from ldcnd.model.commands import About, Halt
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
+from tests.support.process import ROOT, daemon
+from tests.support.rig import RunningRig, running_rig
+from tests.support.session_pair import free_endpoint
+
+CLIENT = ROOT / "ldcnd" / "client"
+
+
+@asynccontextmanager
+async def client_rig() -> AsyncIterator[tuple[RunningRig, Rig]]:
+    async with running_rig() as running:
+        for name in running.daemon.rig.axes:
+            await running.until(name, lambda state: state.link is LinkState.UP)
+        yield running, Rig(running.client, await running.client.daemon())
+
+
+def test_every_command_of_an_axis_is_a_method_of_both_clients():
+    names = {method_name(command) for command in COMMANDS if command.about is About.AXIS}
+
+    assert names <= set(dir(Axis))
+    assert names <= set(dir(blocking.Axis))
+
+
+def test_the_methods_are_those_that_the_commands_make():
+    written = (CLIENT / "verbs.py").read_text()
+    blocks = (CLIENT / "blocking.py").read_text()
+
+    assert ast.dump(ast.parse(written)) == ast.dump(ast.parse(verb_methods())), "run `make fix`"
+    assert blocks == with_blocking_methods(blocks), "run `make fix`"
+
+
+def test_no_call_of_the_asyncio_client_is_missing_from_the_blocking_one():
+    for theirs, ours in ((Axis, blocking.Axis), (Rig, blocking.Rig)):
+        public = {name for name, _ in inspect.getmembers(theirs) if not name.startswith("_")}
+        inner = {"watched", "controlled", "news", "halt_now", "halt_unfinished", "begun", "lost", "outcome"}
+        assert public - inner <= set(dir(ours)), theirs
+
+
+def test_the_reference_is_made_of_the_docstrings():
+    page = (ROOT / "docs" / "reference" / "python.md").read_text()
+
+    assert page == client_reference(), "run `make fix`"
+
+
+def test_what_is_promised_at_the_top_is_there():
+    assert {name: getattr(ldcnd, name) for name in ldcnd.__all__}
+    with pytest.raises(AttributeError, match="unknown"):
+        ldcnd.unknown  # noqa: B018
+
+
+async def test_a_program_moves_an_axis_and_waits_for_its_end():
+    async with client_rig() as (_, rig), rig.control("x", client="ann") as x:
+        await x.power(on=True)
+        move = await x.move_absolute(5, velocity=5)
+        steps = [step async for step in move]
+        state = await move.done()
+        position = x.position
+
+    assert (state.state, state.moving) == (AxisState.STANDSTILL, Moving.NO)
+    assert float(position) == pytest.approx(5.0, abs=0.01)
+    assert (position.unit, position.quality) == ("mm", Quality.GOOD)
+    assert steps[0].left > steps[-1].left
+    assert str(position).startswith("5.0")
+    assert repr(move) == "<move_absolute of x to 5: ended>"
+
+
+async def test_positions_come_to_several_readers():
+    async with client_rig() as (_, rig), rig.watch("x") as x:
+        first, second = x.positions(), x.positions()
+        async with asyncio.timeout(5):
+            samples = [(await anext(first)).seq for _ in range(3)]
+            assert samples == [(await anext(second)).seq for _ in range(3)]
+
+
+async def test_a_motion_that_is_stopped_is_an_error_where_the_program_waits():
+    async with client_rig() as (_, rig), rig.control("x", client="ann") as x:
+        await x.power(on=True)
+        move = await x.move_absolute(50, velocity=1)
+        await rig.stop()
+        with pytest.raises(CommandAborted, match="aborted"):
+            await move.done()
+
+
+async def test_a_value_that_a_command_cannot_have_is_refused_before_it_is_sent():
+    async with client_rig() as (_, rig), rig.control("x", client="ann") as x:
+        with pytest.raises(MalformedRequest, match="velocity"):
+            await x.move_absolute(1, velocity=-1)
+
+
+async def test_control_that_is_taken_away_is_an_error_where_the_program_waits():
+    async with client_rig() as (running, rig):
+        with pytest.raises(LeaseExpired):  # noqa: PT012
+            async with rig.control("x", client="ann") as x:
+                await running.client.ask(Acquire(client="bob", axes=("x",), force=True))
+                await asyncio.sleep(60)
+        assert x.control.lost
+
+        with pytest.raises(LeaseHeld):
+            async with rig.control("x", client="ann"):
+                pass
+
+
+async def test_a_wait_that_is_cancelled_halts_the_axis():
+    async with client_rig() as (running, rig), rig.control("x", client="ann") as x:
+        await x.power(on=True)
+        move = await x.move_absolute(50, velocity=5)
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(1):
+                await move.done()
+        await running.until("x", lambda state: state.moving is Moving.NO)
+        outcome = await rig.outcome(move.command_id)
+
+    assert outcome.status is CommandStatus.ABORTED
+
+
+async def test_an_error_of_the_program_halts_what_it_moved():
+    async with client_rig() as (running, rig):
+        with pytest.raises(ZeroDivisionError):  # noqa: PT012
+            async with rig.control("x", client="ann") as x:
+                await x.power(on=True)
+                move = await x.move_absolute(50, velocity=5)
+                raise ZeroDivisionError
+        await running.until("x", lambda state: state.moving is Moving.NO)
+        outcome = await rig.outcome(move.command_id)
+
+    assert (outcome.status, "halt" in outcome.reason) == (CommandStatus.ABORTED, True)
+
+
+async def test_a_cancelled_wait_without_control_halts_nothing():
+    async with client_rig() as (running, rig), rig.control("x", client="ann") as x:
+        await x.power(on=True)
+        move = await x.move_absolute(50, velocity=5)
+        x.control.lost = LeaseExpired("taken away")
+        with pytest.raises((TimeoutError, LeaseExpired)):
+            async with asyncio.timeout(1):
+                await move.done()
+        assert (await running.client.state("x")).moving is Moving.YES
+        x.control.lost = None
+        await running.client.command("x", Halt())
+
+
+async def test_several_axes_and_questions_under_one_lease():
+    async with client_rig() as (_, rig), rig.control("x", "y", client="ann") as (x, y):
+        assert (x.name, y.name) == ("x", "y")
+        why = await x.why()
+        held = {holder.axis: holder.client for holder in (await rig.holders()).holders}
+
+    assert [cause.code for cause in why.causes if cause.code.startswith("lease")] == []
+    assert (held["x"], held["y"], held["z"]) == ("ann", "ann", None)
+
+
+async def test_an_unknown_axis_is_named_with_those_that_there_are():
+    async with client_rig() as (_, rig):
+        with pytest.raises(UnknownAxis, match="x, y, z, c"):
+            async with rig.watch("nowhere"):
+                pass
+
+
+@pytest.mark.real_time
+async def test_the_first_program_runs(tmp_path: Path):
+    program = """
+        import asyncio, ldcnd
+
+        async def main() -> None:
+            async with ldcnd.connect() as rig:
+                async with rig.control("x", client="demo") as x:
+                    await x.power(on=True)
+                    move = await x.move_absolute(5, velocity=5)
+                    await move.done()
+                    print(x.position, x.state)
+                    async for sample in x.positions():
+                        print(sample.value)
+                        break
+
+        asyncio.run(main())
+    """
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        printed = await run_program(inspect.cleandoc(program), endpoint)
+        quietly = """
+            import ldcnd
+
+            with ldcnd.connect_blocking() as rig, rig.control("y", client="demo") as y:
+                y.power(on=True)
+                move = y.move_absolute(2, velocity=5)
+                print(len(list(move)) > 1)
+                move.done()
+                print(y.position, y)
+                print(next(y.positions()).unit, "<td>x</td>" in rig._repr_html_())
+        """
+        blocked = await run_program(inspect.cleandoc(quietly), endpoint)
+
+    assert float(printed[0].split()[0]) == pytest.approx(5.0, abs=0.05)
+    assert "mm (" in printed[0]
+    assert "standstill (" in printed[0]
+    assert float(printed[1]) == pytest.approx(5.0, abs=0.05)
+    assert blocked[0] == "True"
+    assert float(blocked[1].split()[0]) == pytest.approx(2.0, abs=0.05)
+    assert blocked[2].endswith("True")
+
+
+@pytest.mark.real_time
+def test_what_cannot_be_opened_is_an_error_and_leaves_no_thread():
+    with pytest.raises(SessionError), blocking.connect(free_endpoint()):
+        pass
+
+    assert "ldcnd client" not in {thread.name for thread in threading.enumerate()}
+
+
+async def run_program(text: str, endpoint: str) -> list[str]:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", text, stdout=-1, env={**os.environ, "LDCND_CONNECT": endpoint}
+    )
+    async with asyncio.timeout(45):
+        printed, _ = await process.communicate()
+    assert process.returncode == 0
+    return printed.decode().splitlines()
