@@ -143,6 +143,8 @@ class Axis(Facade[asynchronous.Axis]):
     clear_counter = _waiting(asynchronous.Axis.clear_counter)
     read_alarms = _waiting(asynchronous.Axis.read_alarms)
     read_profile = _waiting(asynchronous.Axis.read_profile)
+    read_monitors = _waiting(asynchronous.Axis.read_monitors)
+    plan_parameters = _waiting(asynchronous.Axis.plan_parameters)
     move_analog = _moving(asynchronous.Axis.move_analog)
     set_pwm = _moving(asynchronous.Axis.set_pwm)
     track = _moving(asynchronous.Axis.track)

@@ -1,8 +1,8 @@
 """The verbs of an axis as methods; made from the command classes by `ldcnd schema client`, not edited."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Mapping
+from typing import Annotated, TypeVar
 
 from ldcnd.client.motion import Motion
 from ldcnd.model.commands import (
@@ -41,15 +41,20 @@ from ldcnd.model.parameters import (
     DriveProfile,
     ListParameters,
     Memory,
+    MonitorReport,
     ParameterDump,
     ParameterList,
+    ParameterPlan,
     ParameterReply,
+    PlanParameters,
     ReadAlarms,
     ReadAllParameters,
+    ReadMonitors,
     ReadParameter,
     ReadProfile,
     WriteParameter,
 )
+from ldcnd.model.samples import MonitorName
 from ldcnd.model.traces import AbortTrace, TraceAbortReply
 
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -128,7 +133,7 @@ class AxisVerbs(ABC):
     async def move_velocity(
         self, velocity: float, *, buffer_mode: BufferMode = BufferMode.REFUSE, acceleration: float | None = None
     ) -> Motion:
-        """Move at a constant velocity until told otherwise or until the software limit.
+        """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
 
         Args:
             buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
@@ -153,6 +158,7 @@ class AxisVerbs(ABC):
         *,
         method: HomeMethod | None = None,
         velocity: float | None = None,
+        find_velocity: float | None = None,
         acceleration: float | None = None,
         position: float | None = None,
         timeout_s: float | None = None,
@@ -164,7 +170,11 @@ class AxisVerbs(ABC):
 
         Args:
             method: What marks the reference position.
-            velocity: Search velocity in units a second, positive forward, not 0.
+            velocity: Search velocity in units a second, positive forward, not 0. On the index at most 0.75 of an index
+                width in a servo cycle: a faster search is refused with the nearest velocity.
+            find_velocity: Speed at which a limit switch is found first, in units a second; the axis then moves off it
+                and comes back at `velocity` to take the reference over. A missing one, and any other method, searches
+                at `velocity` alone.
             acceleration: Acceleration in units a second squared.
             position: What the position is called there, in axis units.
             timeout_s: Longest search, in seconds; moving off a limit switch first counts as a search of its own.
@@ -176,6 +186,7 @@ class AxisVerbs(ABC):
             lambda: Home(
                 method=method,
                 velocity=velocity,
+                find_velocity=find_velocity,
                 acceleration=acceleration,
                 position=position,
                 timeout_s=timeout_s,
@@ -284,8 +295,43 @@ class AxisVerbs(ABC):
         """Tell how the drive is taken to behave, assumptions included; asks nothing of the drive."""
         return await self._send(ReadProfile)
 
+    async def read_monitors(self, *, monitors: tuple[MonitorName, ...] = ()) -> MonitorReport:
+        """Read monitors once, published or not.
+
+        Args:
+            monitors: Which; none stands for all.
+        """
+        return await self._send(lambda: ReadMonitors(monitors=monitors))
+
+    async def plan_parameters(
+        self,
+        values: Mapping[str, Annotated[int, Field(ge=0, le=65535)]],
+        *,
+        driver_type: int | None = None,
+        any_type: bool = False,
+        memory: Memory | None = None,
+    ) -> ParameterPlan:
+        """List the writes after which a drive holds certain values, and what speaks against them; changes nothing.
+
+        Args:
+            values: The wanted words, by number such as Pn100. The unit number in Pn000 is not taken from here.
+            driver_type: 8800H of the drive that the values come from; with another type, or none, there is a problem.
+            any_type: Take values of another or of an unknown type of drive.
+            memory: RAM: for trying out, without what takes effect at power-on; EEPROM: for good; null: for good, and in
+                use at once where that is possible.
+        """
+        return await self._send(
+            lambda: PlanParameters(values=values, driver_type=driver_type, any_type=any_type, memory=memory)
+        )
+
     async def move_analog(
-        self, target: int, *, velocity: float | None = None, acceleration: float | None = None
+        self,
+        target: int,
+        *,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        timeout_s: float | None = None,
+        distance: float | None = None,
     ) -> Motion:
         """Move until the analog position sensor reads a value; the drive finds the direction itself.
 
@@ -293,8 +339,17 @@ class AxisVerbs(ABC):
             target: A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
+            timeout_s: Longest motion, in seconds; the axis's `analog.timeout_s` when missing. The daemon ends it, not
+                the drive.
+            distance: Longest way from where it begins, in axis units, and the way to stop behind it; the axis's
+                `analog.distance` when missing, and without that as far as the velocity goes in the time. The daemon
+                ends it, not the drive.
         """
-        return await self._start(lambda: MoveAnalog(target=target, velocity=velocity, acceleration=acceleration))
+        return await self._start(
+            lambda: MoveAnalog(
+                target=target, velocity=velocity, acceleration=acceleration, timeout_s=timeout_s, distance=distance
+            )
+        )
 
     async def set_pwm(self, duty: float, duration_s: float) -> Motion:
         """Put a raw duty on the motor, with the position loop open, for a limited time; then the axis stops and holds.
