@@ -137,11 +137,21 @@ def _annotations(command: type[Command[Frozen]]) -> dict[str, str]:
         node = ast.parse(dedent(inspect.getsource(base))).body[0]
         if isinstance(node, ast.ClassDef):
             found |= {
-                part.target.id: ast.unparse(part.annotation)
+                part.target.id: ast.unparse(_Plain().visit(part.annotation))
                 for part in node.body
                 if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name)
             }
     return found
+
+
+class _Plain(ast.NodeTransformer):
+    """Takes the limits out of an annotation: `Annotated[int, Field(ge=0)]` is `int` to a caller."""
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        self.generic_visit(node)
+        if isinstance(node.value, ast.Name) and node.value.id == "Annotated" and isinstance(node.slice, ast.Tuple):
+            return node.slice.elts[0]
+        return node
 
 
 def _types_in(command: type[Command[Frozen]], annotation: str) -> set[type]:

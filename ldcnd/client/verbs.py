@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 from ldcnd.client.motion import Motion
 from ldcnd.model.commands import (
@@ -305,7 +305,7 @@ class AxisVerbs(ABC):
 
     async def plan_parameters(
         self,
-        values: Mapping[str, Annotated[int, Field(ge=0, le=65535)]],
+        values: Mapping[str, int],
         *,
         driver_type: int | None = None,
         any_type: bool = False,

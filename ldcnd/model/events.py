@@ -122,7 +122,3 @@ class ReadEvents(Command[EventList]):
     """At most so many, and never more than one reply takes."""
     from_number: int | None = Field(default=None, ge=0)
     """The first of these and later ones; the latest when missing."""
-
-
-OutcomeRequest = ReadOutcome  # former names, until the last importer has moved
-EventsRequest = ReadEvents
