@@ -15,7 +15,8 @@ INNER = {"watched", "controlled", "news", "halt_now", "halt_unfinished", "begun"
 HEADER = """# The Python client
 
 What can a program call? This page is made from the docstrings of `ldcnd`;
-[write a client](../how-to/write-a-client.md) shows how the parts fit together. `ldcnd.connect_blocking` has the same calls without `await`.
+[write a client](../how-to/write-a-client.md) shows how the parts fit together. `ldcnd.connect_blocking` has the same
+calls without `await`.
 
 """
 
