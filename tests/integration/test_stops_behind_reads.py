@@ -9,14 +9,17 @@ from typing import Any
 import pytest
 
 from ldcnd.config.rig import load_config
+from ldcnd.daemon.command.requests import EarlyStops
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.publish.meta import WORK_PER_STEP
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import READS_OF_A_CLIENT, Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.stops_under_load import LOADS, compared
-from tests.support.rig import SIMULATED, RunningRig, running_rig
+from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 from tests.support.session_pair import free_endpoint
 
 STOP_MOTOR = 0x7
@@ -118,3 +121,21 @@ async def test_a_stop_over_its_own_link_waits_for_no_reader(load: str):
         print(f"{what}: {median(without) * 1e3:.1f} ms without, {median(with_load) * 1e3:.1f} ms with")
         assert median(with_load) <= 5 * median(without) + 0.05
     assert (quiet.failed, loaded.failed) == (0, 0)
+
+
+async def test_a_stop_that_comes_before_there_is_a_daemon_is_answered_by_it():
+    config, broker, stops = load_config(SIMULATED), MemoryBroker(), EarlyStops()
+    async with broker.session() as session, broker.session() as client, asyncio.TaskGroup() as group:
+        await stops.declare(session, Keys(config.rig))
+        early = group.create_task(client.query("ldcn/sim/@stop/x", timeout_s=60.0, urgent=True), name="early stop")
+        await asyncio.sleep(1.0)
+        daemon = build_daemon(config, session, lambda: EPOCH_NS, "test", stops=stops)
+        running = group.create_task(daemon.run(), name="daemon")
+
+        (answer,) = await early
+        latched = daemon.rig.axis("x").tracker.stop_latched
+        (later,) = await client.query("ldcn/sim/@stop/y", urgent=True)
+        daemon.end()
+        await running
+
+    assert (answer.is_error, later.is_error, latched) == (False, False, True)

@@ -10,7 +10,7 @@ from ldcnd.errors import InternalError, LdcndError, ShuttingDown, TooManyRequest
 from ldcnd.log import LogLimit, get_logger
 from ldcnd.messaging.codec import decode, encode, reply_encoding
 from ldcnd.messaging.keys import RIG_ITSELF, CommandAddress, Keys
-from ldcnd.messaging.session import Query
+from ldcnd.messaging.session import Declaration, OnQuery, Query, Session
 from ldcnd.model.catalogue import BY_VERB
 from ldcnd.model.commands import About, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
@@ -21,6 +21,31 @@ STOPS_AT_ONCE = 8
 """So many stops of the same axes are sent one beside the other; more than that join."""
 PENDING_REQUESTS = 64
 """So many commands may be under way at once; stops are not counted."""
+
+
+class EarlyStops:
+    """Takes stops from the moment on at which clients can connect; they wait until there is a daemon to answer them."""
+
+    def __init__(self) -> None:
+        self._declarations: list[Declaration] = []
+        self._held: list[Query] = []
+        self._take: OnQuery = self._held.append
+
+    async def declare(self, session: Session, keys: Keys) -> None:
+        """Serve the stops of a rig."""
+        for stop in keys.all_stops:
+            self._declarations.append(await session.serve(stop, self._pass_on, complete=True, urgent=True))
+
+    def hand_over(self, take: OnQuery) -> list[Declaration]:
+        """Give the stops that wait, and all that come from now on, to a daemon; return what it has to close."""
+        self._take = take
+        held, self._held = self._held, []
+        for query in held:
+            take(query)
+        return self._declarations
+
+    def _pass_on(self, query: Query) -> None:
+        self._take(query)
 
 
 class Requests:

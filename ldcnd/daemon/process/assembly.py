@@ -17,6 +17,7 @@ from ldcnd.daemon.command.authority import Authority, random_token
 from ldcnd.daemon.command.dispatch import Dispatcher
 from ldcnd.daemon.command.events import EventLog
 from ldcnd.daemon.command.ledger import Ledger
+from ldcnd.daemon.command.requests import EarlyStops
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
@@ -46,7 +47,9 @@ async def open_daemon(config: RigConfig) -> AsyncIterator[Daemon]:
         SessionError: the session cannot be opened.
     """
     async with open_zenoh_session(session_settings(config)) as session:
-        yield build_daemon(config, session, time.time_ns, secrets.token_hex(4))
+        stops = EarlyStops()
+        await stops.declare(session, Keys(config.rig))  # clients can connect by now; a daemon takes a while
+        yield build_daemon(config, session, time.time_ns, secrets.token_hex(4), stops=stops)
 
 
 def session_settings(config: RigConfig) -> ZenohSettings:
@@ -63,6 +66,7 @@ def build_daemon(
     chains: Mapping[str, Chain] = MappingProxyType({}),
     openers: Mapping[str, Opener] = MappingProxyType({}),
     next_token: Callable[[], str] = random_token,
+    stops: EarlyStops | None = None,
 ) -> Daemon:
     """Build a daemon on an open session.
 
@@ -74,6 +78,7 @@ def build_daemon(
         chains: simulated lines that exist already, by name; the others are built from the configuration.
         openers: what opens a line instead of its port, by the name of the bus.
         next_token: makes what a lease is known by.
+        stops: what takes stops already.
     """
     clock = Clock(now_ns)
     publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
@@ -101,7 +106,7 @@ def build_daemon(
     def eeprom_writes(axis: AxisService) -> int | None:
         return eeprom.total(axis.config.name) if eeprom and axis.driver.parameters else None
 
-    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, eeprom_writes)
+    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, eeprom_writes, stops=stops)
 
 
 def _build_bus(

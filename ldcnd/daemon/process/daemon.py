@@ -11,7 +11,7 @@ from ldcnd.daemon.capture.watch import CaptureWatch
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.dispatch import Dispatcher
 from ldcnd.daemon.command.loss import apply_policy
-from ldcnd.daemon.command.requests import Requests
+from ldcnd.daemon.command.requests import EarlyStops, Requests
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.health import EepromWrites, HealthWatch
 from ldcnd.daemon.publish.meta import Describing
@@ -53,8 +53,11 @@ class Daemon:
         clock: Clock,
         instance: str,
         eeprom_writes: EepromWrites,
+        *,
+        stops: EarlyStops | None = None,
     ) -> None:
         self.rig = rig
+        self._stops = stops
         self._dispatcher = dispatcher
         self._config = config
         self._session = session
@@ -150,8 +153,11 @@ class Daemon:
         log.info("ended", rig=self.rig.name)
 
     async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
-        for stop in self._keys.all_stops:
-            declaration = await self._session.serve(stop, requests.on_stop, complete=True, urgent=True)
+        stops = self._stops
+        if stops is None:
+            stops = EarlyStops()
+            await stops.declare(self._session, self._keys)
+        for declaration in stops.hand_over(requests.on_stop):
             self._declarations.append(declaration)
             declared.push_async_callback(declaration.close)
 
