@@ -6,6 +6,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.numbers import Finite
+from ldcnd.cli.quantities import state_word
 from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.errors import SessionError
 from ldcnd.messaging.session import Session
@@ -50,7 +51,7 @@ def table(rig: RigReport) -> list[str]:
 def _axis(axis: AxisReport) -> str:
     info, state, health = axis.info, axis.state, axis.health
     where = f"{info.bus}/{info.address}"
-    what = f"{state.state}{' (stop latched)' if state.stop_latched else ''}" if state else "unknown"
+    what = state_word(state) if state else "unknown"
     link = state.link.value if state else "?"
     rate = f"{health.rate_hz:6.1f} Hz" if health else "     ? Hz"
     return f"{info.axis:12} {info.model:14} {where:12} {link:8} {rate}  {what}"

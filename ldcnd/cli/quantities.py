@@ -75,6 +75,8 @@ STATE_WORDS = {
 def state_word(state: StateSample) -> str:
     """Return the state of an axis in the console's words."""
     word = STATE_WORDS.get(state.state, state.state.value.replace("_", " "))
+    if state.stop_pending:
+        return f"{word}, stop NOT CONFIRMED by the drive"
     return f"{word}, stop latched" if state.stop_latched else word
 
 

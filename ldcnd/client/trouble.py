@@ -38,12 +38,16 @@ class Trouble:
     text: str
 
 
+STOP_PENDING = "a stop is NOT confirmed by the drive: use the machine's emergency stop"
+
+
 def axis_troubles(
     state: StateSample | None, fault: FaultSample | None, health: AxisHealth | None
 ) -> tuple[Trouble, ...]:
     """Return what is wrong with an axis, the worst first; empty when nothing is.
 
-    Of an axis that is not heard of, nothing else is said: what was known of it may be over. How its last command ended
+    Of an axis that does not answer, nothing else is said but a stop that it has not confirmed: what was known of it may
+    be over. How its last command ended
     is news, not a state, and is told only where it is why the axis is in error stop.
 
     Args:
@@ -53,20 +57,23 @@ def axis_troubles(
     """
     if state is None:
         return (Trouble(Severity.NOTICE, "nothing was heard of it yet"),)
+    pending = (Trouble(Severity.WRONG, STOP_PENDING),) if state.stop_pending else ()
     if state.link is LinkState.DOWN:
-        return (Trouble(Severity.WRONG, "the drive does not answer"),)
+        return (*pending, Trouble(Severity.WRONG, "the drive does not answer"))
     faults = _first_cause_first(fault) if fault else []
     wrong = [_told(entry) for entry in faults if entry.stops]
     failed = state.state is AxisState.ERROR_STOP
     if failed and not wrong:
         wrong.append(f"in error stop: {state.last_error or 'reset it to go on'}")
-    notices = ["a stop is latched: nothing moves before reset"] if state.stop_latched else []
+    latched = state.stop_latched and not pending
+    notices = ["a stop is latched: nothing moves before reset"] if latched else []
     notices += [_told(entry) for entry in faults if not entry.stops]
     if state.link is LinkState.DEGRADED:
         notices.append("the drive missed its latest polls")
     elif health:
         notices += _slowness(health)
     return (
+        *pending,
         *(Trouble(Severity.WRONG, text) for text in wrong),
         *(Trouble(Severity.NOTICE, text) for text in notices),
     )
@@ -87,4 +94,4 @@ def _slowness(health: AxisHealth) -> list[str]:
     wanted_hz = asked.get(TelemetryItem.POSITION, health.rate_wanted_hz)
     if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:
         return []
-    return [f"{health.rate_hz:.1f} samples a second instead of {wanted_hz:.1f}"]
+    return [f"fewer samples a second than asked for: {health.rate_hz:.1f} of {wanted_hz:.1f}"]

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from ldcnd.cli.params import load_values
+from ldcnd.cli.parameter_file import load_parameters
 from ldcnd.client.traces import fetch_trace
 from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
 from ldcnd.model.events import CommandStatus
@@ -196,4 +196,4 @@ async def test_what_the_pages_compute_is_what_one_computes_by_hand(house, tmp_pa
     )
     dump = tmp_path / "feed.toml"
     dump.write_text(text, encoding="utf-8")
-    assert dict(read) == load_values(dump) == {"Pn100": 80}
+    assert dict(read) == load_parameters(dump).values == {"Pn100": 80}

@@ -69,6 +69,15 @@ def test_of_a_drive_that_does_not_answer_nothing_else_is_said():
     assert axis_troubles(gone, faults(entry("link_lost")), health(0.0)) == wrong("the drive does not answer")
 
 
+def test_a_stop_that_no_drive_has_confirmed_comes_before_everything_even_of_a_drive_that_does_not_answer():
+    gone = state(link=LinkState.DOWN, stop_latched=True, stop_pending=True)
+
+    assert [trouble.text for trouble in axis_troubles(gone, faults(entry("overheat")), None)] == [
+        "a stop is NOT confirmed by the drive: use the machine's emergency stop",
+        "the drive does not answer",
+    ]
+
+
 def test_faults_that_stop_come_before_warnings_and_the_first_cause_before_its_consequences():
     active = faults(entry("position_wrap", stops=False), entry("position_error"), entry("overheat"))
     caused = active.model_copy(update={"first": entry("overheat")})
@@ -99,12 +108,12 @@ def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on(
 @pytest.mark.parametrize(
     ("report", "told"),
     [
-        (health(16.0), "16.0 samples a second instead of 20.0"),
+        (health(16.0), "fewer samples a second than asked for: 16.0 of 20.0"),
         (health(17.0), None),  # a report may miss the sample at its edge
         (health(0.0, wanted_hz=1.0), None),
-        (health(0.0, wanted_hz=2.0), "0.0 samples a second instead of 2.0"),
+        (health(0.0, wanted_hz=2.0), "fewer samples a second than asked for: 0.0 of 2.0"),
         (health(1.0, asked_hz=1.0), None),  # as often as the drive is asked
-        (health(1.0, asked_hz=20.0), "1.0 samples a second instead of 20.0"),
+        (health(1.0, asked_hz=20.0), "fewer samples a second than asked for: 1.0 of 20.0"),
     ],
 )
 def test_samples_that_come_too_seldom_are_told(report, told):
@@ -123,9 +132,10 @@ def test_the_console_says_it_in_the_same_words():
         axis_troubles(state(link=LinkState.DOWN), None, None),
         axis_troubles(state(link=LinkState.DEGRADED), None, None),
         axis_troubles(state(stop_latched=True), None, None),
+        axis_troubles(state(stop_pending=True), None, None),
     ]
 
     for (trouble,) in said:
         assert f'"{trouble.text[0].upper()}{trouble.text[1:]}."' in script
-    for part in ("In error stop: ", "reset it to go on", " samples a second instead of "):
+    for part in ("In error stop: ", "reset it to go on", "ewer samples a second than asked for:"):
         assert part in script

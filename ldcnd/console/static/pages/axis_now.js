@@ -49,6 +49,7 @@ function StatusLamps({ state }) {
     <${Lamp} label="answers" on=${state && state.link !== "down"} yes=${state?.link} no="down"
       level=${state?.link === "degraded" ? "warn" : ""} />
     <${Lamp} label="stop latched" on=${state?.stop_latched} level="warn" />
+    ${state?.stop_pending && html`<${Lamp} label="stop confirmed by the drive" on=${true} yes="NO" level="bad" />`}
     <${Lamp} label="error stop" on=${state && state.state === "error_stop"} level="bad" />
   </ul>`;
 }

@@ -118,8 +118,11 @@ function AxisRow({ axis }) {
   return html`<tr role="row" data-axis=${axis.name}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
       <small>${info.model} · ${info.address}</small></th>
-    ${cell("State", html`<${StateWord} axis=${axis} />${state?.stop_latched && html` <${Mark}
-      level="warn">stop latched<//>`}`)}
+    ${cell("State", html`<${StateWord} axis=${axis} />${
+      state?.stop_pending
+        ? html` <${Mark} level="bad">stop NOT confirmed<//>`
+        : state?.stop_latched && html` <${Mark} level="warn">stop latched<//>`
+    }`)}
     ${cell("Position", html`<b>${number(position?.value, decimals)}</b> <span class="unit">${info.unit}</span>`, "number main")}
     ${cell("Velocity", html`${number(velocity?.value, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
     ${cell("Target", number(state?.command?.target, decimals), "number")}

@@ -54,13 +54,16 @@ function* ofAxis(rig, axis) {
   const at = { where: `${rig.name} · ${axis.name}`, link: `#/axis/${rig.name}/${axis.name}` };
   const { state, quality, health } = axis;
   const silent = state?.link === "down";
+  if (state?.stop_pending) {
+    yield { ...at, level: "bad", text: "A stop is NOT confirmed by the drive: use the machine's emergency stop." };
+  }
   if (silent) yield { ...at, level: "bad", text: "The drive does not answer." };
   for (const fault of silent ? [] : axis.faults)
     yield { ...at, level: fault.stops ? "bad" : "warn", text: `${words(fault.code)}: ${fault.text}` };
   if (state?.state === "error_stop" && !axis.faults.length && state.link !== "down") {
     yield { ...at, level: "bad", text: `In error stop: ${state.last_error ?? "reset it to go on"}` };
   }
-  if (state?.stop_latched) yield { ...at, level: "warn", text: "A stop is latched: nothing moves before reset." };
+  if (state?.stop_latched && !state.stop_pending) yield { ...at, level: "warn", text: "A stop is latched: nothing moves before reset." };
   if (state?.link === "degraded") yield { ...at, level: "warn", text: "The drive missed its latest polls." };
   if (quality.level && state?.link !== "down")
     yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
