@@ -78,7 +78,6 @@ def test_an_adapter_hands_over_when_its_chip_does(holding, held, last_byte_s, du
 # -- unplugged -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(reason="being mended: stops that wait for the line, slow motion taken for rest")
 @pytest.mark.parametrize("velocity", [1.5, 40.0])
 async def test_a_move_that_nobody_could_see_is_halted_however_slow_it_is(velocity):
     async with plugged() as line:
@@ -92,7 +91,6 @@ async def test_a_move_that_nobody_could_see_is_halted_however_slow_it_is(velocit
         assert drive(line.chain, X).loop.position < 94_000
 
 
-@pytest.mark.xfail(reason="being mended: stops that wait for the line, slow motion taken for rest")
 async def test_a_stop_while_the_adapter_is_away_is_carried_out_when_it_is_back():
     async with plugged(settings=slow_config(loss={"bus": "run_to_target"})) as line:
         await moving(line, "x", 95.0, 5.0)
@@ -122,7 +120,6 @@ async def test_a_move_goes_on_where_its_policy_says_so_and_no_stop_was_asked_for
         assert abs(drive(line.chain, X).loop.position - 60_000) <= 1
 
 
-@pytest.mark.xfail(reason="being mended: stops that wait for the line, slow motion taken for rest")
 @pytest.mark.parametrize("instant_s", [0.0, 0.004, 0.03])
 async def test_a_stop_that_is_cut_off_by_the_plug_is_carried_out_when_it_is_back(instant_s):
     async with plugged(settings=slow_config(loss={"bus": "run_to_target"})) as line:

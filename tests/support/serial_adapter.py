@@ -22,6 +22,7 @@ import asyncio
 import math
 import os
 import select
+import termios
 import threading
 import time
 import tty
@@ -34,6 +35,7 @@ from pathlib import Path
 from ldcnd.errors import TransportLost
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
+from ldcnd.transport.line_discipline import actual_baud
 from ldcnd.transport.transport import Receiver, Transport
 
 LONGEST_WAIT_S = 0.02
@@ -236,6 +238,7 @@ class TerminalAdapter:
         self._lock = threading.Lock()
         self._line = -1
         self._host = -1
+        self._baud = 0
 
     def push(self) -> None:
         """Plug it in: a new terminal, and the link to it."""
@@ -259,6 +262,7 @@ class TerminalAdapter:
             for descriptor in (self._host, self._line):
                 os.close(descriptor)
             self._host = self._line = -1
+            self._baud = 0
             self._held.take(0.0)
 
     def run(self, stopped: threading.Event) -> None:
@@ -280,9 +284,18 @@ class TerminalAdapter:
     def _carry(self, end: int) -> None:
         data = os.read(end, READ_BYTES)
         if end == self._host:
+            self._tune(actual_baud(self._host) or 0)
             os.write(self._line, data)
         else:
             self._held.add(data, time.monotonic())
+
+    def _tune(self, baud: int) -> None:
+        """Send at the rate that the host has set, as an adapter does."""
+        if baud != self._baud:
+            attributes = termios.tcgetattr(self._line)
+            attributes[4] = attributes[5] = getattr(termios, f"B{baud}")
+            termios.tcsetattr(self._line, termios.TCSANOW, attributes)
+            self._baud = baud
 
 
 @contextmanager
