@@ -13,7 +13,7 @@ import pytest
 
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
-from ldcnd.model.samples import AxisState, LinkState, PositionSample, Quality, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, TelemetryItem
 from tests.support.chain_rig import drive
 from tests.support.plugged_rig import Plugged, X, Y, plugged, slow_config
 
@@ -65,6 +65,8 @@ class Judge:
 async def ready(line: Plugged, judge: Judge, axis: str) -> None:
     """Clear what the last round left, and give the axis a reference in the middle of its travel."""
     client = line.rig.client
+    await client.stop(axis)
+    await line.rig.until(axis, lambda state: state.moving is Moving.NO)
     await client.command(axis, Reset())
     await client.command(axis, Power(on=True))
     await client.command(axis, SetPosition(position=0.0))
