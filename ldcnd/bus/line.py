@@ -14,7 +14,7 @@ from typing import Protocol
 
 from ldcnd.bus.queue import POLL
 from ldcnd.bus.resync import Fence, Probe, Resync
-from ldcnd.bus.settings import HOST_LATE_S, LINGER_S, BusSettings
+from ldcnd.bus.settings import LINGER_S, BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import AT_ONCE, LANES, Turn
 from ldcnd.bus.wire import NEVER_S, Pieces, Watchdog, Whole, Wire
@@ -398,8 +398,7 @@ class Line:
         self._missing = exchange.reply_bytes if plain else NOT_PLAIN
         self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)
         wire.expect(max(ANY, self._missing - early))
-        # a pause counts from when the packet has left an adapter that may hold it for a while
-        answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else wire.lag_s + HOST_LATE_S
+        answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else 0.0
         self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
         self._statistics.exchanges += 1
         wire.sent(exchange.request, now_s, remark)

@@ -132,7 +132,7 @@ async def test_an_analog_move_whose_sensor_does_not_follow_ends_at_its_bounds(bo
     async with dialect_rig(LS_182AP, DEAD_SENSOR, reference="required") as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0, **bounds))
+        state = await rig.done(MoveAnalog(target=900, velocity=5.0, **bounds))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, f"move_analog: {failure}")
         assert rig.position_mm == pytest.approx(way_mm, abs=0.8)
@@ -142,7 +142,7 @@ async def test_an_analog_move_takes_its_bounds_from_the_configuration():
     async with dialect_rig(LS_182AP, DEAD_SENSOR, analog={"timeout_s": 60, "distance": 2}) as rig:
         await rig.power_on()
 
-        state = await rig.done(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0))
+        state = await rig.done(MoveAnalog(target=900, velocity=5.0))
 
         assert state.last_error == "move_analog: not there within 2 mm"
 
@@ -151,7 +151,7 @@ async def test_an_analog_move_that_went_out_of_sight_is_ended_when_the_line_is_b
     loss = {"bus": "run_to_target"}
     async with dialect_rig(LS_182AP, DEAD_SENSOR, analog={"timeout_s": 3}, loss=loss) as rig:
         await rig.power_on()
-        await rig.send(Verb.MOVE_ANALOG, MoveAnalog(target=900, velocity=5.0))
+        await rig.send(MoveAnalog(target=900, velocity=5.0))
         await asyncio.sleep(0.5)
 
         rig.chain.unplug(asyncio.get_running_loop().time(), 4.0)

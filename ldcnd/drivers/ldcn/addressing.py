@@ -16,7 +16,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes
+from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
 from ldcnd.drivers.line import GroupSpec
 from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
@@ -237,7 +237,7 @@ class LineRate:
             commands.set_baud(commands.Group(address, profile), baud, self._codes).request for address in self.groups
         ]
         burst = spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
-        await self._bus.change_baud(unanswered(EVERYBODY, burst, SERVO_CYCLE_S, repeatable=False), baud)
+        await self._bus.change_baud(unanswered(EVERYBODY, burst, commands.GROUP_QUIET_S, repeatable=False), baud)
 
     async def who_is(self, address: int, *, patient: bool = False) -> Identity | None:
         """Ask an address who it is at the host's rate; None when nobody answers.

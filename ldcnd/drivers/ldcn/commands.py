@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
+from ldcnd.bus.settings import HOST_LATE_S
 from ldcnd.drivers.ldcn.controls import (
     HomingControl,
     IoOption,
@@ -126,7 +127,7 @@ class Group(Destination[None]):
 
     def exchange(self, request: bytes, items: StatusItem | None, *, repeatable: bool) -> Exchange[None]:  # noqa: ARG002
         """See `Destination`; the manuals ask for 0.51 ms of quiet."""
-        return unanswered(self.address, request, SERVO_CYCLE_S, repeatable=repeatable)
+        return unanswered(self.address, request, GROUP_QUIET_S, repeatable=repeatable)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
@@ -166,6 +167,8 @@ def _nothing(_data: bytes) -> None:
     return None
 
 
+GROUP_QUIET_S = SERVO_CYCLE_S + HOST_LATE_S
+"""Pause behind a packet to a silent group: 0.51 ms (PIC-SERVO manual, 4.1) from when an adapter has sent it."""
 RESET_SETTLE_S = 0.1
 """What a module gets to restart after Hard Reset; the manuals name no time."""
 COMMON_TOP_BAUD = 115_200

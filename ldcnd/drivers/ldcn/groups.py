@@ -14,7 +14,6 @@ from ldcnd.drivers.driver import Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
 from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.errors import BusError, DriveFault, LdcndError, NotSupported, OutcomeUnknown, ReplyTimeout, WrongState
@@ -136,7 +135,7 @@ class Groups:
     def _quiet_s(self, groups: list[Group]) -> float:
         """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which nobody reads."""
         leaders = sum(group.leader is not None for group in groups)
-        return SERVO_CYCLE_S + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
+        return commands.GROUP_QUIET_S + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
 
     def _spaced(self, packets: list[bytes]) -> bytes:
         return spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
