@@ -10,6 +10,7 @@ from ldcnd.model.samples import AdcSample, AxisState, PositionSample, TelemetryI
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
+    CMC,
     LS_173AP,
     LS_182AP,
     LS_182AP_22,
@@ -35,7 +36,7 @@ async def next_sample(rig: DialectRig, item: TelemetryItem):
 
 async def a_working_day(dialect: Dialect) -> None:
     """Take a drive of this dialect through all that a client does with it."""
-    reports_position_error = dialect not in (V1, V2, V3, V4)
+    reports_position_error = dialect not in (V1, V2, V3, V4, CMC)
     full_scale = 1023 if dialect in (LS_182AP, LS_182AP_22) else 255
     async with dialect_rig(dialect, WIDE_INDEX) as rig:
         # identity and enabling
@@ -100,6 +101,10 @@ async def test_pic_servo_v3():
 
 async def test_pic_servo_v4():
     await a_working_day(V4)
+
+
+async def test_pic_servo_cmc():
+    await a_working_day(CMC)
 
 
 async def test_pic_servo_sc():

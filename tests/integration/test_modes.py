@@ -18,6 +18,7 @@ from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
+    CMC,
     DIALECTS,
     LS_173AP,
     LS_182AP,
@@ -47,7 +48,7 @@ async def test_the_capabilities_tell_what_the_model_can_do(dialect):
         expected.add(Verb.MOVE_ANALOG)
     if dialect is not V1:
         expected.add(Verb.TRACK)
-    if dialect is V4:
+    if dialect in (V4, CMC):
         expected.add(Verb.SET_OUTPUTS)
     assert special & set(info.capabilities) == expected
 

@@ -51,3 +51,29 @@ def test_velocity_mode_integrates_its_velocity(velocities, acceleration):
             assert profiler.done == (profiler.velocity == goal)
 
     assert profiler.position == travelled
+
+
+CHANGE = st.tuples(st.integers(-3000, 3000), st.integers(ONE // 4, 30 * ONE), st.integers(1, 300))
+"""A goal, a velocity, and for how many ticks they are in force."""
+
+
+@settings(max_examples=60, deadline=None)
+@given(changes=st.lists(CHANGE, min_size=1, max_size=6), acceleration=st.integers(500, 4 * ONE))
+def test_goal_and_velocity_may_change_at_any_time_and_the_limits_are_kept(changes, acceleration):
+    """Every change begins with the velocity that is there; one above the new limit is only ever brought down."""
+    profiler = ProfileGenerator()
+
+    for counts, speed, ticks in changes:
+        profiler.go_to(counts, speed, acceleration, from_velocity=True)
+        for _ in range(ticks):
+            before = profiler.velocity
+            profiler.step()
+            assert abs(profiler.velocity - before) <= acceleration
+            assert abs(profiler.velocity) <= max(speed, abs(before) - min(acceleration, abs(before)))
+    for _ in range(200_000):
+        if profiler.done:
+            break
+        profiler.step()
+
+    assert profiler.at_rest
+    assert profiler.position == changes[-1][0] * ONE

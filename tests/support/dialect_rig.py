@@ -43,11 +43,12 @@ V1 = Dialect("pic-servo-v1", "picservo-v1", 1)
 V2 = Dialect("pic-servo-v2", "picservo-v2", 2)
 V3 = Dialect("pic-servo-v3", "picservo-v3", 3)
 V4 = Dialect("pic-servo-v4", "picservo-v4", 4)
+CMC = Dialect("pic-servo-cmc", "pic-servo-cmc", 5)
 SC = Dialect("pic-servo-sc", "picservo-sc", 10)
 LS_173AP = Dialect("ls-173ap", "ls173ap", 1)
 LS_182AP = Dialect("ls-182ap", "ls182ap", 20)
 LS_182AP_22 = Dialect("ls-182ap", "ls182ap", 22)
-DIALECTS = (V1, V2, V3, V4, SC, LS_173AP, LS_182AP, LS_182AP_22)
+DIALECTS = (V1, V2, V3, V4, CMC, SC, LS_173AP, LS_182AP, LS_182AP_22)
 
 
 @dataclass(frozen=True, slots=True)
