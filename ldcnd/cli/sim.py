@@ -13,11 +13,14 @@ import click
 from ldcnd.config.simulation import FaultPlanConfig, SimulationConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.drivers.ldcn.packet import HEADER, PacketReader
+from ldcnd.drivers.smartstep.config import SimulatedSmartStepsConfig, SimulatedUnitConfig
+from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
 from ldcnd.drivers.transcript import describer
 from ldcnd.errors import ConfigError
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import serve_pty
+from ldcnd.sim.smartstep.cable import simulated_units, smartstep_chain
 from ldcnd.version import version
 from ldcnd.wirelog.capture import CaptureHeader, capture_lines
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
@@ -28,6 +31,7 @@ DEFAULT_SEED = 1
 @click.command()
 @click.option("--pty", "link", type=click.Path(path_type=Path), help="Make this symbolic link to the terminal.")
 @click.option("--chain", help=f"The modules in daisy-chain order, of: {', '.join(MODELS)}.")
+@click.option("--smartstep", help="SmartSteps instead: unit numbers such as 1,2, or a file with their tables (TOML).")
 @click.option("--file", type=click.Path(path_type=Path), help="The modules and what happens to them (TOML).")
 @click.option("--fault-plan", type=click.Path(path_type=Path), help="What else may go wrong on the wires (TOML).")
 @click.option("--baud-check", is_flag=True, help="Bytes at another rate than a module's are garbage to it.")
@@ -37,6 +41,7 @@ DEFAULT_SEED = 1
 def command(
     link: Path | None,
     chain: str | None,
+    smartstep: str | None,
     file: Path | None,
     fault_plan: Path | None,
     seed: int | None,
@@ -46,6 +51,11 @@ def command(
     as_json: bool,
 ) -> None:
     """Simulate a line of drives in real time until SIGTERM or SIGINT; prints the terminal once it can be opened."""
+    if smartstep is not None:
+        if chain is not None or file is not None:
+            raise click.UsageError("a line has SmartSteps, or the modules of --chain or --file")
+        _serve_smartsteps(smartstep, fault_plan, seed, link, as_json=as_json)
+        return
     spec = _spec(chain, file, seed)
     spec = replace(spec, baud_check=spec.baud_check or baud_check)
     if fault_plan:
@@ -63,6 +73,34 @@ def command(
             serve_pty(build_chain(spec), link, baud_check=spec.baud_check, opened=opened, observer=observer)
         except OSError as error:
             raise click.ClickException(f"no terminal: {error}") from error
+
+
+def _serve_smartsteps(
+    described: str, fault_plan: Path | None, seed: int | None, link: Path | None, *, as_json: bool
+) -> None:
+    """Serve a line of SmartSteps; its rate is always 9600."""
+    config = _smartsteps(described)
+    faults = read_toml(fault_plan, FaultPlanConfig).fault if fault_plan else ()
+    plan = FaultPlan(tuple(fault.spec(0.0) for fault in faults), DEFAULT_SEED if seed is None else seed)
+    units = simulated_units(config.unit, 0.0)
+
+    def opened(path: Path) -> None:
+        numbers = [unit.number for unit in config.unit]
+        print(json.dumps({"terminal": str(path), "units": numbers}) if as_json else path, flush=True)
+
+    try:
+        serve_pty(smartstep_chain(units, config.wiring, config.framing, faults=plan), link, opened=opened)
+    except OSError as error:
+        raise click.ClickException(f"no terminal: {error}") from error
+
+
+def _smartsteps(described: str) -> SimulatedSmartStepsConfig:
+    if not described.replace(",", "").replace(" ", "").isdigit():
+        return read_toml(Path(described), SimulatedSmartStepsConfig)
+    numbers = [int(number) for number in described.replace(",", " ").split()]
+    if len(set(numbers)) < len(numbers) or max(numbers) > HIGHEST_UNIT:
+        raise ConfigError(f"--smartstep: {described!r} are not different unit numbers from 0 to {HIGHEST_UNIT}")
+    return SimulatedSmartStepsConfig(unit=tuple(SimulatedUnitConfig(number=number) for number in numbers))
 
 
 class WireLogFile:

@@ -302,9 +302,9 @@ async def test_interval_that_this_drive_has_not_is_refused_before_anything_is_se
         assert settings_sent(under_test) == []
 
 
-async def test_trigger_without_a_map_is_refused_before_anything_is_sent():
+async def test_samples_before_a_trigger_without_a_map_are_refused_before_anything_is_sent():
     async with trace_rig(assumed={"trigger_map": None}) as under_test:
-        with pytest.raises(NotSupported, match="bits of the trigger condition are not known"):
+        with pytest.raises(ValueOutOfRange, match="trigger bits of the drive are not known"):
             await arm_trace(under_test.rig.client, "feed", trace_request())
 
         assert settings_sent(under_test) == []

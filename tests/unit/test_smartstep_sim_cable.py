@@ -10,14 +10,15 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.smartstep.commands import FLUSH, Refusal, probe, reference, string_reference, write_eeprom, write_ram
+from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
 from ldcnd.drivers.smartstep.packet import DAMAGED, ResponseStatus, add_parity, strip_parity
-from ldcnd.drivers.smartstep.parameters import PN000, PN100
-from ldcnd.drivers.smartstep.profiles import Framing, Wiring
+from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN102
+from ldcnd.drivers.smartstep.profiles import Framing, TraceWordLayout, Wiring
 from ldcnd.errors import OutcomeUnknown, ReplyTimeout
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.sim.smartstep.cable import SimulatedCable, smartstep_chain
+from ldcnd.sim.smartstep.cable import SimulatedCable, simulated_units, smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 
@@ -218,3 +219,56 @@ def test_host_that_sends_into_a_reply_on_four_wires_does_not_cut_it():
     chain.write(1.03, FLUSH)
 
     assert [data for _, data in chain.advance(2.0)] == [b"W1001000029C6\r"]
+
+
+def configured(**settings) -> SimulatedUnit:
+    (unit,) = simulated_units([SimulatedUnitConfig.model_validate({"number": 1, **settings})], 10.0)
+    return unit
+
+
+def test_a_configured_unit_has_its_parameters_switches_history_and_wear():
+    unit = configured(stored={"Pn102": 55}, gain_switch=7, switches=0x21, history=[0x10, 0x51], worn=9_999)
+
+    memory = unit.drive.memory
+    assert (memory.stored(PN102), unit.drive.gain_switch, int(unit.drive.switches)) == (55, 7, 0x21)
+    assert unit.drive.alarm_history[:3] == [0x10, 0x51, 0x99]
+    assert [memory.write(0x0102, value) and memory.stored(PN102) for value in (56, 57)] == [56, 56]
+
+
+def test_what_is_configured_happens_to_a_unit_in_its_time():
+    unit = configured(
+        event=[
+            {"at_s": 3, "alarm": 0x10},
+            {"at_s": 1, "run": True, "pulse_rate": 1000},
+            {"at_s": 4, "reset": True, "pulse_rate": 0},
+            {"at_s": 5, "power": False},
+        ]
+    )
+    seen = []
+    for at_s in (10.5, 12.0, 13.5, 14.5, 15.5):
+        unit.transmissions(at_s)
+        seen.append((unit.drive.motor.servo_on, unit.drive.alarm_code, unit._powered))
+
+    assert seen == [
+        (False, 0x99, True),
+        (True, 0x99, True),
+        (False, 0x10, True),
+        (True, 0x99, True),
+        (True, 0x99, False),
+    ]
+
+
+def test_a_configured_unit_behaves_as_its_variant_says():
+    unit = configured(
+        variant={"trace_word_layout": "lsb-io-mask", "eeprom_changes_ram": True, "alarm_output_high": False}
+    )
+
+    assert unit.variant.trace_word_layout is TraceWordLayout.LSB_IO_MASK
+    assert unit.variant.eeprom_changes_ram
+    assert not unit.variant.alarm_output_high
+
+
+@pytest.mark.parametrize("name", ["Pn000", "Pn7FF", "speed"])
+def test_only_parameters_that_there_are_can_be_stored(name):
+    with pytest.raises(ValueError, match=name):
+        configured(stored={name: 1})

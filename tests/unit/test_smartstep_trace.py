@@ -15,6 +15,7 @@ from ldcnd.drivers.smartstep.profiles import (
     Verification,
 )
 from ldcnd.drivers.smartstep.trace_upload import TraceUpload
+from ldcnd.drivers.tracer import TraceTimedOut
 from ldcnd.errors import (
     BadReply,
     BusError,
@@ -387,3 +388,32 @@ async def test_a_change_of_a_value_triggers_by_both_edges():
 
     assert recorded.values[0][0] != 0.0
     assert max(recorded.values[0]) < 4.0
+
+
+async def test_without_known_trigger_bits_the_host_starts_the_trace_and_says_how_late():
+    unit = running(pulses=0.0)
+    async with smartstep_line([unit]) as line:
+        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=100.0)
+        request = TakeTrace(channels=("speed_feedback",), trigger=trigger, interval_s=0.004)
+        armed = await line.axis("u1").tracer.arm(request)
+        loop = asyncio.get_running_loop()
+        met_s = loop.time() + 2.0
+        loop.call_at(met_s, lambda: unit.drive.set_pulse_rate(8000.0, loop.time()))
+        recorded = await armed.record(ignore)
+
+    assert armed.granted.phase == "waiting"
+    assert (recorded.trigger_index, recorded.drive.trigger_word_source) == (None, "host")
+    assert recorded.values[0][0] > 100.0
+    assert recorded.zero_from_s - recorded.trigger_late_s - 0.05 <= met_s <= recorded.zero_until_s
+
+
+async def test_a_host_trigger_that_does_not_come_leaves_nothing_armed():
+    unit = running(pulses=0.0)
+    async with smartstep_line([unit]) as line:
+        request = TakeTrace(channels=("speed_feedback",), trigger=NEVER, timeout_s=2.0)
+        armed = await line.axis("u1").tracer.arm(request)
+
+        with pytest.raises(TraceTimedOut, match="within 2 s"):
+            await armed.record(ignore)
+
+    assert unit.drive.mode == 0

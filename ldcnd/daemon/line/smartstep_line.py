@@ -14,13 +14,11 @@ from ldcnd.drivers.smartstep.drive import UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger
 from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
 from ldcnd.drivers.smartstep.parameter_store import EepromRules
-from ldcnd.drivers.smartstep.parameters import PN000
 from ldcnd.drivers.smartstep.profiles import Echo, Framing, SmartStepProfile
 from ldcnd.planning.smartstep import rates_hz
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.sim.smartstep.cable import smartstep_chain
-from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.cable import simulated_units, smartstep_chain
 from ldcnd.transport.port_url import port_opener
 from ldcnd.transport.serial_port import Framing as SerialFraming
 from ldcnd.transport.transport import Opener
@@ -109,11 +107,5 @@ def _opener(config: RigConfig, settings: BusConfig, profile: SmartStepProfile, c
 
 
 def _chain(line: SimulatedLineConfig, profile: SmartStepProfile) -> Chain:
-    now_s = asyncio.get_running_loop().time()
-    units = []
-    for settings in line.unit:
-        unit = SimulatedUnit(stored={PN000: settings.number << 8})
-        unit.drive.set_run(now_s, on=settings.run)
-        unit.drive.set_pulse_rate(settings.pulse_rate, now_s)
-        units.append(unit)
+    units = simulated_units(line.unit, asyncio.get_running_loop().time())
     return smartstep_chain(units, profile.wiring, profile.framing, echo=profile.echo is Echo.EXPECT)

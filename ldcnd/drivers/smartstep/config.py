@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, find_parameter
 from ldcnd.drivers.smartstep.profiles import (
     ByteOrder,
     CommandPulseGear,
@@ -158,6 +159,56 @@ class SmartStepUnitConfig(Frozen):
         return self
 
 
+class SimulatedEventConfig(Frozen):
+    """What happens to a simulated drive at an instant."""
+
+    at_s: float = Field(ge=0)
+    """Seconds after the line began."""
+    run: bool | None = None
+    """RUN is switched."""
+    pulse_rate: float | None = None
+    """The pulse input changes, command units a second."""
+    alarm: int | None = Field(default=None, ge=0, le=WORD)
+    """An alarm or a warning comes."""
+    reset: bool = False
+    """RESET is pressed."""
+    power: bool | None = None
+    """It is switched off or on."""
+
+
+class SimulatedVariantConfig(Frozen):
+    """How a simulated drive behaves where the manual leaves room; the defaults are the assumptions of the driver."""
+
+    response_s: float = Field(default=0.01, ge=0, le=5)
+    """From a command to the first character of its reply; the manual allows 0.2."""
+    string_checksum: StringChecksum = StringChecksum.HEADER
+    """What the checksum of a string reply covers."""
+    string_count_unit: CountUnit = CountUnit.BYTES
+    """What the count of a string reference counts."""
+    longest_string_bytes: int = Field(default=1000, ge=2, le=1000)
+    """More is an error in number of bytes."""
+    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
+    """Where the signal's bit and the value sit in a word of the trace memory."""
+    trace_byte_order: ByteOrder = ByteOrder.BIG
+    """Which half of a word comes first in a string."""
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
+    """By which way of gearing traced command pulses become the motor's speed."""
+    trigger_map: TriggerMapConfig | None = None
+    """The bits of the trigger condition; invented ones when missing."""
+    full_scale_settable: bool = True
+    """8701H and 8702H take settings."""
+    eeprom_changes_ram: bool = False
+    """A write to EEPROM also changes the value in use."""
+    hears_itself: bool = False
+    """It takes its own replies for commands."""
+    run_active_low: bool = True
+    """RUN is on at level 0."""
+    reset_active_low: bool = True
+    """RESET is on at level 0."""
+    alarm_output_high: bool = True
+    """/ALM is 1 in alarm."""
+
+
 class SimulatedUnitConfig(Frozen):
     """One simulated SmartStep."""
 
@@ -167,6 +218,40 @@ class SimulatedUnitConfig(Frozen):
     """RUN is on."""
     pulse_rate: float = 0.0
     """Command units a second that come in from the start."""
+    stored: Mapping[str, Annotated[int, Field(ge=0, le=WORD)]] = {}
+    """Parameters in EEPROM, by number such as Pn102; the others have factory values."""
+    worn: int = Field(default=0, ge=0, le=10_000)
+    """Writes that its EEPROM has taken already; after 10,000 in all nothing is stored any more."""
+    gain_switch: int = Field(default=4, ge=0, le=15)
+    """Position of the gain rotary switch."""
+    switches: int = Field(default=0x20, ge=0, le=0x3F)
+    """Function selection switches, switch 1 in bit 0."""
+    history: tuple[Annotated[int, Field(ge=0, le=WORD)], ...] = Field(default=(), max_length=10)
+    """Alarm codes of its history, the newest first."""
+    event: tuple[SimulatedEventConfig, ...] = ()
+    """What happens to it as time goes on."""
+    variant: SimulatedVariantConfig = SimulatedVariantConfig()
+    """How it behaves where the manual leaves room."""
+
+    @field_validator("stored")
+    @classmethod
+    def _listed(cls, values: Mapping[str, int]) -> Mapping[str, int]:
+        for name in values:
+            found = find_parameter(name)
+            if found not in PARAMETERS or found is PN000:
+                raise ValueError(f"{name} is no parameter that can be stored; the unit number is `number`")
+        return values
+
+
+class SimulatedSmartStepsConfig(Frozen):
+    """A file of `ldcnd sim --smartstep`."""
+
+    unit: tuple[SimulatedUnitConfig, ...] = Field(min_length=1, max_length=16)
+    """The drives of the line."""
+    wiring: Wiring = Wiring.FOUR_WIRE
+    """2-wire for its hazards."""
+    framing: Framing = Framing.SEVEN_EVEN
+    """How the host makes characters; a pseudo-terminal carries no parity bit unless the host makes it."""
 
 
 def as_axis(document: object) -> object:

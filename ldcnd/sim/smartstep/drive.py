@@ -50,10 +50,12 @@ class SimulatedMemory:
 
     Attributes:
         writes: how often each EEPROM word was written.
+        worn: writes before the simulation began; the life is that of the EEPROM as a whole (manual 2.2, note).
     """
 
     def __init__(self, stored: Mapping[Parameter, int], *, eeprom_changes_ram: bool) -> None:
         self.writes = {parameter.number: 0 for parameter in PARAMETERS}
+        self.worn = 0
         self._limits = {parameter.number: _limits(parameter) for parameter in PARAMETERS}
         self._eeprom = {parameter.number: _factory_value(parameter) for parameter in PARAMETERS}
         self._eeprom.update({parameter.number: value for parameter, value in stored.items()})
@@ -92,7 +94,7 @@ class SimulatedMemory:
             self._ram[number] = value
             return True
         self.writes[number] += 1
-        if self.writes[number] <= EEPROM_LIFE:
+        if self.worn + sum(self.writes.values()) <= EEPROM_LIFE:
             self._eeprom[number] = value
             if self._eeprom_changes_ram:
                 self._ram[number] = value

@@ -4,7 +4,8 @@ Time is an input: `receive` says when characters have arrived, `transmissions` w
 Source: manual 2.1 "Basic specifications" (the silent cases), 2.2.
 """
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TRACE_2_AREA
@@ -62,6 +63,7 @@ class SimulatedUnit:
         self._deaf_until_s = 0.0
         self._pending: Transmission | None = None
         self._sent: list[Transmission] = []
+        self._events: deque[tuple[float, Callable[[float], None]]] = deque()
 
     @property
     def always_transmits(self) -> bool:
@@ -114,7 +116,14 @@ class SimulatedUnit:
         self._powered = True
         self._deaf_until_s = at_s
 
+    def schedule(self, at_s: float, act: Callable[[float], None]) -> None:
+        """Let something happen at an instant of the line's clock; calls come in order of time."""
+        self._events.append((at_s, act))
+
     def _settle(self, to_s: float) -> None:
+        while self._events and self._events[0][0] <= to_s:
+            at_s, act = self._events.popleft()
+            act(at_s)
         while self._pending and self._pending.start_s <= to_s:
             sending, self._pending = self._pending, None
             self._sent.append(sending)
