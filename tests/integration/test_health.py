@@ -166,10 +166,12 @@ async def test_rates_of_drives_that_pace_themselves_are_reported_like_those_of_o
                 assert item.granted_hz == pytest.approx(item.asked_hz, rel=0.1)
 
 
-def test_rate_of_two_reports_at_one_instant_is_the_one_before():
-    rate = _Rate(0.0, 0)
+def test_rate_is_told_from_the_instants_of_samples_also_by_two_reports_at_one_instant():
+    rate = _Rate(0.0, 1, 0)
+    reports = ((9, 2_000_000_000, 2.05), (10, 2_250_000_000, 2.05), (10, 2_250_000_000, 3.2))
 
-    assert [rate.of(count, at_s, 0.01) for count, at_s in ((0, 0.0), (8, 2.0), (9, 2.0))] == [0.0, 4.0, 4.0]
+    assert [rate.of(*report, 0.9) for report in reports] == [4.0, 4.0, 4.0]
+    assert rate.of(10, 2_250_000_000, 4.3, 0.9) == 0.0
 
 
 async def test_reports_leave_the_network_with_the_daemon():

@@ -27,24 +27,31 @@ LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
 
 
 class _Rate:
-    """How often something is counted, over as long as it takes to tell."""
+    """How often something comes, from the instants of the samples themselves, over as long as it takes to tell."""
 
-    __slots__ = ("_count", "_hz", "_since_s")
+    __slots__ = ("_at_ns", "_count", "_hz", "_looked_s")
 
-    def __init__(self, since_s: float, count: int) -> None:
-        self._since_s = since_s
+    def __init__(self, now_s: float, count: int, at_ns: int) -> None:
+        self._looked_s = now_s
         self._count = count
+        self._at_ns = at_ns
         self._hz = 0.0
 
-    def of(self, count: int, now_s: float, least_s: float) -> float:
-        """Return the rate since at least `least_s` ago; before that the one found last."""
-        elapsed_s = now_s - self._since_s
-        if elapsed_s > 0 and elapsed_s >= least_s - CLOCK_S:
-            self._hz = max(0, count - self._count) / elapsed_s
-            self._since_s, self._count = now_s, count
-        elif not self._hz and elapsed_s > 0:
-            return (count - self._count) / elapsed_s
-        return self._hz
+    def of(self, count: int, at_ns: int, now_s: float, least_s: float) -> float:
+        """Return the rate since at least `least_s` ago; before that the one found last.
+
+        Args:
+            count: samples so far.
+            at_ns: when the latest of them was true.
+            now_s: when the report is made.
+            least_s: how long it takes to tell.
+        """
+        lasted_s, more = (at_ns - self._at_ns) / 1e9, count - self._count
+        hz = more / lasted_s if more > 0 and lasted_s > 0 else 0.0
+        if now_s - self._looked_s >= least_s - CLOCK_S and now_s > self._looked_s:
+            self._hz = hz
+            self._looked_s, self._count, self._at_ns = now_s, count, at_ns
+        return self._hz or hz
 
 
 class HealthWatch:
@@ -184,9 +191,10 @@ class HealthWatch:
 
     def _granted_hz(self, axis: str, item: TelemetryItem, asked_hz: float) -> float:
         """Return how often an item was published lately."""
-        now_s, count = self._clock.now_s(), self._count(axis, item)
-        rate = self._granted.setdefault((axis, item), _Rate(now_s, count))
-        return rate.of(count, now_s, TURNS / asked_hz if asked_hz else PERIOD_S)
+        last = self._publisher.last.get(self._keys.telemetry(axis, item))
+        now_s, count, at_ns = self._clock.now_s(), self._count(axis, item), last.t if last else 0
+        rate = self._granted.setdefault((axis, item), _Rate(now_s, count, at_ns))
+        return rate.of(count, at_ns, now_s, TURNS / asked_hz if asked_hz else PERIOD_S)
 
     def _count(self, axis: str, item: TelemetryItem) -> int:
         """Return how many samples of an item were published so far."""
