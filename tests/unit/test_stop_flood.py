@@ -61,8 +61,8 @@ class Flood:
 
     def __init__(self, rig: SlowRig, group: asyncio.TaskGroup) -> None:
         self.answers: list[Answer] = []
-        self.desk = Mock()
-        self._requests = Requests(rig, KEYS, group, SimpleNamespace(commands=self.desk), None)
+        self.dispatcher = Mock()
+        self._requests = Requests(rig, KEYS, group, self.dispatcher, None)
 
     def stop(self, times: int = 1) -> None:
         for _ in range(times):
@@ -159,11 +159,11 @@ async def test_who_has_stopped_is_entered_once_the_drives_have_confirmed_it():
         flood = Flood(rig, group)
         flood.stop()
         await settled()
-        sent, entered = rig.stops, flood.desk.stopped.call_count
+        sent, entered = rig.stops, flood.dispatcher.stopped.call_count
         rig.confirmed.set()
 
     assert (sent, entered) == (1, 0)
-    flood.desk.stopped.assert_called_once_with(("x",), ("x",), Stop(), None)
+    flood.dispatcher.stopped.assert_called_once_with(("x",), ("x",), Stop(), None)
 
 
 async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
@@ -171,11 +171,11 @@ async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
     rig.wire_log.add.side_effect = OSError("no room")
     async with asyncio.TaskGroup() as group:
         flood = Flood(rig, group)
-        flood.desk.stopped.side_effect = ValueError("a bug")
+        flood.dispatcher.stopped.side_effect = ValueError("a bug")
         flood.stop()
         await settled()
         rig.confirmed.set()
 
-    assert rig.stops == flood.desk.stopped.call_count == 1
+    assert rig.stops == flood.dispatcher.stopped.call_count == 1
     assert b'"confirmed":["x"]' in flood.answers[0].payload
     assert not flood.answers[0].is_error
