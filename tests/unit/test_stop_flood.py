@@ -62,7 +62,7 @@ class Flood:
     def __init__(self, rig: SlowRig, group: asyncio.TaskGroup) -> None:
         self.answers: list[Answer] = []
         self.dispatcher = Mock()
-        self._requests = Requests(rig, KEYS, group, self.dispatcher, None)
+        self._requests = Requests(rig, KEYS, group, self.dispatcher)
 
     def stop(self, times: int = 1) -> None:
         for _ in range(times):
