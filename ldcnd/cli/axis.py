@@ -21,9 +21,9 @@ from ldcnd.model.commands import (
     MoveAnalog,
     MoveRelative,
     MoveVelocity,
-    PlanReply,
     Power,
     Preview,
+    PreviewReply,
     QuickStop,
     Reset,
     SetGains,
@@ -225,8 +225,8 @@ def preview(
     """Show what a motion of AXIS would do; nothing is sent to its drive."""
     asked = of_options(Preview, position=position, distance=distance, velocity=velocity, acceleration=acceleration)
 
-    async def work(client: RigClient) -> tuple[AxisInfo, PlanReply]:
-        return await axis_of(client, axis), await client.plan(axis, asked)
+    async def work(client: RigClient) -> tuple[AxisInfo, PreviewReply]:
+        return await axis_of(client, axis), await client.preview(axis, asked)
 
     info, reply = target.run(work)
     target.show(reply, *_previewed(info, reply))
@@ -313,7 +313,7 @@ def clear_counter(target: Target, axis: str, counter: str) -> None:
     target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
 
 
-def _previewed(info: AxisInfo, reply: PlanReply) -> list[str]:
+def _previewed(info: AxisInfo, reply: PreviewReply) -> list[str]:
     if reply.refusal:
         lines = [f"{info.axis}: would be refused: {reply.refusal.message} [{reply.refusal.code}]"]
         if reply.refusal.nearest is not None:

@@ -10,7 +10,17 @@ from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionErro
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Answer, Declaration, Sample, SampleKind, Session
-from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, PlanReply, Preview, Stop, StopReply, Why, WhyReply
+from ldcnd.model.commands import (
+    LONGEST_NAME,
+    AxisCommand,
+    Command,
+    Preview,
+    PreviewReply,
+    Stop,
+    StopReply,
+    Why,
+    WhyReply,
+)
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, DaemonHealth
@@ -210,7 +220,7 @@ class RigClient:
         """Ask why a motion of an axis would be refused now, and what would clear that."""
         return await self.ask(question, axis)
 
-    async def plan(self, axis: str, question: Preview) -> PlanReply:
+    async def preview(self, axis: str, question: Preview) -> PreviewReply:
         """Ask what a motion would do; no effect."""
         return await self.ask(question, axis)
 

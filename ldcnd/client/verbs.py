@@ -19,9 +19,9 @@ from ldcnd.model.commands import (
     MoveRelative,
     MoveVelocity,
     PinMode,
-    PlanReply,
     Power,
     Preview,
+    PreviewReply,
     QuickStop,
     Reset,
     SetGains,
@@ -396,7 +396,7 @@ class AxisVerbs(ABC):
         distance: float | None = None,
         velocity: float | None = None,
         acceleration: float | None = None,
-    ) -> PlanReply:
+    ) -> PreviewReply:
         """Ask what a motion would do; exactly one of position, distance and velocity-alone says which motion is meant.
 
         Args:

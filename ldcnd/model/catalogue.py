@@ -38,6 +38,8 @@ BY_VERB: Mapping[About, Mapping[str, type[Command[Frozen]]]] = MappingProxyType(
     {about: MappingProxyType({each.verb: each for each in COMMANDS if each.about is about}) for about in About}
 )
 """What the last chunk of a command key stands for, in keys of axes and in those of the rig."""
+RENAMED: Mapping[str, str] = MappingProxyType({"plan": "preview"})
+"""Verbs of before, and what they are called now."""
 
 
 def verbs_for(*capabilities: Capability) -> frozenset[Verb]:

@@ -539,8 +539,8 @@ class Why(Command[WhyReply]):
     """Whether the motion would name a position, which needs a referenced axis."""
 
 
-class PlanReply(Frozen):
-    """What the motion would be; nothing was sent: the reply to `@cmd/<axis>/plan`."""
+class PreviewReply(Frozen):
+    """What the motion would be; nothing was sent: the reply to `@cmd/<axis>/preview`."""
 
     axis: str
     """The axis."""
@@ -566,10 +566,10 @@ class PlanReply(Frozen):
     """For how long that would occupy the line at most, in seconds."""
 
 
-class Preview(Command[PlanReply]):
+class Preview(Command[PreviewReply]):
     """Ask what a motion would do; exactly one of position, distance and velocity-alone says which motion is meant."""
 
-    verb = "plan"
+    verb = "preview"
     about = About.AXIS
     effect = Effect.QUESTION
 

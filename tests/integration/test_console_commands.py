@@ -39,7 +39,7 @@ async def test_an_axis_is_powered_moved_and_arrives(console):
 
 async def test_questions_about_an_axis_are_answered(console):
     why = await console.browser.post(f"{X}/why")
-    plan = await console.browser.post(f"{X}/plan", {"position": 5.0})
+    plan = await console.browser.post(f"{X}/preview", {"position": 5.0})
 
     assert why.document["can_move"] is False
     assert plan.status == 200, plan.document

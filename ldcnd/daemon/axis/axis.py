@@ -39,8 +39,8 @@ from ldcnd.model.commands import (
     Capability,
     CommandReply,
     Move,
-    PlanReply,
     Preview,
+    PreviewReply,
     QuickStop,
     Stop,
     Verb,
@@ -371,7 +371,7 @@ class AxisService:
                 permit.ask()
             return await execute()
 
-    def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PlanReply:
+    def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""
         return preview(self._motion, self._bus, request, obstacles)
 

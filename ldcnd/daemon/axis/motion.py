@@ -21,7 +21,7 @@ from ldcnd.drivers.driver import AxisReading, Motion
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BusError, MalformedRequest, OutcomeUnknown, RequestRefused, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import error_reply
-from ldcnd.model.commands import CommandReply, PlanReply, Preview, Verb
+from ldcnd.model.commands import CommandReply, Preview, PreviewReply, Verb
 from ldcnd.model.samples import AxisState
 
 LARGEST_COUNT = 0x7FFFFFFF
@@ -278,7 +278,7 @@ class AxisMotion:
         return CommandReply(command_id=turn.command_id, axis=self.config.name, verb=turn.verb)
 
 
-def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PlanReply:
+def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
     """Plan a motion without sending anything.
 
     Args:
@@ -297,11 +297,11 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
     except MalformedRequest:
         raise
     except RequestRefused as error:
-        return PlanReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
+        return PreviewReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
     exchanges = motion.driver.exchanges(plan.motion)
     asked_velocity = motion.config.velocity if request.velocity is None else request.velocity
     asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
-    return PlanReply(
+    return PreviewReply(
         axis=name,
         refusal=None,
         obstacles=obstacles,

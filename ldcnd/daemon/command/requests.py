@@ -11,7 +11,7 @@ from ldcnd.log import LogLimit, get_logger
 from ldcnd.messaging.codec import decode, encode, reply_encoding
 from ldcnd.messaging.keys import RIG_ITSELF, CommandAddress, Keys
 from ldcnd.messaging.session import Declaration, OnQuery, Query, Session
-from ldcnd.model.catalogue import BY_VERB
+from ldcnd.model.catalogue import BY_VERB, RENAMED
 from ldcnd.model.commands import About, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
 
@@ -186,5 +186,9 @@ def _command_class(address: CommandAddress) -> type[Command[Frozen]]:
     known = BY_VERB[About.RIG if axis is None else About.AXIS]
     if command := known.get(address.verb):
         return command
+    if now := RENAMED.get(address.verb):
+        raise UnknownVerb(
+            f"the command {address.verb!r} is called {now!r} now", axis=axis, value=address.verb, remedy=f"send {now}"
+        )
     whose = "the rig has" if axis is None else "there is"
     raise UnknownVerb(f"{whose} no command {address.verb!r}, only {', '.join(known)}", axis=axis, value=address.verb)

@@ -111,7 +111,7 @@ function Preview({ axis, body, field, onNearest }) {
     if (!asked) return undefined;
     let wanted = true;
     const timer = setTimeout(() => {
-      question(axis, "plan", JSON.parse(asked)).then(
+      question(axis, "preview", JSON.parse(asked)).then(
         (reply) => wanted && setPlan(reply),
         (error) => wanted && setRefusal(error),
       );

@@ -55,7 +55,7 @@ export async function runTest(axis, { kind, distance, settleS }) {
 }
 
 async function planned(axis, body) {
-  const { refusal, duration_s: duration } = await question(axis, "plan", body);
+  const { refusal, duration_s: duration } = await question(axis, "preview", body);
   if (refusal) throw new Refusal(refusal, 409);
   return duration;
 }
