@@ -25,7 +25,7 @@ from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import (
     SAMPLE_MODELS,
     FaultSample,
@@ -131,10 +131,10 @@ class RigClient:
                     found[answer.key.partition("/meta/")[2]] = answer.payload
         return found
 
-    async def line_plan(self) -> RigPlan | None:
+    async def line_plan(self) -> RigBudget | None:
         """Return what the lines promise, or None when the daemon does not say."""
-        answers = await self._session.query(self._keys.plan)
-        return self._decoded(answers[0], RigPlan) if answers else None
+        answers = await self._session.query(self._keys.budget)
+        return self._decoded(answers[0], RigBudget) if answers else None
 
     async def command_list(self) -> CommandList | None:
         """Return all commands and error codes, or None when the daemon does not say."""

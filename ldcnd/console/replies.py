@@ -3,7 +3,7 @@
 from ldcnd.model.commands import ErrorReply, StopReply
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 
 
 class RigReply(Frozen):
@@ -23,7 +23,7 @@ class RigReply(Frozen):
     """In the order of lines and addresses."""
     buses: tuple[BusInfo, ...] = ()
     """Its lines."""
-    plan: RigPlan | None = None
+    plan: RigBudget | None = None
     """What the lines promise."""
     commands: CommandList | None = None
     """What can be asked of it."""

@@ -120,9 +120,9 @@ class Keys:
         return f"{self._root}/meta/commands"
 
     @property
-    def plan(self) -> str:
-        """What the lines promise."""
-        return f"{self._root}/meta/plan"
+    def budget(self) -> str:
+        """What the lines can carry, and what they promise."""
+        return f"{self._root}/meta/budget"
 
     @property
     def configuration(self) -> str:

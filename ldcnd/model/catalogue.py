@@ -9,7 +9,7 @@ from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.rig_commands import LeaseRequest
 from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.model.traces import TraceChunk, TraceHeader
@@ -60,7 +60,7 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
     DaemonInfo,
     ErrorReply,
     MonitorSample,
-    RigPlan,
+    RigBudget,
     StopReply,
     TraceChunk,
     TraceHeader,

@@ -120,7 +120,7 @@ class BusInfo(Frozen):
     command_p99_s: float
     """The same for commands, from queueing."""
     stop_p50_s: float
-    """Half of all stops had their reply within so many seconds; the bound is in `meta/plan`."""
+    """Half of all stops had their reply within so many seconds; the bound is in `meta/budget`."""
     stop_p99_s: float
     """99 % of all stops had their reply within so many seconds."""
     stop_longest_s: float

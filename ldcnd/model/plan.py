@@ -1,4 +1,4 @@
-"""What the lines of a rig promise before anything is opened: served on `meta/plan`."""
+"""What the lines of a rig promise before anything is opened: served on `meta/budget`."""
 
 from typing import Literal
 
@@ -85,8 +85,8 @@ class BusPlan(Frozen):
     """What is asked of it."""
 
 
-class RigPlan(Frozen):
-    """All lines of a rig: `meta/plan`."""
+class RigBudget(Frozen):
+    """All lines of a rig: `meta/budget`."""
 
     rig: str
     """The rig id."""

@@ -18,7 +18,7 @@ from ldcnd.drivers.ldcn.network import RESET_BAUD
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.errors import ConfigError, ValueOutOfRange
-from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigPlan
+from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigBudget
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning import smartstep as smartstep_plan
 from ldcnd.planning.cost import LineTiming, cost_of
@@ -39,13 +39,13 @@ def wanted_rates_hz(rates: RatesConfig, *, adc: bool) -> Mapping[TelemetryItem, 
     return {item: rate for item, rate in wanted.items() if rate > 0}
 
 
-def plan_rig(config: RigConfig) -> RigPlan:
+def plan_rig(config: RigConfig) -> RigBudget:
     """Plan every line."""
     buses = tuple(plan_bus(bus) for bus in config.bus)
-    return RigPlan(rig=config.rig, holds=all(bus.holds for bus in buses), buses=buses)
+    return RigBudget(rig=config.rig, holds=all(bus.holds for bus in buses), buses=buses)
 
 
-def require_plan(config: RigConfig) -> RigPlan:
+def require_plan(config: RigConfig) -> RigBudget:
     """Return the plan of a rig.
 
     Raises:

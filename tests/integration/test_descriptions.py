@@ -9,7 +9,7 @@ from ldcnd.model.commands import Home, Power, SetGains
 from tests.support.rig import RunningRig, running_rig
 
 KEYS = Keys("sim")
-READ_ONLY = (KEYS.axis("x"), KEYS.plan, KEYS.configuration, KEYS.commands, KEYS.daemon, KEYS.schema("axis_info"))
+READ_ONLY = (KEYS.axis("x"), KEYS.budget, KEYS.configuration, KEYS.commands, KEYS.daemon, KEYS.schema("axis_info"))
 
 
 async def payload(rig: RunningRig, key: str) -> bytes:

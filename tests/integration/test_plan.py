@@ -16,9 +16,9 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import ConfigError
-from ldcnd.messaging.codec import decode
+from ldcnd.messaging.codec import decode, decode_error
 from ldcnd.model.health import BusHealth
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.planning.plan import plan_rig, require_plan
 from tests.bench.virtual_time import smartsteps_busy
 from tests.support.rig import SIMULATED, running_rig
@@ -250,9 +250,11 @@ async def test_the_load_on_average_is_what_the_wire_shows():
 
 async def test_the_plan_is_served():
     async with running_rig() as rig:
-        (answer,) = await rig.session.query("ldcn/sim/meta/plan")
+        (former,) = await rig.session.query("ldcn/sim/meta/plan")
+        assert "meta/budget" in decode_error(former.payload, former.encoding).message
+        (answer,) = await rig.session.query("ldcn/sim/meta/budget")
 
-        assert decode(RigPlan, answer.payload, answer.encoding) == plan_rig(load_config(SIMULATED))
+        assert decode(RigBudget, answer.payload, answer.encoding) == plan_rig(load_config(SIMULATED))
 
 
 def test_the_command_prints_a_table_and_json_and_exits_with_1_when_overfull(tmp_path):
@@ -267,7 +269,7 @@ def test_the_command_prints_a_table_and_json_and_exits_with_1_when_overfull(tmp_
 
     assert table.exit_code == 0
     assert "holds" in table.output
-    assert RigPlan.model_validate(json.loads(plan.output)).holds
+    assert RigBudget.model_validate(json.loads(plan.output)).holds
     assert refused.exit_code == 1
     assert "CANNOT HOLD" in refused.output
     assert checked.exit_code == 78

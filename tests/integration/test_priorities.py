@@ -14,7 +14,7 @@ from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.codec import decode
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.traces import TakeTrace
 from ldcnd.planning.plan import plan_rig
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
@@ -154,10 +154,10 @@ async def test_a_reload_changes_priorities():
 async def test_priorities_are_described_and_planned():
     async with running_rig(ranked_config({"high": Asked(1, 10.0), "normal": Asked(1, 10.0)})) as rig:
         (axis,) = await rig.session.query("ldcn/sim/meta/axes/high1")
-        (plan,) = await rig.session.query("ldcn/sim/meta/plan")
+        (plan,) = await rig.session.query("ldcn/sim/meta/budget")
 
     assert decode(AxisInfo, axis.payload, axis.encoding).priority == "high"
-    (bus,) = decode(RigPlan, plan.payload, plan.encoding).buses
+    (bus,) = decode(RigBudget, plan.payload, plan.encoding).buses
     assert [poll.priority for poll in bus.polls] == ["high", "normal"]
 
 

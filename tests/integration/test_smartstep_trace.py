@@ -11,7 +11,7 @@ from ldcnd.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange,
 from ldcnd.messaging.codec import decode
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.parameters import WriteParameter
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
 from ldcnd.sim.smartstep.variant import SimulatedVariant
@@ -227,8 +227,8 @@ async def test_stop_on_another_bus_is_not_delayed_by_an_upload():
 
     async with trace_rig() as under_test:
         rig = under_test.rig
-        (answer,) = await rig.session.query(Keys("mixed").plan)
-        plan = decode(RigPlan, answer.payload, answer.encoding)
+        (answer,) = await rig.session.query(Keys("mixed").budget)
+        plan = decode(RigBudget, answer.payload, answer.encoding)
         (bound_s,) = [bus.stop_s for bus in plan.buses if bus.bus == "line0"]
         await arm_trace(rig.client, "feed", TakeTrace(channels=CHANNELS))
         await asyncio.sleep(0.6)

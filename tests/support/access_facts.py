@@ -124,7 +124,7 @@ class AccessFacts:
     def test_forged_daemon_token_is_seen_by_nobody(self, rig: SecuredRig, login: str) -> None:
         with rig.login(login) as forger, rig.login("operator") as operator:
             with forger.liveliness().declare_token("ldcn/sim/alive/rival"):
-                answers(forger, "ldcn/sim/meta/plan")
+                answers(forger, "ldcn/sim/meta/budget")
                 tokens = alive(operator)
                 answers(operator, "ldcn/sim/@cmd/x/reset", {})
                 # with a rival the daemon would move nothing
@@ -136,7 +136,7 @@ class AccessFacts:
     def test_client_token_is_not_shown_to_other_clients(self, rig: SecuredRig) -> None:
         with rig.login("operator") as operator, rig.login("viewer") as viewer:
             with operator.liveliness().declare_token("ldcn/sim/client/ada"):
-                answers(operator, "ldcn/sim/meta/plan")
+                answers(operator, "ldcn/sim/meta/budget")
                 seen = [str(reply.ok.key_expr) for reply in viewer.liveliness().get("ldcn/sim/client/*") if reply.ok]
 
         assert seen == []

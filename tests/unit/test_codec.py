@@ -27,7 +27,7 @@ from ldcnd.messaging.codec import (
 from ldcnd.model.catalogue import AXIS_COMMANDS
 from ldcnd.model.commands import ErrorReply, Home, MoveAbsolute, Power, Reset
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import (
     AxisState,
     CurrentCommand,
@@ -178,9 +178,9 @@ def test_an_answer_may_be_longer_than_any_request() -> None:
     """The plan of two full lines is."""
     answer = b'{"rig":"sim","holds":true,"buses":[]}'
 
-    assert decode_received(RigPlan, answer.ljust(MAX_RECEIVED_BYTES), "application/json").holds
+    assert decode_received(RigBudget, answer.ljust(MAX_RECEIVED_BYTES), "application/json").holds
     with pytest.raises(PayloadTooLarge):
-        decode_received(RigPlan, answer.ljust(MAX_RECEIVED_BYTES + 1), "application/json")
+        decode_received(RigBudget, answer.ljust(MAX_RECEIVED_BYTES + 1), "application/json")
 
 
 @given(

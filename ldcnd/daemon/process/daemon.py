@@ -20,7 +20,7 @@ from ldcnd.log import get_logger
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Declaration, Load, Session
 from ldcnd.model.meta import DaemonInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import LinkState
 from ldcnd.planning.plan import plan_rig
 from ldcnd.version import version
@@ -92,7 +92,7 @@ class Daemon:
         """
         return capture_of(snapshot_of(self.rig.line(bus), self._run.clock), self._config, self._run, cause)
 
-    def reconfigure(self, config: RigConfig, plan: RigPlan) -> None:
+    def reconfigure(self, config: RigConfig, plan: RigBudget) -> None:
         """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`.
 
         Args:
@@ -243,5 +243,5 @@ def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:
     return CaptureWatch(daemon.rig, lambda: daemon.config, run, store)
 
 
-def _stop_bounds_s(plan: RigPlan) -> dict[str, float]:
+def _stop_bounds_s(plan: RigBudget) -> dict[str, float]:
     return {bus.bus: bus.stop_wait_s for bus in plan.buses if bus.family == "ldcn"}

@@ -22,7 +22,7 @@ from ldcnd.daemon.process.reload import Reload, plan_reload
 from ldcnd.daemon.process.systemd import Notifier
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import LinkState
 from ldcnd.planning.plan import require_plan
 
@@ -259,7 +259,7 @@ class Service:
         log.warning("changes need a restart", keys=reload.refused)
         return f"restart needed for {', '.join(reload.refused)}"
 
-    def _prepare(self, running: RigConfig) -> tuple[Reload, RigPlan]:
+    def _prepare(self, running: RigConfig) -> tuple[Reload, RigBudget]:
         """Read and judge the file, beside the loop: lines go on meanwhile."""
         reload = plan_reload(running, self._load())
         return reload, require_plan(reload.config)

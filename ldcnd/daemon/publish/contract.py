@@ -18,7 +18,7 @@ from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen, schema_name, schema_text
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.model.traces import TraceChunk, TraceHeader
 
@@ -94,7 +94,7 @@ def _descriptions() -> Iterator[Channel]:
     for key, model in (
         (_KEYS.daemon, DaemonInfo),
         (_KEYS.commands, CommandList),
-        (_KEYS.plan, RigPlan),
+        (_KEYS.budget, RigBudget),
         (_KEYS.configuration, RigConfig),
         (_KEYS.axis(_AXIS), AxisInfo),
         (_KEYS.bus(_BUS), BusInfo),

@@ -12,7 +12,7 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.contract import all_schemas
 from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.errors import ErrorCode
+from ldcnd.errors import ErrorCode, MalformedRequest
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
 from ldcnd.messaging.session import Query
@@ -21,7 +21,7 @@ from ldcnd.model.commands import About, Verb
 from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo, RegisterInfo
-from ldcnd.model.plan import RigPlan
+from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import Sample, TelemetryItem
 
 WORK_PER_STEP = 16
@@ -75,19 +75,20 @@ class Describing:
         publisher: Publisher,
         daemon: Callable[[], DaemonInfo],
         configuration: Callable[[], Frozen],
-        plan: RigPlan,
+        plan: RigBudget,
         health: HealthWatch,
         clock: Clock,
     ) -> None:
         self._publisher = publisher
         self._clock = clock
         self.plan = plan
+        self._former_budget = keys.budget.removesuffix("budget") + "plan"
         self._health = health
         self._latest: dict[tuple[str, Encoding], tuple[Frozen, bytes, str]] = {}
         self._described: dict[str, _Encoded] = {
             keys.daemon: _Encoded(configuration, daemon),
             keys.commands: _Encoded(lambda: None, command_list),
-            keys.plan: _Encoded(lambda: self.plan, lambda: self.plan),
+            keys.budget: _Encoded(lambda: self.plan, lambda: self.plan),
             keys.configuration: _Encoded(configuration, configuration),
         }
         for bus in rig.buses:
@@ -106,6 +107,9 @@ class Describing:
 
     def on_meta(self, query: Query) -> Iterator[None]:
         """Answer with every description that the query covers."""
+        if query.key == self._former_budget:
+            query.refuse(MalformedRequest("`meta/plan` is called `meta/budget` now", remedy="ask for meta/budget"))
+            return iter(())
         return _in_steps(query, self._descriptions(query))
 
     def _descriptions(self, query: Query) -> Iterator[_Part]:
