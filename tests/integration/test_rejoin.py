@@ -8,7 +8,7 @@ import pytest
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
@@ -97,6 +97,7 @@ async def test_the_axis_works_again_once_it_is_powered():
         set_power(chain, 2, on=True)
         await rig.until("y", lambda state: state.link is LinkState.UP)
 
+        await rig.until("y", lambda state: state.moving is Moving.NO)  # until then it may coast, and is stopped
         await rig.client.command("y", Power(on=True))
         state = await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
 

@@ -19,7 +19,7 @@ NAMED = sorted(set(re.findall(r"`(test_\w+)`", PAGE)))
 
 
 def defined_tests() -> set[str]:
-    sources = [*ROOT.glob("tests/*/test_ldcn_*.py"), *ROOT.glob("tests/integration/test_*.py")]
+    sources = [*ROOT.glob("tests/*/test_*.py")]
     return {
         name for path in sources for name in re.findall(r"^(?:async )?def (test_\w+)", path.read_text(), re.MULTILINE)
     }
@@ -69,5 +69,5 @@ def test_page_lists_the_dialect(profile):
 def test_every_row_of_every_table_names_its_test():
     entries = [row for row in ROWS if row[-1] != "test" and set(row[0]) != {"-"}]
 
-    assert [row for row in entries if not re.fullmatch(r"`test_\w+`", row[-1])] == []
+    assert [row for row in entries if not re.fullmatch(r"`test_\w+`(, `test_\w+`)*", row[-1])] == []
     assert len(entries) > 90

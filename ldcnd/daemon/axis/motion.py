@@ -81,6 +81,7 @@ class MotionPlanner:
                 axis=view.name,
                 value=position,
                 limit=LARGEST_COUNT,
+                remedy="move the other way, or switch the drive off and on, which sets its counter to 0, and home",
             )
         counts_per_unit = self._scale.counts_per_unit
         motion = self._driver.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
