@@ -1,3 +1,8 @@
+import contextlib
+import resource
+from collections.abc import Iterator
+
+import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.daemon.capture.captures import CaptureStore
@@ -62,3 +67,27 @@ def test_the_log_says_where_the_file_is(tmp_path):
         path = CaptureStore(tmp_path, 3, 10**6).write(capture(1))
 
     assert [(line["event"], line["file"]) for line in told] == [("capture written", str(path))]
+
+
+@contextlib.contextmanager
+def files_end_at(size: int) -> Iterator[None]:
+    """Let no file grow beyond a size, as on a disk that is nearly full: what fits is written, then nothing."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
+def test_a_disk_that_fills_up_meanwhile_leaves_no_part_of_a_capture(tmp_path, share):
+    whole = CaptureStore(tmp_path / "whole", 3, 10**6).write(capture(1))
+    store = CaptureStore(tmp_path / "full", 3, 10**6)
+
+    with capture_logs() as told, files_end_at(int(share * whole.stat().st_size)):
+        written = store.write(capture(1))
+
+    assert written is None
+    assert [line["event"] for line in told] == ["capture not written"]
+    assert list((tmp_path / "full").iterdir()) == []

@@ -4,6 +4,7 @@ Writing one never runs on the event loop. The text is written in small pieces: b
 have the interpreter, so a bus waits for less than a millisecond.
 """
 
+import contextlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -52,15 +53,20 @@ class CaptureStore:
         part = path.with_suffix(".part")
         try:
             self._directory.mkdir(parents=True, exist_ok=True)
+            size = 0
             with part.open("wb", buffering=0) as file:
                 for piece in _pieces(capture_lines(header, capture.records, _without_words)):
-                    file.write(piece)  # lets go of the interpreter
+                    rest = piece
+                    while rest:  # a disk that is nearly full takes a part, and says nothing
+                        rest = rest[file.write(rest) :]  # lets go of the interpreter
+                    size += len(piece)
             part.replace(path)
             self._thin_out(path)
         except OSError as error:
             log.error("capture not written", bus=header.bus, cause=header.cause, file=str(path), reason=str(error))
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)  # the disk needs the room
             return None
-        size = path.stat().st_size
         log.warning("capture written", bus=header.bus, cause=header.cause, file=str(path), size_bytes=size)
         return path
 
