@@ -61,7 +61,14 @@ class Workers:
             else:
                 self._backlog += 1
         if ended:
-            threading.Thread(target=self._work, args=(ended,), name=self._name, daemon=True).start()
+            try:
+                threading.Thread(target=self._work, args=(ended,), name=self._name, daemon=True).start()
+            except (
+                RuntimeError
+            ):  # no memory for one more: another one takes the job, or the next that starts
+                with self._lock:
+                    self._ended.remove(ended)
+                    self._backlog += 1
 
     async def run(self, work: Callable[[], ResultT], timeout_s: float, undo: Callable[[ResultT], None]) -> ResultT:
         """Have work done and return its result.

@@ -95,3 +95,22 @@ async def test_stopping_does_not_wait_for_a_stuck_worker() -> None:
 
     assert not in_time
     assert await workers.stop(2)
+
+
+async def test_a_job_that_finds_no_memory_for_a_thread_is_done_by_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    workers, done = Workers("test", 2), []
+    start = threading.Thread.start
+    refused = ["the first"]
+
+    def scarce(thread: threading.Thread) -> None:
+        if refused:
+            raise RuntimeError(f"can't start {refused.pop()} thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", scarce)
+
+    workers.submit(lambda: done.append(1))
+    workers.submit(lambda: done.append(2))
+
+    assert await workers.stop(2)
+    assert done == [1, 2]
