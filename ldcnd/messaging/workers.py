@@ -63,9 +63,7 @@ class Workers:
         if ended:
             try:
                 threading.Thread(target=self._work, args=(ended,), name=self._name, daemon=True).start()
-            except (
-                RuntimeError
-            ):  # no memory for one more: another one takes the job, or the next that starts
+            except RuntimeError:  # no memory for one more: another one takes the job, or the next that starts
                 with self._lock:
                     self._ended.remove(ended)
                     self._backlog += 1
