@@ -175,8 +175,8 @@ async def test_what_the_pages_compute_is_what_one_computes_by_hand(house, tmp_pa
             move | {"profileS": 0.02},
         )
         text = await desk.page.evaluate(
-            "(values) => import('/static/session/parameter_file.js').then(({ asToml }) => asToml('feed', values))",
-            values,
+            "(dump) => import('/static/session/parameter_file.js').then(({ asToml }) => asToml('feed', dump))",
+            {"values": values, "facts": None},
         )
         read = await desk.page.evaluate(
             "(text) => import('/static/session/parameter_file.js').then(({ fromToml }) => [...fromToml(text)])", text
