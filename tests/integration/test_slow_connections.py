@@ -21,6 +21,8 @@ from tests.support.process import free_port
 pytestmark = [pytest.mark.real_time, pytest.mark.timeout(120)]
 
 HALF = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
+ALLOWANCE_S = 10.0
+"""A busy machine may take so much longer."""
 DESCRIPTORS = 200
 """Of the console in the test; a service has 1024, which takes more connections and no more skill."""
 
@@ -125,3 +127,24 @@ async def test_the_console_gives_up_a_request_that_trickles(monkeypatch):
             protocol.data_received(bytes([byte]))
             await asyncio.sleep(0.02)
     protocol.connection_lost(None)
+
+
+async def test_a_page_whose_browser_does_not_answer_is_gone_after_five_seconds():
+    async with console("-e", f"tcp/127.0.0.1:{free_port()}") as running:
+        browser = await running.stranger.enter(running.link)
+        port = int(re.search(r":(\d+)/", running.link)[1])
+        usual = {"origin": browser.origin, "upgrade": "websocket", "connection": "Upgrade"}
+        usual |= {"sec-websocket-key": "AAAAAAAAAAAAAAAAAAAAAA==", "sec-websocket-version": "13"}
+        lines = [f"{name}: {text}" for name, text in browser.headers(usual).items()]
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write("\r\n".join(["GET /api/page HTTP/1.1", *lines, "", ""]).encode())
+        loop = asyncio.get_running_loop()
+        assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 101")
+        opened_at_s = loop.time()
+        async with asyncio.timeout(60):
+            while await reader.read(4096):  # greeting and pings; no pong is ever sent
+                pass
+        lasted_s = loop.time() - opened_at_s
+        writer.close()
+
+    assert 4 < lasted_s < 5 + ALLOWANCE_S
