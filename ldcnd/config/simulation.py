@@ -192,6 +192,8 @@ class SimulatedModuleConfig(Frozen):
     """Where the manuals allow variants."""
     conditions: tuple[Condition, ...] = ()
     """What is wrong around the drive from the beginning."""
+    start_up: Byte | None = None
+    """The byte of Hard Reset with which a PIC-SERVO SC was configured earlier; left out, its EEPROM is erased."""
     io: IoConfig | None = None
     """What is connected to a PIC-I/O."""
 
@@ -214,6 +216,8 @@ class SimulatedModuleConfig(Frozen):
             known = identify(profile.device_id, version)
             other = f"that is a {known.name}" if known else "no such device is known"
             raise ValueError(f"behaviour.version: a {self.model} has no version {version}; {other}")
+        if self.start_up is not None and not profile.sc_extensions:
+            raise ValueError(f"start_up: a {self.model} has no EEPROM")
         if self.io is not None and not self.has_terminals:
             raise ValueError(f"io: a {self.model} has no terminals")
         return self
@@ -233,7 +237,14 @@ class SimulatedModuleConfig(Frozen):
 
         plant = replace(travel, **self.plant.model_dump(exclude_none=True))
         wiring = self.io.wiring() if self.io else IoWiring()
-        return ModuleSpec(self.model, plant, adjust=adjust, conditions=frozenset(self.conditions), wiring=wiring)
+        return ModuleSpec(
+            self.model,
+            plant,
+            adjust=adjust,
+            conditions=frozenset(self.conditions),
+            wiring=wiring,
+            start_up=self.start_up,
+        )
 
 
 class SimulatedEventConfig(Frozen):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from ldcnd.config.simulation import SimulatedChainConfig
 from ldcnd.drivers.ldcn.controls import IoOption, StartUp, StopControl
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S
@@ -483,3 +484,19 @@ def test_whether_deadband_compensation_applies_at_zero_is_a_switch(added):
     axis.stop(ON | StopControl.HERE, *little(axis.status().position, 4))
 
     assert abs(axis.pwm()) == (5 if added else 0)
+
+
+def test_a_module_may_come_with_a_start_up_that_energises_it_when_it_is_addressed():
+    config = SimulatedChainConfig.model_validate({"module": [{"model": "pic-servo-sc", "start_up": 0x0D}]})
+    host = SimulatedHost(build_chain(config.spec()))
+    drive = host.chain.modules[0]
+    before = drive.loop.servo_on
+
+    host.address_all()
+
+    assert (before, drive.stage.enabled, drive.loop.servo_on) == (False, True, True)
+
+
+def test_only_sc_has_an_eeprom():
+    with pytest.raises(ValueError, match="start_up: a ls-182ap has no EEPROM"):
+        SimulatedChainConfig.model_validate({"module": [{"model": "ls-182ap", "start_up": 1}]})

@@ -98,6 +98,7 @@ class ModuleSpec:
         adjust: changes single settings and leaves the others as they are.
         conditions: what is wrong around the drive from the beginning; empty for modules without a motor.
         wiring: what is connected to a PIC-I/O; others ignore it.
+        start_up: the byte of Hard Reset with which a PIC-SERVO SC was configured earlier; None for an erased EEPROM.
     """
 
     name: str
@@ -106,6 +107,7 @@ class ModuleSpec:
     adjust: Callable[[ModuleSettings], ModuleSettings] = _unchanged
     conditions: frozenset[Condition] = frozenset()
     wiring: IoWiring = field(default_factory=IoWiring)
+    start_up: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,5 +207,8 @@ def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
         drive = SimulatedDrive(profile, settings, spec.plant)
         for condition in spec.conditions:
             drive.set_condition(condition, present=True, at_s=0.0)
+        if spec.start_up is not None and profile.sc_extensions:
+            drive.save(spec.start_up)
+            drive.restore()
         return drive
     return SimulatedIo(profile, settings, spec.wiring) if profile is PIC_IO else SimulatedOther(profile, settings)
