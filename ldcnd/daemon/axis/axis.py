@@ -416,7 +416,7 @@ class AxisService:
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever is known of the axis."""
-        if self._pending is None:
+        if self._unconfirmed() is None:
             return
         try:
             if not self._seen:  # a stop would close the loop of a disabled axis: see how the drive was left
@@ -424,13 +424,20 @@ class AxisService:
                 reading = await self._read()
                 now_s = self._clock.now_s()
                 self.observed(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
-        except BusError as error:
+        except LdcndError as error:  # a stop that comes now withdraws the reading, and is sent itself
             log.warning("stop not sent again", axis=self.config.name, reason=error.message)
             return
-        if await self._confirmed_stop(self._pending, Verb.STOP, rounds=1):
+        mode = self._unconfirmed()
+        if mode is None:
+            return  # such a stop was confirmed while the axis was read
+        if await self._confirmed_stop(mode, Verb.STOP, rounds=1):
             log.warning("stop confirmed late", axis=self.config.name)
             self._note(self.config.name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")
         self.telemetry.state(self._clock.now_ns())
+
+    def _unconfirmed(self) -> StopMode | None:
+        """Return how it was told to stop, while no drive has confirmed that."""
+        return self._pending
 
     def cannot_move(self) -> None:
         """Its drive was reset or had no power: what it was told to stop has ended."""
