@@ -30,7 +30,7 @@ READ_BYTES = 4096
 
 
 class LineObserver(Protocol):
-    """Told what passes through the terminal; instants are seconds since it was opened."""
+    """Gets what passes through the terminal; instants are seconds since it was opened."""
 
     def sent(self, at_s: float, data: bytes, baud: int | None) -> None:
         """Take bytes that the host wrote, and its rate, as far as the line knows it."""
@@ -60,7 +60,7 @@ class PtyLine:
             chain: whose clock starts at 0 now; built with the same `baud_check`.
             link: symbolic link to make to the terminal; one that is there already is replaced.
             baud_check: tell the chain the rate to which the host sets the terminal.
-            observer: told what passes.
+            observer: gets all bytes that pass.
 
         Raises:
             OSError: there is no terminal left, or the link cannot be made.
@@ -123,7 +123,7 @@ class PtyLine:
     def _deliver(self) -> None:
         due = b"".join(data for _, data in self._chain.advance(self._now_s()))
         if due:
-            with suppress(BlockingIOError):  # nobody reads: a real line does not wait either
+            with suppress(BlockingIOError):  # the host does not read: a real line does not wait either
                 os.write(self._master, due)
             if self._observer:
                 self._observer.received(self._now_s(), due)
@@ -155,8 +155,8 @@ def serve_pty(
         baud_check: frames at another rate than a module's are garbage to it.
         stop: asked at least every 50 ms whether to end. Without it SIGTERM and SIGINT end it; then only the main
             thread may call.
-        opened: told the terminal's path once it can be used.
-        observer: told what passes.
+        opened: called with the terminal's path once it can be used.
+        observer: gets all bytes that pass.
 
     Raises:
         OSError: there is no terminal left, or the link cannot be made.

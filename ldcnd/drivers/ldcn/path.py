@@ -44,7 +44,7 @@ def encode_point(point: PathPoint, *, fast_path: bool) -> int:
 
     Args:
         point: to encode.
-        fast_path: as the module was told by I/O Control.
+        fast_path: the option as last set by I/O Control.
 
     Raises:
         ValueOutOfRange: the step does not fit its period, or the period is none of the two.

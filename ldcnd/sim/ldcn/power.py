@@ -22,7 +22,7 @@ class Condition(StrEnum):
     MOTOR_POWER_OFF = "motor_power_off"
     """PIC-SERVO; a Logosol drive without its supply is silent altogether."""
     ENCODER_STUCK = "encoder_stuck"
-    """The counter stands still and nobody notices."""
+    """The counter stands still, and the drive does not notice."""
     SENSOR_LOST = "sensor_lost"
     """The potentiometer is disconnected: the A/D converter reads 0."""
     STALLED = "stalled"

@@ -12,7 +12,7 @@ class CommandBuffer(StrEnum):
     """What becomes of a command that waits for the end of the servo cycle when another packet begins."""
 
     OVERWRITTEN = "overwritten"
-    """It is lost with the other packet's address byte, whoever that is for (PIC-SERVO manual, 4.1)."""
+    """It is lost with the other packet's address byte, for this module or another (PIC-SERVO manual, 4.1)."""
     KEPT = "kept"
     """Only a whole packet for the same module replaces it."""
 
