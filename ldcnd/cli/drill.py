@@ -1,4 +1,4 @@
-"""`ldcnd drill`: rehearse what happens when somebody disappears, and measure it. Moves the axis that is named."""
+"""`ldcnd drill`: rehearse a loss and measure it. Moves the axis that is named."""
 
 import asyncio
 import json
@@ -16,7 +16,7 @@ from ldcnd.model.rig_commands import Acquire, Rehearse
 from ldcnd.model.samples import AxisState, StateSample, TelemetryItem
 
 RUN_UP_S = 0.5
-"""The axis moves for so long before somebody disappears."""
+"""Time in motion before the loss, seconds."""
 PATIENCE_S = 30.0
 
 
@@ -41,7 +41,7 @@ def _moving(work: Callable[..., None]) -> Callable[..., None]:
 @click.option("--lease", "lease_s", type=Finite(), default=1.0, show_default=True, help="Length of the lease, seconds.")
 @with_target
 def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> None:
-    """Take control, jog, and disappear: how long until the axis reacts, and until it stands?"""
+    """Take control, jog, and disappear: how long until the axis reacts, and until it is at rest?"""
 
     async def work(client: RigClient) -> dict[str, float]:
         request = Acquire(client="drill", axes=(axis,), lease_s=lease_s)

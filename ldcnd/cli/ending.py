@@ -1,4 +1,4 @@
-"""Being told to end: by Ctrl-C, by whoever manages services, by the terminal that goes."""
+"""Being told to end: by Ctrl-C, by the service manager, by the end of the terminal."""
 
 import asyncio
 import os

@@ -18,7 +18,7 @@ DEFAULT_ADDRESS = "127.0.0.1:8765"
 @address_option("--address", DEFAULT_ADDRESS)
 @with_target
 def command(target: Target, address: ListenAddress) -> None:
-    """Show a rig in Foxglove until SIGTERM or SIGINT; read-only, and open to whoever reaches the address."""
+    """Show a rig in Foxglove until SIGTERM or SIGINT; read-only, and open to everyone who can reach the address."""
     target.run(lambda client: _serve(client, address))
 
 

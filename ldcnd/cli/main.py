@@ -25,7 +25,7 @@ COMMANDS = {
     "fleet": ("ldcnd.cli.fleet", "Show every rig, axis, version and health that can be reached."),
     "fault": ("ldcnd.cli.fault", "Explain a fault or an error code: what to check, how to clear it."),
     "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
-    "drill": ("ldcnd.cli.drill", "Rehearse what happens when somebody disappears."),
+    "drill": ("ldcnd.cli.drill", "Rehearse the loss of a client, a line or the daemon."),
     "bus": ("ldcnd.cli.bus", "Look at the lines of a running daemon."),
     "console": ("ldcnd.cli.console", "Show rigs in a browser."),
     "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),

@@ -18,7 +18,7 @@ DEFAULT_ADDRESS = "127.0.0.1:9464"
 @address_option("--address", DEFAULT_ADDRESS)
 @with_target
 def command(target: Target, address: ListenAddress) -> None:
-    """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for whoever reads them."""
+    """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for a scraper."""
     target.run(lambda client: _serve(client, address))
 
 

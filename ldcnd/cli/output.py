@@ -26,7 +26,7 @@ def show_lines(*lines: str, err: bool = False) -> None:
 
 
 def exit_code(error: BaseException) -> int:
-    """Say how a command has ended; return its exit code. An error that nobody foresaw is raised again."""
+    """Say how a command has ended; return its exit code. An unexpected error is raised again."""
     match error:
         case BaseExceptionGroup():
             return exit_code(_single(error))

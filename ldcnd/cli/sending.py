@@ -122,7 +122,7 @@ async def halting(client: RigClient, info: AxisInfo, *, leave_running: bool = Fa
 
 
 async def halted(client: RigClient, info: AxisInfo) -> str:
-    """Halt an axis and wait until it stands; return in words how that went."""
+    """Halt an axis and wait until it is at rest; return the outcome in words."""
     try:
         async with asyncio.timeout(HALT_TIME_S):
             reply = await client.command(info.axis, Halt(client=NAME), HALT_TIME_S)

@@ -132,7 +132,7 @@ def take(
 @out_option
 @with_target
 def last(target: Target, axis: str, out: Path | None) -> None:
-    """Fetch the last trace of AXIS, whoever took it."""
+    """Fetch the last trace of AXIS, of any client."""
     _deliver(target, target.run(lambda client: fetch_trace(client, axis)), out)
 
 

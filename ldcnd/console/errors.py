@@ -46,6 +46,6 @@ def answering_errors(answer: Answer) -> Answer:
         except LdcndError as error:
             return error_response(error)
         except ClientDisconnect:
-            return Response(status_code=400)  # nobody reads it
+            return Response(status_code=400)  # the browser has gone: this answer has no reader
 
     return answered

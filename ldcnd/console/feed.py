@@ -1,4 +1,4 @@
-"""Telemetry on its way to pages: those that ask for the same share a channel, and nobody waits for a slow one."""
+"""Telemetry on its way to pages: those that ask for the same share a channel, and a slow one delays no other."""
 
 import asyncio
 from collections import deque

@@ -39,8 +39,8 @@ STRANGER_PAGE = """<!doctype html>
 <link rel="stylesheet" href="/static/style/base.css"></head>
 <body><main><h1>This browser is not let in yet</h1>
 <p>Open the console with the link that <code>ldcnd console</code> prints when it starts. A link works once, within ten
-minutes. For another one, ask somebody whose console is open, or send the console's process the signal USR1: it then
-prints one.</p>
+minutes. For another one, press <i>Let another browser in</i> on a page that is open, or send the console's process the
+signal USR1: it then prints one.</p>
 <p>If you came here by a link just now, <a href="/">try once more</a>.</p></main></body></html>
 """
 

@@ -326,7 +326,7 @@ def _page_gone() -> LeaseExpired:
 
 
 async def _give_up(hold: _Hold, client: str) -> None:
-    """Halt an axis that may move, and release it when it stands.
+    """Halt an axis that may move, and release it when it is at rest.
 
     One that does not come to rest is not released: its lease ends unrenewed, and the daemon does what it is configured
     to do then.
@@ -346,20 +346,20 @@ async def _bring_to_rest(hold: _Hold, client: str) -> None:
     """Halt, and once more whenever a command was answered meanwhile: a move may have waited for the end of this one."""
     while True:
         in_flight = hold.sending
-        if not hold.moved and await _stands(hold):
+        if not hold.moved and await _at_rest(hold):
             return
         try:
             await hold.client.command(hold.axis, Halt(client=client), HALT_TIME_S)
         except NotSupported:
             return  # no command of ours moves it
-        stands = False
-        while hold.sending == in_flight and not (stands and not in_flight):
+        at_rest = False
+        while hold.sending == in_flight and not (at_rest and not in_flight):
             await asyncio.sleep(LOOK_EACH_S)
-            stands = await _stands(hold)
-        if stands and not hold.sending:
+            at_rest = await _at_rest(hold)
+        if at_rest and not hold.sending:
             return
 
 
-async def _stands(hold: _Hold) -> bool:
+async def _at_rest(hold: _Hold) -> bool:
     state = await hold.client.state(hold.axis)
     return state is not None and state.moving is Moving.NO

@@ -35,7 +35,7 @@ class RigWatch:
         self._instances: set[str] = set()
         self._stirred = asyncio.Event()
         self._reply = RigReply(
-            name=client.rig, endpoint=endpoint, connected=False, problem="its daemon was not there yet"
+            name=client.rig, endpoint=endpoint, connected=False, problem="its daemon has not been seen yet"
         )
         self._told: Mapping[str, bool | str | None] = {}
         self._described_at_s = -DESCRIPTION_AGE_S
@@ -86,7 +86,7 @@ class RigWatch:
         while True:
             self._stirred.clear()
             if not self._instances:
-                self._show(problem="its daemon is not there; the values are the last ones")
+                self._show(problem="daemon offline, last known values")
                 await self._stirred.wait()
             elif await self._learn():
                 await self._stirred.wait()

@@ -36,7 +36,7 @@ class Endpoint:
 
 
 class Rigs:
-    """The rigs by name. A name belongs to the endpoint that showed it first: nobody's commands reach a namesake.
+    """The rigs by name. A name belongs to the endpoint that showed it first: no command reaches a namesake.
 
     Args:
         values: takes what they publish.

@@ -1,4 +1,4 @@
-"""How the console is served, and what it refuses: nobody off this machine gets in without TLS and a token."""
+"""How the console is served, and what it refuses: from other machines it takes TLS and a token."""
 
 import stat
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class ConsoleSettings:
         hosts: names under which browsers reach it, beside the address.
         certificate: PEM file with the chain; None serves plain HTTP.
         key: PEM file with its key.
-        token: lets in whoever has it; None hands out links that work once.
+        token: lets every browser in that has it; None hands out links that work once.
         as_json: print the link as a line of JSON.
     """
 

@@ -46,7 +46,7 @@ class Visitors:
 
     Args:
         now_s: a clock.
-        standing_token: lets in whoever has it, any number of times; None is the rule on one's own machine.
+        standing_token: lets in every browser that has it, any number of times; None is the rule on one's own machine.
     """
 
     def __init__(self, now_s: Callable[[], float], standing_token: str | None = None) -> None:

@@ -24,7 +24,7 @@ class HealthCollector(Collector):
 
     Args:
         rig: label of every metric.
-        now_s: a clock, in seconds; also called by whoever collects.
+        now_s: a clock, in seconds; also called from the thread that collects.
     """
 
     def __init__(self, rig: str, now_s: Callable[[], float]) -> None:

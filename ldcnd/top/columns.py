@@ -6,7 +6,7 @@ from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 UNKNOWN = "-"
 MARKS = {Severity.FINE: " ", Severity.NOTICE: "!", Severity.WRONG: "X"}
-"""A mark beside the colour: nobody has to tell colours apart."""
+"""A mark beside the colour, readable without telling colours apart."""
 
 AXIS_TITLES = ("", "bus", "axis", "state", "position", "velocity", "target", "A/D", "age", "rate", "control", "trouble")
 NARROW = (0, 2, 3, 4, 10, 11)

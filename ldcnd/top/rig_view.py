@@ -1,6 +1,6 @@
 """The latest of everything that a rig publishes, and what it comes to at a glance; knows no terminal and no clock.
 
-Samples are kept as they come and decoded when somebody looks: a rig publishes many more than anybody can read.
+Samples are kept as they come and decoded when they are shown: a rig publishes many more than are read.
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ class Description:
     Attributes:
         daemon: itself.
         axes: in the order in which they are shown.
-        holders: who controls which axis; an axis that nobody controls is missing.
+        holders: who controls which axis; an axis that is not controlled is missing.
     """
 
     daemon: DaemonInfo

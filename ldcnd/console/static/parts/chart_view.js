@@ -10,7 +10,7 @@ const STEPS = 1000;
 const DIGITS = 4;
 const COUNTED_MS = 1_000;
 
-/** Show `curves`; with `live` the span follows `live.now()` until somebody looks closer.
+/** Show `curves`; with `live` the span follows `live.now()` until the operator zooms.
 
  * `live` is `{now, windowS, paused, onPause}`. `name` is what exported files are called, `csv` returns their text.
  */

@@ -88,7 +88,7 @@ export async function readSignals(axis) {
   return { at: one.header.t, values };
 }
 
-/** Fetch the last complete trace of an axis, whoever took it. */
+/** Fetch the last complete trace of an axis, of any client. */
 export async function fetchLast(axis) {
   return new Capture(axis, await read(`${axisPath(axis.rig.name, axis.name)}/trace`));
 }

@@ -196,7 +196,7 @@ const watchers = new Set();
 let drawnAtMs = 0;
 let due = 0;
 
-/** Redraw whoever shows rigs, at most ten times a second. */
+/** Redraw what shows rigs, at most ten times a second. */
 export function changed() {
   if (due) return;
   const waitMs = Math.max(0, drawnAtMs + DRAWN_EACH_MS - performance.now());

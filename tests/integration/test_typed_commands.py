@@ -1,0 +1,67 @@
+"""Every verb of an axis and of the rig, typed: what it prints, in which units, and how it ends."""
+
+import pytest
+
+from tests.support.command_line import run_all
+from tests.support.process import ROOT, client, daemon
+
+pytestmark = [pytest.mark.real_time, pytest.mark.timeout(200)]
+
+
+async def test_what_a_drive_can_do_can_be_typed(tmp_path):
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
+        typed = [
+            "power on",
+            "axis set-position x 1.5",
+            "axis move x 3 --velocity 10 --wait",
+            "axis preview x --position 400",
+            "axis preview x --distance -1",
+            "axis gains z --kp 400",
+            "axis jog z 1 --for 0.2",
+            "axis quick-stop z",
+            "axis move z 1",
+            "why z",
+            "axis watch z --item position --count 20",
+            "reset z",
+            "lease list",
+            "lease hold --axis x -- true",
+            "axis move X 1",
+            "axis monitors x",
+            "bus list --rig sum",
+            "trace channels x",
+            "events --axis x --count 3",
+            "stop",
+            "reset",
+            "power off",
+        ]
+        at = f"-e {endpoint.removeprefix('tcp/')}"
+        lines = (f"ldcnd {line.replace(' -- ', f' {at} -- ')}" for line in typed)
+        ran = await run_all(tmp_path, *(line if " -- " in line else f"{line} {at}" for line in lines))
+        state = await rig.state("x")
+
+    went = dict(zip(typed, ran, strict=True))
+    refused = {
+        "axis move z 1": 1,
+        "why z": 1,
+        "axis move X 1": 1,
+        "axis monitors x": 1,
+        "bus list --rig sum": 3,
+    }
+    assert {line: each.code for line, each in went.items()} == {line: refused.get(line, 0) for line in went}, went
+    assert went["axis move x 3 --velocity 10 --wait"].printed.splitlines() == [
+        "x: move absolute accepted: to 3.000 mm, at 10 mm/s, with 200 mm/s², in 200 ms",
+        "x: done, standstill",
+    ]
+    assert (
+        went["axis preview x --position 400"].printed.splitlines()[1]
+        == "  the nearest value that would be accepted is 100"
+    )
+    assert "z: halted at " in went["axis jog z 1 --for 0.2"].printed
+    assert "ldcnd axis reset z" in went["axis move z 1"].errors
+    assert "ldcnd axis reset z" in went["why z"].printed
+    assert went["axis move X 1"].errors.startswith("there is no axis 'X'; did you mean 'x'?")
+    assert went["bus list --rig sum"].errors.startswith("no rig 'sum' answers; did you mean 'sim'?")
+    assert "position" in went["trace channels x"].printed.splitlines()
+    assert went["stop"].printed == "stopped and latched: x, y, z, c\n"
+    assert went["power off"].printed.count("power done") == 4
+    assert not state.enabled
