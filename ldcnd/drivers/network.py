@@ -21,12 +21,14 @@ class BringUpReport:
         identities: what was found, by axis name.
         reset: the drives were reset, so their positions count from 0.
         remarks: what differs from the configuration or deserves a look.
+        open_loops: axes whose drives an earlier host has left with an open loop: nothing in them would end a raw duty.
     """
 
     baud: int
     identities: Mapping[str, str]
     reset: bool
     remarks: tuple[str, ...] = ()
+    open_loops: frozenset[str] = frozenset()
 
 
 class Network(ABC):

@@ -64,7 +64,7 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
     StopReply,
     TraceChunk,
     TraceHeader,
-    LeaseRequest,  # stands for both commands that carry it
+    LeaseRequest,
 )
 """Everything that crosses the network but the configuration, which is no part of the vocabulary."""
 

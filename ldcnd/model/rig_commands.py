@@ -46,8 +46,6 @@ class LeaseRequest(Frozen):
 
     lease: str
     """As the reply to acquire named it."""
-    leave_running: bool = False
-    """With release: let what moves go on to its own end, with nobody in control; without effect on renew."""
 
 
 class Renew(LeaseRequest, Command[LeaseReply]):
@@ -59,13 +57,16 @@ class Renew(LeaseRequest, Command[LeaseReply]):
     about = About.RIG
 
 
-class Release(LeaseRequest, Command[LeaseReply]):
+class Release(Command[LeaseReply]):
     """Give a lease back; an axis that still moves does what its policy for the loss of a client says."""
-
-    model_config = ConfigDict(title="LeaseRequest")
 
     verb = "release"
     about = About.RIG
+
+    lease: str
+    """As the reply to acquire named it."""
+    leave_running: bool = False
+    """Let what moves go on to its own end, with nobody in control."""
 
 
 class Holder(Frozen):

@@ -161,6 +161,7 @@ class AxisService:
 
     Attributes:
         stop_wanted: set when a stop waits to be sent again; its line sees to that.
+        line_up: its line is ready for stops; while it is not, they wait for it.
         returned: called when the drive answers again after it was out of reach, with what it does known.
     """
 
@@ -204,7 +205,7 @@ class AxisService:
         self.stop_wanted = asyncio.Event()
         self.returned: Callable[[], None] | None = None
         self._pending: StopMode | None = None
-        self._reachable = False
+        self.line_up = False
         self._seen = False
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
@@ -239,14 +240,13 @@ class AxisService:
 
     def connected(self, *, referenced: bool) -> None:
         """The line came up; `referenced` when the drive's position is known to be right."""
-        self._reachable = True
+        self.line_up = True
         self.tracker.referenced = referenced
         if referenced:
             self.telemetry.origin_counts = 0.0
 
     def disconnected(self) -> None:
-        """The line is gone."""
-        self._reachable = False
+        """The drive is out of reach, or has lost power."""
         self.traces.disconnected()
         self._plausibility.after_gap()
         self.tracker.disconnected(self._clock.now_ns())
@@ -272,7 +272,7 @@ class AxisService:
         """Digest a reading that is believed."""
         was_away = self._seen and self.tracker.link is LinkState.DOWN
         self._seen = True
-        if self._pending is not None:
+        if self.stop_is_pending:
             self.stop_wanted.set()  # it answers again
         was_referenced = self.tracker.referenced
         self.tracker.observed(reading, timing, self._clock.now_ns())
@@ -405,7 +405,7 @@ class AxisService:
         if self._pending is None or STRENGTH[mode] > STRENGTH[self._pending]:
             self._pending = mode
         try:
-            if not self._reachable:
+            if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
             self._bus.withdraw(self.driver.spec.address, overtaken)
             return await self._confirmed_stop(mode, verb, STOP_ROUNDS)
@@ -413,6 +413,11 @@ class AxisService:
             if self._pending is not None:
                 self._not_confirmed()
             self.telemetry.state(self._clock.now_ns())
+
+    @property
+    def stop_is_pending(self) -> bool:
+        """Whether a stop waits to be sent again; not while it is being sent."""
+        return self._pending is not None and self.tracker.stop_pending
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever is known of the axis."""
@@ -438,6 +443,12 @@ class AxisService:
     def _unconfirmed(self) -> StopMode | None:
         """Return how it was told to stop, while no drive has confirmed that."""
         return self._pending
+
+    def switch_off(self) -> None:
+        """Have the motor switched off as the first thing that is sent to its drive."""
+        if self.stoppable:
+            self._pending = StopMode.OFF
+            self.tracker.stop_unconfirmed(self._clock.now_ns())
 
     def cannot_move(self) -> None:
         """Its drive was reset or had no power: what it was told to stop has ended."""

@@ -126,9 +126,11 @@ class BusService:
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue
             retry_s, self.problem = FIRST_RETRY_S, ""
-            if report.reset:
-                for axis in self.axes:
+            for axis in self.axes:
+                if report.reset:
                     axis.cannot_move()
+                elif axis.config.name in report.open_loops:
+                    axis.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
             await self._send_pending_stops()
             self.report, self._baud = report, report.baud
             self._connect(report)
@@ -137,13 +139,17 @@ class BusService:
             self._up.clear()
             self._down.set()
             for axis in self.axes:
+                axis.line_up = False
                 axis.disconnected()
 
     async def _send_pending_stops(self) -> None:
         """Send what no drive has confirmed, to all axes that wait for it at once."""
         self._stop_wanted.clear()
+        waiting = [axis for axis in self.axes if axis.stop_is_pending]
+        if not waiting:
+            return
         async with asyncio.TaskGroup() as stops:
-            for axis in self.axes:
+            for axis in waiting:
                 stops.create_task(axis.send_pending_stop(), name=f"pending stop {axis.config.name}")
 
     async def _pause(self, pause_s: float) -> None:

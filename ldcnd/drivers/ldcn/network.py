@@ -6,6 +6,7 @@ Sources: LS-182AP manual, "Addressing", "Changing communications rates"; PIC-SER
 import asyncio
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
+from dataclasses import replace
 from typing import Any
 
 from ldcnd.bus.bus import Bus
@@ -33,7 +34,7 @@ from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status
+from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import BusError, NetworkMismatch
@@ -129,11 +130,20 @@ class LdcnNetwork(Network):
                 await self._check_may_reset(error)
                 remarks = (error.message,)
             else:
-                return self._up(adopted.identities, self._take_over(adopted), reset=False)
+                found_open = frozenset() if self._was_up else self._open_loops(adopted)
+                report = self._up(adopted.identities, self._take_over(adopted), reset=False)
+                return replace(report, open_loops=found_open)
         for drive in self._drives.values():
             drive.forget()
         modules, found = await self._start_afresh()
         return self._up(modules, remarks + found, reset=True)
+
+    def _open_loops(self, adopted: Adopted) -> frozenset[str]:
+        return frozenset(
+            self._names[address]
+            for address, status in adopted.states.items()
+            if address in self._drives and not (status.aux is not None and status.aux & AuxFlag.SERVO_ON)
+        )
 
     def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
         self._identities = dict(modules)

@@ -1,0 +1,44 @@
+"""What no drive ends by itself is ended by a daemon that starts."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.model.commands import SetPwm
+from tests.support.dialect_rig import AXIS, LS_182AP, V4, DialectRig, adopting_rig, dialect_rig
+
+PWM = {"duty": 0.5, "duration_s": 60.0}
+RUN_ON = {"daemon": "run_to_target"}
+
+
+async def true_speed(rig: DialectRig) -> float:
+    """Return how fast the shaft turns, in mm a second."""
+    loop = asyncio.get_running_loop()
+    rig.chain.advance(loop.time())
+    before = rig.position_mm
+    await asyncio.sleep(0.2)
+    rig.chain.advance(loop.time())
+    rig.drive.catch_up(loop.time())
+    return (rig.position_mm - before) / 0.2
+
+
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_duty_that_a_daemon_has_left_is_ended_by_the_next_one(dialect):
+    async with dialect_rig(dialect, pwm=PWM, acceleration=2000, loss=RUN_ON) as rig:
+        await rig.power_on()
+        await rig.send(SetPwm(duty=0.02, duration_s=60.0))
+        await asyncio.sleep(0.3)
+    assert abs(await true_speed(rig)) > 0.1
+
+    async with adopting_rig(dialect, rig, pwm=PWM, acceleration=2000, loss=RUN_ON) as again:
+        await asyncio.sleep(1.5)
+        assert abs(await true_speed(again)) < 0.1
+        assert not (await again.rig.client.state(AXIS)).stop_pending
+
+
+async def test_a_closed_loop_is_left_closed_by_a_take_over():
+    async with dialect_rig(V4, loss=RUN_ON) as rig:
+        await rig.power_on()
+    async with adopting_rig(V4, rig, loss=RUN_ON) as again:
+        await asyncio.sleep(0.5)
+        assert (await again.rig.client.state(AXIS)).enabled

@@ -1,0 +1,148 @@
+"""One table: in which state of an axis each command is taken, and with which refusal it is not."""
+
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.axis.state import ActiveCommand, Completion
+from ldcnd.errors import ErrorCode, LdcndError
+from ldcnd.model.commands import (
+    Halt,
+    Home,
+    HomeMethod,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Reset,
+    SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
+    Track,
+    Verb,
+)
+from ldcnd.model.samples import AxisState, LinkState
+from tests.support.dialect_rig import AXIS, V4, dialect_rig
+
+TAKEN, WRONG, LATCHED, AWAY = "taken", ErrorCode.WRONG_STATE, ErrorCode.STOP_LATCHED, ErrorCode.AXIS_UNREACHABLE
+MOTIONS = {
+    "move_absolute": MoveAbsolute(position=1.0),
+    "move_relative": MoveRelative(distance=1.0),
+    "move_velocity": MoveVelocity(velocity=1.0),
+    "home": Home(method=HomeMethod.INDEX, velocity=1.0),
+    "set_pwm": SetPwm(duty=0.05, duration_s=1.0),
+    "track": Track(position=0.1),
+}
+COMMANDS = MOTIONS | {
+    "power on": Power(on=True),
+    "power off": Power(on=False),
+    "set_position": SetPosition(position=0.0),
+    "set_gains": SetGains(kp=300),
+    "set_outputs": SetOutputs(),
+    "halt": Halt(),
+    "reset": Reset(),
+}
+
+
+def row(**different: object) -> dict[str, object]:
+    """Return what becomes of each command: it is taken, unless the row says otherwise."""
+    motions = different.pop("motions", TAKEN)
+    return (
+        dict.fromkeys(COMMANDS, TAKEN)
+        | dict.fromkeys(MOTIONS, motions)
+        | {k.replace("_on", " on"): v for k, v in different.items()}
+    )
+
+
+BUSY = row(motions=WRONG, power_on=WRONG, set_position=WRONG, reset=WRONG)
+TABLE = {
+    "standstill": row(),
+    "disabled": row(motions=WRONG),
+    "moving": BUSY,
+    "continuous": BUSY,
+    "stopping": BUSY,
+    "homing": BUSY,
+    "tracking": BUSY | {"track": TAKEN},
+    "pwm": BUSY | {"set_pwm": TAKEN},
+    "latched": row(motions=LATCHED, power_on=LATCHED),
+    "stopping, latched": row(motions=LATCHED, power_on=LATCHED, set_position=WRONG, reset=WRONG),
+    "stop pending": row(motions=LATCHED, power_on=LATCHED, reset=LATCHED),
+    "error": row(motions=WRONG, power_on=WRONG),
+    "error, moving": row(motions=WRONG, power_on=WRONG, reset=WRONG),
+    "error, latched": row(motions=LATCHED, power_on=LATCHED),
+    "away": dict.fromkeys(COMMANDS, AWAY),
+}
+
+
+RESTING = {"standstill", "disabled", "latched", "stop pending", "error", "error, latched"}
+
+
+async def nothing(*_args: object, **_kwargs: object) -> None:
+    """Stand in for every packet."""
+
+
+async def put(axis: AxisService, name: str) -> None:
+    """Bring what the daemon knows of the axis into a state."""
+    tracker, commands = axis.tracker, axis._commands
+    commands._drop_procedure()
+    tracker.command = None
+    tracker.link, tracker.referenced, tracker.enabled = LinkState.UP, True, True
+    tracker.stop_latched = tracker.stop_pending = tracker.position_lost = False
+    tracker.active_faults, tracker.first_fault = (), None
+    tracker.state = AxisState.STANDSTILL
+    axis._motion.target_counts = None
+    motion = {"moving": AxisState.DISCRETE_MOTION, "continuous": AxisState.CONTINUOUS_MOTION}
+    motion |= {"stopping": AxisState.STOPPING, "homing": AxisState.HOMING}
+    kind = name.partition(",")[0]
+    if kind in motion:
+        tracker.begin(ActiveCommand("other", Verb.MOVE_ABSOLUTE, 0, motion[kind], Completion.PROFILE), 0.0)
+    elif kind in ("tracking", "pwm"):
+        await axis.execute(MOTIONS["track" if kind == "tracking" else "set_pwm"])
+        if kind == "tracking":
+            commands._procedure._due_s = float("-inf")  # as if it had come long ago
+    elif kind == "error":
+        tracker.state, tracker.enabled = AxisState.ERROR_STOP, name == "error, moving"
+    elif kind == "disabled":
+        tracker.state, tracker.enabled = AxisState.DISABLED, False
+    elif kind == "away":
+        tracker.link = LinkState.DOWN
+    tracker.stop_latched = "latched" in name
+    if name == "stop pending":
+        tracker.stop_unconfirmed(0)
+    set_at_rest(
+        axis, kind in ("standstill", "disabled", "latched", "stop pending") or name in ("error", "error, latched")
+    )
+
+
+def set_at_rest(axis: AxisService, at_rest: bool) -> None:  # noqa: FBT001
+    axis.tracker._at_rest = at_rest
+
+
+async def outcome(send: Callable[[], Awaitable[object]]) -> object:
+    try:
+        await send()
+    except LdcndError as error:
+        return error.code
+    return TAKEN
+
+
+@pytest.mark.parametrize("state", TABLE)
+async def test_each_command_is_taken_or_refused_as_the_table_says(state):
+    async with dialect_rig(V4, pwm={"duty": 0.5, "duration_s": 5.0}, tracking={"step": 0.4, "rate": 50.0}) as rig:
+        await rig.power_on()
+        axis = rig.rig.daemon.rig.axis(AXIS)
+        reading = axis._motion.latest()
+        for name in ("load", "start", "track", "power", "stop", "reset", "clear_warnings", "set_gains", "set_outputs"):
+            setattr(axis.driver, name, nothing)
+        axis._motion.read = lambda: _value(reading)  # no packet
+        found = {}
+        for name, command in COMMANDS.items():
+            await put(axis, state)
+            found[name] = await outcome(lambda command=command: axis.execute(command))
+        assert found == TABLE[state]
+
+
+async def _value(reading: object) -> object:
+    return reading
