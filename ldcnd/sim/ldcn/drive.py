@@ -104,11 +104,11 @@ class SimulatedDrive(SimulatedModule):
 
     @property
     def dialect(self) -> Profile:
-        """See `SimulatedModule`: a CMC knows its own commands only after Stop Motor with bit 5."""
+        """A CMC knows its own commands only after Stop Motor with bit 5."""
         return self._advanced if self._is_advanced else self._compatible
 
     def restart(self) -> None:
-        """See `SimulatedModule`: everything but the shaft and its troubles starts anew."""
+        """Everything but the shaft and its troubles starts anew."""
         if self.profile.pic_ae_diagnostics:
             self.stage = LogosolPower()
         else:
@@ -133,14 +133,14 @@ class SimulatedDrive(SimulatedModule):
         self._shows_slew = self.settings.aux_after_reset
 
     def run(self, cycles: int) -> None:
-        """See `SimulatedModule`."""
+        """Let servo cycles pass; a home search that ends on a limit may lock motion."""
         self.loop.run(cycles)
         if self.loop.homed_on_limit:
             self.loop.homed_on_limit = False
             self._locked = self._may_lock
 
     def execute(self, command: ReceivedCommand) -> None:  # noqa: C901 - one branch per command
-        """See `SimulatedModule`."""
+        """Execute a command of servo drives."""
         loop = self.loop
         match command:
             case ResetPosition(position, relative_to_home):
@@ -168,7 +168,7 @@ class SimulatedDrive(SimulatedModule):
                 loop.home = loop.position
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
-        """See `SimulatedModule`."""
+        """Return a status packet in the layout of the dialect."""
         loop = self.loop
         flags = self.stage.flags(self._limits())
         if loop.move_done:
@@ -231,7 +231,7 @@ class SimulatedDrive(SimulatedModule):
     # -- the EEPROM of PIC-SERVO SC ----------------------------------------------------------------------------------
 
     def save(self, start_up: int) -> None:
-        """See `SimulatedModule`; without the bit for saving the EEPROM is erased."""
+        """Save the configuration; without the bit for saving the EEPROM is erased."""
         control = StartUp(start_up)
         if not control & StartUp.SAVE:
             self.saved = None
@@ -248,7 +248,7 @@ class SimulatedDrive(SimulatedModule):
         )
 
     def restore(self) -> None:
-        """See `SimulatedModule`."""
+        """Take over what the EEPROM holds, at power-up."""
         saved = self.saved
         if saved is None:
             return
@@ -263,7 +263,7 @@ class SimulatedDrive(SimulatedModule):
             self.addressed()
 
     def addressed(self) -> None:
-        """See `SimulatedModule`: what was saved for the start-up energises the motor now."""
+        """What was saved for the start-up energises the motor now."""
         start_up, self._energised_by_address = self._energised_by_address, StartUp(0)
         if start_up & StartUp.AMPLIFIER_ON:
             self.stage.enable(on=True)

@@ -103,7 +103,7 @@ class SimulatedIo(SimulatedModule):
     # -- module ------------------------------------------------------------------------------------------------------
 
     def restart(self) -> None:
-        """See `SimulatedModule`: all lines become inputs; what is connected stays."""
+        """All lines become inputs; what is connected stays."""
         self.outputs = 0
         self.latch = 0
         self.pwm = (0, 0)
@@ -114,7 +114,7 @@ class SimulatedIo(SimulatedModule):
         self._captured = (0, 0)
 
     def run(self, cycles: int) -> None:
-        """See `SimulatedModule`: the module's own clock drives the timer, the world outside the counter."""
+        """The module's own clock drives the timer, the world outside the counter."""
         if not self._mode.enabled:
             return
         if not self._mode.counter:
@@ -123,7 +123,7 @@ class SimulatedIo(SimulatedModule):
             self._raw += cycles * self._pulses_per_cycle * self._cycle_s / SERVO_CYCLE_S
 
     def execute(self, command: ReceivedCommand) -> None:
-        """See `SimulatedModule`."""
+        """Execute a command of PIC-I/O."""
         before = self.levels
         match command:
             case SetDirection(inputs):
@@ -146,7 +146,7 @@ class SimulatedIo(SimulatedModule):
         self._count_edges(before)
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
-        """See `SimulatedModule`."""
+        """Return a status packet."""
         adc1, adc2, adc3 = self._adc
         levels, counter = self._captured
         status = IoStatus(
@@ -186,16 +186,16 @@ class SimulatedOther(SimulatedModule):
         super().__init__(profile, settings)
 
     def restart(self) -> None:
-        """See `SimulatedModule`."""
+        """Take the state of power-up."""
 
     def run(self, cycles: int) -> None:
-        """See `SimulatedModule`: nothing here moves."""
+        """Nothing here moves."""
 
     def execute(self, command: ReceivedCommand) -> None:
-        """See `SimulatedModule`: acknowledged, without any effect."""
+        """Acknowledged, without any effect."""
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
-        """See `SimulatedModule`."""
+        """Return a status packet."""
         body = bytearray([CHECKSUM_ERROR if checksum_error else 0])
         identity = bytes((self.profile.device_id, self.settings.version))
         for bit, width in enumerate(self._item_bytes):

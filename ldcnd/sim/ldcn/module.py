@@ -74,7 +74,7 @@ class SimulatedModule(Module):
         self._start_afresh()
 
     def hear(self, value: int | None, at_s: float) -> None:
-        """See `Module`."""
+        """Take a byte of the host; a complete packet for this module waits for the end of the servo cycle."""
         if not self._powered or at_s < self._deaf_until_s:
             return
         self._fall_silent()
@@ -98,13 +98,13 @@ class SimulatedModule(Module):
         self.next_event_s = self.settings.phase_s + self._due_cycle * self._cycle_s
 
     def takes_whole(self, data: bytes) -> bool:
-        """See `Module`: exactly one packet, or no beginning of any."""
+        """Exactly one packet, or no beginning of any."""
         if self._reader.in_packet:
             return False
         return _is_packet(data) or HEADER not in data
 
     def hear_all(self, data: bytes, starts_at_s: float, byte_s: float) -> None:
-        """See `Module`: a packet for another module only ends what this one was about to do."""
+        """A packet for another module only ends what this one was about to do."""
         deaf = not self._powered or starts_at_s + byte_s < self._deaf_until_s
         if deaf or not _is_packet(data) or self._is_for_me(data[1], data[2] & 0x0F):
             super().hear_all(data, starts_at_s, byte_s)
@@ -113,7 +113,7 @@ class SimulatedModule(Module):
             self._overwrite()
 
     def advance(self, to_s: float) -> Reply | None:
-        """See `Module`."""
+        """Execute the packet that waits, at the end of the servo cycle, and begin the reply."""
         at_s = self.next_event_s
         if at_s > to_s:
             return None
@@ -142,7 +142,7 @@ class SimulatedModule(Module):
             self.restore()
 
     def catch_up(self, to_s: float) -> None:
-        """See `Module`: let the servo cycles up to that instant pass; also before something is changed from outside."""
+        """Let the servo cycles up to that instant pass; also before something is changed from outside."""
         self._pass_cycles(math.floor((to_s - self.settings.phase_s) / self._cycle_s + _ROUNDING))
 
     # -- what kinds of modules differ in -----------------------------------------------------------------------------

@@ -111,7 +111,7 @@ class PicServoPower(PowerStage):
     """An external amplifier: an enable pin, and motor power that is sensed and whose loss opens the loop."""
 
     def check(self) -> None:
-        """See `PowerStage`."""
+        """Draw the consequences of the conditions."""
         self.allows_servo = Condition.MOTOR_POWER_OFF not in self.conditions
         self.drives = self.enabled and self.allows_servo
 
@@ -122,11 +122,11 @@ class PicServoPower(PowerStage):
         """Nothing is latched."""
 
     def flags(self, limits: StatusFlag) -> StatusFlag:
-        """See `PowerStage`."""
+        """Return bits 3, 5 and 6 of the status byte."""
         return limits | StatusFlag.POWER_ON if self.allows_servo else limits
 
     def aux(self, index: AuxFlag) -> AuxFlag:
-        """See `PowerStage`."""
+        """Return bit 0 of the auxiliary status byte."""
         return index
 
 
@@ -137,12 +137,12 @@ class ScPower(PicServoPower):
     """
 
     def check(self) -> None:
-        """See `PowerStage`."""
+        """Draw the consequences of the conditions."""
         super().check()
         self.drives = self.drives and Condition.OVERVOLTAGE not in self.conditions
 
     def flags(self, limits: StatusFlag) -> StatusFlag:
-        """See `PowerStage`."""
+        """Return bits 3, 5 and 6 of the status byte."""
         return super().flags(limits) if Condition.OVERVOLTAGE not in self.conditions else limits
 
 
@@ -157,7 +157,7 @@ class LogosolPower(PowerStage):
         self.latched: Trip | None = None
 
     def check(self) -> None:
-        """See `PowerStage`."""
+        """Draw the consequences of the conditions."""
         if self.enabled and self.latched is None:
             for condition, cause in _TRIPS:
                 if condition in self.conditions:
@@ -166,19 +166,19 @@ class LogosolPower(PowerStage):
         self.drives = self.allows_servo = self.enabled and self.latched is None
 
     def trip(self, cause: Trip) -> None:
-        """See `PowerStage`."""
+        """Latch the cause, unless an earlier one is latched."""
         if self.latched is None:
             self.latched = cause
         self.check()
 
     def clear(self) -> None:
-        """See `PowerStage`."""
+        """Forget the latched cause, with Pic_ae = 0 only."""
         if not self.enabled:
             self.latched = None
         self.check()
 
     def flags(self, limits: StatusFlag) -> StatusFlag:
-        """See `PowerStage`."""
+        """Return bits 3, 5 and 6 of the status byte."""
         if not self.enabled:
             return self._standing()
         match self.latched:
@@ -190,7 +190,7 @@ class LogosolPower(PowerStage):
                 return StatusFlag(cause.value)
 
     def aux(self, index: AuxFlag) -> AuxFlag:
-        """See `PowerStage`."""
+        """Return bit 0 of the auxiliary status byte."""
         if self.enabled and self.latched is Trip.ENCODER:
             return AuxFlag(0)
         if self.enabled and self.latched in _DRIVER_STAYS:
