@@ -1,0 +1,15 @@
+"""Every verb can be reached from client, command line and console, and is documented, or the table says why not."""
+
+from tests.support.verb_table import PAGE, empty_cells, needless_explanations, verb_table
+
+
+def test_no_cell_is_empty():
+    assert empty_cells() == []
+
+
+def test_nothing_is_explained_that_is_there():
+    assert needless_explanations() == []
+
+
+def test_the_page_is_made_of_the_classes():
+    assert PAGE.read_text() == verb_table(), "run `python -m tests.support.verb_table`"
