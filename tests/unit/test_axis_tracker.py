@@ -245,3 +245,19 @@ def test_a_fault_that_loses_the_position_takes_the_reference_away_and_nothing_bu
     tracker.cleared(3.0)
     tracker.observed(ON, at(3.1), 0)
     assert (tracker.referenced, tracker.position_lost) == (False, False)
+
+
+@pytest.mark.parametrize("how", ["line lost", "not sent"])
+def test_readings_count_again_after_a_start_that_no_drive_has_taken(how):
+    tracker = AxisTracker("x", "mm")
+    tracker.observed(ON, at(1.0), 0)
+    tracker.begin(command(), float("inf"))
+
+    if how == "line lost":
+        tracker.disconnected(0)
+    else:
+        tracker.finished("the line was busy")
+    for at_s in (5.0, 5.5):
+        tracker.observed(OFF, at(at_s), 0)
+
+    assert (tracker.moving, tracker.enabled) == (Moving.NO, False)

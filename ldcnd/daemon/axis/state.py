@@ -1,5 +1,6 @@
 """What the daemon knows of one axis: digests readings and commands into PLCopen states. Pure; time is an input."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -292,6 +293,8 @@ class AxisTracker:
     def _end(self, status: CommandStatus, reason: str | None = None) -> None:
         command, self.command = self.command, None
         self._failure = None
+        if math.isinf(self._effective_from_s):
+            self._effective_from_s = 0.0  # the drive never took it, so there is nothing to wait for: readings count
         if command is None:
             return
         if reason:
