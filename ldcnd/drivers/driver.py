@@ -207,6 +207,7 @@ class AxisDriver(ABC):
         capabilities: the truth about what the family and the model can do.
         adc_full_scale: counts of the A/D converter at full scale; None without one.
         home_methods: what can mark the reference position.
+        retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
         index_sample_s: how often the drive looks at its index input: a shorter pulse can be missed.
         monitors: what is published beside the common items.
         tracer: the drive's own recorder; None where the host has to sample.
@@ -218,6 +219,7 @@ class AxisDriver(ABC):
     adc_full_scale: int | None
     home_methods: frozenset[HomeMethod]
     index_sample_s: float = 0.0
+    retargets: bool = False
     monitors: tuple[MonitorName, ...] = ()
     tracer: Tracer | None = None
 

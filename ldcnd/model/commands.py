@@ -306,7 +306,10 @@ class MoveRelative(Move):
 
 
 class MoveVelocity(Move):
-    """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`."""
+    """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
+
+    On an axis that jogs already it changes velocity and acceleration on the fly.
+    """
 
     verb = Verb.MOVE_VELOCITY
 

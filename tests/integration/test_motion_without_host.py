@@ -33,9 +33,10 @@ INSTANTS_S = (0.0015, 0.0045, 0.3)
 """After the command was sent: among its packets, and in mid-motion."""
 
 
-async def sent_into_silence(rig: DialectRig, command: object, instant_s: float) -> None:
+async def sent_into_silence(rig: DialectRig, command: object, instant_s: float, *, powered: bool = False) -> None:
     """Send a command, and let the host fall silent for good so much later."""
-    await rig.power_on()
+    if not powered:
+        await rig.power_on()
     loop = asyncio.get_running_loop()
 
     async def send() -> None:
@@ -78,3 +79,15 @@ async def test_the_two_motions_that_the_docs_name_run_on_without_a_host(verb):
         await sent_into_silence(rig, UNBOUNDED[verb], 0.3)
 
         assert await travelled(rig, HORIZON_S + BRAKING_S) > 1.0
+
+
+@pytest.mark.parametrize(("dialect", "runs_on"), [(SC, False), (V4, True), (LS_182AP, True)])
+async def test_a_jog_that_was_changed_on_its_way_ends_without_a_host_on_sc_alone(dialect, runs_on):
+    async with dialect_rig(dialect, **AXIS) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=2.0))
+        await asyncio.sleep(0.2)
+        await sent_into_silence(rig, MoveVelocity(velocity=3.0), 0.3, powered=True)
+        await asyncio.sleep(HORIZON_S + BRAKING_S)
+
+        assert (await travelled(rig, 2.0) > 1.0) is runs_on

@@ -8,6 +8,7 @@ from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
 from ldcnd.daemon.axis.procedures.home import HomeSequence
+from ldcnd.daemon.axis.procedures.jog import Jog, jogs
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.state import Completion
@@ -108,6 +109,8 @@ class AxisCommands:
                 return AnalogMove(self._motion, turn, request)
             case SetPwm():
                 return PwmRun(self._motion, turn, request)
+            case MoveVelocity() if jogs(self._tracker) and not self._driver.retargets:
+                return Jog(self._motion, turn, request)
             case Track():
                 return SetPoint(self._motion, turn, request, self._procedure)
             case _:
@@ -286,7 +289,10 @@ class AxisCommands:
         return await self._move(turn, self._plan_relative(request), AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
-        guards.check_may_move(self._tracker.view())
+        if jogs(self._tracker):  # on a drive that takes a new trapezoid in mid-move
+            guards.check_may_follow(self._tracker.view())
+        else:
+            guards.check_may_move(self._tracker.view())
         velocity, bounded = self._plan_velocity(request)
         reply = await self._move(turn, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity})

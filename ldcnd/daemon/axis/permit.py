@@ -58,6 +58,7 @@ class QuietDrive(Protocol):
     spec: AxisSpec
     adc_full_scale: int | None
     home_methods: frozenset[HomeMethod]
+    retargets: bool
 
     @property
     def index_sample_s(self) -> float: ...  # noqa: D102 - of `AxisDriver`, as all of these

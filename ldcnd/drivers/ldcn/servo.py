@@ -32,7 +32,7 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
 from ldcnd.drivers.ldcn.faults import DriveState, FaultCode, sensor_lost
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
-from ldcnd.drivers.ldcn.registers import LIMIT_PINS, SERVO_CYCLE_S, Gains, RegisterBook, gain_values
+from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, SERVO_CYCLE_S, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
@@ -139,6 +139,7 @@ class LdcnAxis(AxisDriver):
         self.capabilities = _capabilities(profile)
         self.adc_full_scale = (1 << profile.adc_bits) - 1
         self.home_methods = home_methods(profile)
+        self.retargets = profile.sc_extensions
         self.state = DriveState(spec.name, profile)
         self._bus = bus
         self._node = Node(spec.address, profile)
@@ -463,7 +464,8 @@ class LdcnAxis(AxisDriver):
             return True
         if loaded.mode is ProfileMode.TRAPEZOIDAL and loaded.position is not None and status.position is not None:
             return abs(status.position - loaded.position) <= REACHED_COUNTS
-        return bool(status.velocity)
+        slow = loaded.velocity is not None and loaded.velocity < FRACTION  # shows in no status
+        return slow or bool(status.velocity)
 
     async def track(self, position_counts: int) -> None:
         """See `AxisDriver`: "stop here", the manuals' way to follow a string of positions.
