@@ -1,31 +1,43 @@
-"""`ldcnd doctor`: examine a line before a daemon uses it; opens the port itself and only reads."""
+"""`ldcnd doctor`: examine a line before a daemon uses it; opens the port itself, reads unless told otherwise."""
 
 import asyncio
+import re
 import sys
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from pathlib import Path
 
 import click
 
 from ldcnd.bus.bus import Bus
+from ldcnd.bus.resync import Resync
+from ldcnd.bus.settings import BusSettings
 from ldcnd.config.bus import BusConfig
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.line import examination
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.smartstep_line import build_line
+from ldcnd.drivers.smartstep.commands import FLUSH
 from ldcnd.drivers.smartstep.commissioning import examine
+from ldcnd.drivers.smartstep.commissioning import scan as scan_units
 from ldcnd.drivers.smartstep.drive import SmartStepAxis
-from ldcnd.drivers.smartstep.network import SmartStepNetwork
+from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
+from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, TriggerMap
+from ldcnd.drivers.smartstep.trigger_search import Stimulus, find_trigger_map
 from ldcnd.errors import BusDown, ConfigError
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
+from ldcnd.transport.port_url import port_opener
+from ldcnd.transport.transport import Opener
 
 OPEN_TIME_S = 5.0
+SOFT_PARITY = SmartStepProfile(framing=Framing.SOFT_PARITY)
+"""Parity is made here, so that any adapter will do and wrong parity is seen character by character."""
 
 
 @click.group()
 def command() -> None:
-    """Examine a line by reading only; no daemon may use it meanwhile."""
+    """Examine a line, by reading unless told otherwise; no daemon may use it meanwhile."""
 
 
 @command.command()
@@ -41,12 +53,115 @@ def ldcn(config: Path, name: str, *, as_json: bool) -> None:
 @click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
 @click.option("--bus", "name", required=True, help="The line to examine.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
-def smartstep(config: Path, name: str, *, as_json: bool) -> None:
+@click.option("--trace", is_flag=True, help="Also record a short trace, which shows how its words are laid out.")
+def smartstep(config: Path, name: str, *, as_json: bool, trace: bool) -> None:
     """Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."""
-    _examine(config, name, "smartstep", as_json=as_json)
+    _examine(config, name, "smartstep", as_json=as_json, trace=trace)
 
 
-def _examine(config: Path, name: str, family: str, *, as_json: bool) -> None:
+@command.command()
+@click.argument("port")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
+def scan(port: str, *, as_json: bool) -> None:
+    """Look for SmartSteps on PORT, units 0 to F, and say what is wrong with the wires; exits with 1 without any."""
+    found: list[Finding] = []
+
+    def show(finding: Finding) -> None:
+        found.append(finding)
+        text = f"{finding.axis:8} {finding.verdict:5} {finding.text}"
+        print(finding.model_dump_json() if as_json else text, flush=True)
+
+    configure_logging(level="error")
+    asyncio.run(scan_line(smartstep_opener(port_opener(port, BAUD, "8n1"), SOFT_PARITY), port, show))
+    sys.exit(1 if any(each.verdict is Verdict.WRONG for each in found) else 0)
+
+
+async def scan_line(opener: Opener, port: str, show: Callable[[Finding], None]) -> None:
+    """Open a line, look for SmartSteps on it, and close it.
+
+    Raises:
+        BusDown: the port does not open.
+    """
+    bus = Bus(BusSettings("scan", BAUD, margin_s=0.01, attempts=1), opener)
+    bus.resync = Resync(flush=FLUSH, quiet_s=SOFT_PARITY.gap_s, settle_s=SOFT_PARITY.quiet_s, probe=lambda _: None)
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name="bus scan")
+        try:
+            await _opened(bus, port)
+            async for finding in scan_units(bus, SOFT_PARITY):
+                show(finding)
+        finally:
+            owner.cancel()
+
+
+@command.command("trigger-bits")
+@click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
+@click.option("--bus", "name", required=True, help="The line.")
+@click.option("--axis", required=True, help="The SmartStep; RUN must be off.")
+@click.option("--write", is_flag=True, help="Write the bits into the configuration.")
+def trigger_bits(config: Path, name: str, axis: str, *, write: bool) -> None:
+    """Find the trigger bits of a SmartStep by trying words; asks for the shaft to be turned and RESET to be pressed."""
+    rig = load_config(config)
+    settings = next((bus for bus in rig.bus if bus.name == name and bus.family == "smartstep"), None)
+    if settings is None or axis not in [each.name for each in settings.axis]:
+        raise ConfigError(f"{config}: no smartstep line {name!r} with an axis {axis!r}")
+    configure_logging(level="error")
+    found = asyncio.run(_search(rig, settings, axis))
+    print(trigger_table(found))
+    if write:
+        with_trigger_map(config, axis, found)
+        print(f"written to {config}")
+
+
+async def _search(rig: RigConfig, settings: BusConfig, axis: str) -> TriggerMap:
+    bus, units = build_line(rig, settings, None, {})
+    bus.resync = units.resync
+    unit = units.axes[axis]
+    if not isinstance(unit, SmartStepAxis):
+        raise ConfigError(f"{axis} is no SmartStep")
+
+    async def act(stimulus: Stimulus) -> None:
+        await asyncio.to_thread(click.prompt, f"{stimulus.value}; Enter", default="", show_default=False, err=True)
+
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name=f"bus {settings.name}")
+        try:
+            await _opened(bus, settings.port)
+            return await find_trigger_map(unit.words, act)
+        finally:
+            owner.cancel()
+
+
+def trigger_table(bits: TriggerMap) -> str:
+    """Return the table of the configuration that says these bits."""
+    keys = "\n".join(f"{key} = 0x{getattr(bits, key):04X}" for key in TriggerMap.__slots__)
+    return f"[bus.axis.smartstep.trace.trigger_map]\n{keys}\n"
+
+
+def with_trigger_map(config: Path, axis: str, bits: TriggerMap) -> None:
+    """Write the bits of one axis into a configuration, its comments and its order left as they are.
+
+    Raises:
+        ConfigError: there are other bits already, or the file is laid out so that the table has to be put in by hand.
+    """
+    lines = config.read_text(encoding="utf-8").splitlines(keepends=True)
+    named = [place for place, line in enumerate(lines) if re.match(rf"\s*name\s*=\s*[\"']{re.escape(axis)}[\"']", line)]
+    draft = config.with_suffix(".new")
+    for place in named:
+        after = next((n for n in range(place, len(lines)) if lines[n].lstrip().startswith("[[")), len(lines))
+        draft.write_text("".join([*lines[:after], "\n", trigger_table(bits), "\n", *lines[after:]]), encoding="utf-8")
+        with suppress(ConfigError):
+            rig = load_config(draft)
+            (found,) = [each for bus in rig.bus for each in bus.axis if each.name == axis]
+            wanted = {key: getattr(bits, key) for key in TriggerMap.__slots__}
+            if found.smartstep.trace.trigger_map and found.smartstep.trace.trigger_map.model_dump() == wanted:
+                draft.replace(config)
+                return
+    draft.unlink(missing_ok=True)
+    raise ConfigError(f"{config}: put this table behind axis {axis} by hand:\n{trigger_table(bits)}")
+
+
+def _examine(config: Path, name: str, family: str, *, as_json: bool, trace: bool = False) -> None:
     rig = load_config(config)
     settings = next((bus for bus in rig.bus if bus.name == name and bus.family == family), None)
     if settings is None:
@@ -62,11 +177,13 @@ def _examine(config: Path, name: str, family: str, *, as_json: bool) -> None:
         print(finding.model_dump_json() if as_json else text, flush=True)
 
     configure_logging(level="error")  # findings say the rest
-    asyncio.run(examine_line(rig, settings, show))
+    asyncio.run(examine_line(rig, settings, show, trace=trace))
     sys.exit(1 if wrong else 0)
 
 
-async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None]) -> None:
+async def examine_line(
+    rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None], *, trace: bool = False
+) -> None:
     """Open a line, examine it and every configured drive on it, and close it.
 
     Raises:
@@ -76,7 +193,7 @@ async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Find
     if settings.family == "smartstep":
         bus, units = build_line(rig, settings, None, {})
         bus.resync = units.resync
-        findings = _smartstep(bus, units)
+        findings = _smartstep(bus, units, trace=trace)
     else:
         bus, network = build_ldcn_line(rig, settings, {})
         bus.resync = network.resync
@@ -84,17 +201,17 @@ async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Find
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name=f"bus {settings.name}")
         try:
-            await _opened(bus, settings)
+            await _opened(bus, settings.port)
             async for finding in findings:
                 show(finding)
         finally:
             owner.cancel()
 
 
-async def _smartstep(bus: Bus, network: SmartStepNetwork) -> AsyncIterator[Finding]:
+async def _smartstep(bus: Bus, network: SmartStepNetwork, *, trace: bool) -> AsyncIterator[Finding]:
     for axis in network.axes.values():
         if isinstance(axis, SmartStepAxis):
-            async for finding in examine(bus, axis):
+            async for finding in examine(bus, axis, trace=trace):
                 yield finding
 
 
@@ -104,12 +221,12 @@ def _as_configured(settings: BusConfig) -> examination.LineAsConfigured:
     )
 
 
-async def _opened(bus: Bus, settings: BusConfig) -> None:
+async def _opened(bus: Bus, port: str) -> None:
     try:
         async with asyncio.timeout(OPEN_TIME_S):
             await bus.wait_opened()
     except TimeoutError:
         raise BusDown(
-            f"bus {settings.name}: {bus.loss_reason or f'{settings.port} did not open within {OPEN_TIME_S:g} s'}",
+            f"bus {bus.settings.name}: {bus.loss_reason or f'{port} did not open within {OPEN_TIME_S:g} s'}",
             remedy="end the daemon that has it, or correct the port",
         ) from None

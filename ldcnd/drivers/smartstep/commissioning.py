@@ -1,10 +1,11 @@
-"""Examining one drive by reading only: is it alive, what is it, how are its wires, which assumptions can be verified.
+"""Examining one drive before it is used: is it alive, what is it, how are its wires, which assumptions can be verified.
 
 Reads at even addresses and even counts only: what a drive does with odd ones is not known. Run it with RUN off.
 Source: manual 2 to 6; the order goes from what no drive can take amiss to what asks most of it.
 """
 
-from collections.abc import AsyncIterator
+import asyncio
+from collections.abc import AsyncIterator, Sequence
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.smartstep import commands
@@ -20,13 +21,20 @@ from ldcnd.drivers.smartstep.monitors import (
     gain_switch,
 )
 from ldcnd.drivers.smartstep.network import hears_itself
+from ldcnd.drivers.smartstep.packet import DAMAGED, HIGHEST_UNIT
 from ldcnd.drivers.smartstep.parameters import PN000, unit_number
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile, Verification
+from ldcnd.drivers.smartstep.words import Words
 from ldcnd.errors import BadReply, BusError, DriveFault
 from ldcnd.model.health import Finding, Verdict
+from ldcnd.model.traces import TakeTrace
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 
-async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
+async def examine(bus: Bus, unit: SmartStepAxis, *, trace: bool = False) -> AsyncIterator[Finding]:
     """Examine one drive on an open line that nobody else uses; yields each finding as it comes.
+
+    It reads only, unless `trace` asks for a short trace, which sets the working registers of the drive's recorder.
 
     Ends early when the drive does not answer or hears itself.
     """
@@ -45,6 +53,7 @@ async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
         examination.string_range,
         examination.longest_string,
         examination.atomic_counter,
+        *((examination.trace_words,) if trace else ()),
     ):
         try:
             finding = await part()
@@ -163,7 +172,80 @@ class Examination:
         can = "can" if isinstance(halves, StringReply) else "cannot"
         return self.finding("atomic counter", Verdict.FINE, f"a counter {can} be read at once", "atomic_counter")
 
+    async def trace_words(self) -> Finding:
+        """Record a short trace of everything that a monitor shows, and compare; nothing moves, no EEPROM is written.
+
+        It tells layouts apart where a signal is high or a value is not zero: best with the shaft turned by hand.
+        """
+        request = TakeTrace(channels=("speed_feedback", "position_deviation", "reset", "bkir"), interval_s=0.004)
+        tracer = self._unit.tracer
+        if tracer is None:
+            return self.finding("trace words", Verdict.LOOK, "the drive has no recorder")
+        armed = await tracer.arm(request)
+        recorded = await armed.record(lambda _phase: None)
+        known = recorded.drive.assumptions if recorded.drive else ()
+        verified = [each.key for each in known if each.verification == Verification.VERIFIED.value]
+        if recorded.problems:
+            return self.finding("trace words", Verdict.LOOK, "; ".join(recorded.problems), "trace_word_layout")
+        text = f"agree with the monitors; verified: {', '.join(verified) or 'nothing, as all layouts agree'}"
+        return self.finding("trace words", Verdict.FINE, text, "trace_word_layout")
+
     async def _string(self, address: int, byte_count: int) -> StringReply | Refusal:
         return await self._bus.execute(
             string_reference(self._unit.spec.address, address, byte_count, self._unit.profile)
         )
+
+
+# -- the line as a whole ---------------------------------------------------------------------------------------------
+
+
+async def scan(bus: Bus, profile: SmartStepProfile) -> AsyncIterator[Finding]:
+    """Ask every unit number from 0 to F whether a drive has it; yields each drive, or why there is none.
+
+    Works best on a line that makes parity in software: then characters with wrong parity are seen as such.
+    """
+    found = 0
+    began_s = asyncio.get_running_loop().time()
+    for unit in range(HIGHEST_UNIT + 1):
+        words = Words(bus, f"unit {unit:X}", unit, profile)
+        if not await words.answers(unit):
+            continue
+        found += 1
+        try:
+            type_word, version = await words.read(Register.DRIVER_TYPE), await words.read(Register.SOFTWARE_VERSION)
+            present = alarm(await words.read(Register.PRESENT_ALARM))
+        except (BusError, DriveFault) as error:
+            yield Finding(axis=words.axis, what="scan", verdict=Verdict.LOOK, text=error.message)
+            continue
+        text = f"driver type {type_word:04X}H, version {version:04X}H, alarm {present.code:02X} ({present.text})"
+        yield Finding(axis=words.axis, what="scan", verdict=Verdict.FINE, text=text)
+    if not found:
+        text = diagnosis([record for record in bus.wire_log.records() if record.at_s >= began_s])
+        yield Finding(axis="-", what="scan", verdict=Verdict.WRONG, text=text, verifies="wiring")
+
+
+def diagnosis(records: Sequence[WireRecord]) -> str:
+    """Return why no drive answers, by what came back on the line."""
+    sent = b"".join(record.data for record in records if record.event is WireEvent.SENT)
+    heard = b"".join(record.data for record in records if record.event in _HEARD)
+    if not heard:
+        return (
+            "nothing comes back: check the power of the drives, that the host's pair for sending goes to RXD (20, 21)"
+            " and the other to TXD (22, 23), plus to plus, the common ground, and the unit numbers in Pn000.2"
+        )
+    if sent.startswith(heard) or heard in sent:
+        return (
+            'the host hears itself and no drive answers: set wiring = "2-wire" and echo = "expect", or use four wires'
+        )
+    wrong = heard.count(DAMAGED)
+    if wrong * 2 >= len(heard):
+        return (
+            f"{wrong} of {len(heard)} characters that came back have wrong parity: plus and minus of a pair may be"
+            " exchanged, a drive with unit number 0 may jam the line, or something sends at another rate than 9600 baud"
+        )
+    return (
+        f"{len(heard)} characters came back that no SmartStep sends, such as {heard[:14]!r}: other devices on the line"
+    )
+
+
+_HEARD = (WireEvent.RECEIVED, WireEvent.PART, WireEvent.STRAY, WireEvent.ECHO)
