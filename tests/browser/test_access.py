@@ -17,6 +17,7 @@ PAGES = {
     "scope": "Live",
     "trace/sim/x": "Record x",
     "tuning/sim/x": "Test move",
+    "tuning/mixed/feed": "Record",
     "parameters/mixed/feed": "Alarms and assumptions",
     "network": "sim · line0",
     "events": "Commands and how they ended",

@@ -12,14 +12,21 @@ import { MOVES, runs, runTest } from "../session/test_moves.js";
 import { AuthorityPanel } from "./axis_authority.js";
 import { gainsOf, GainsTable } from "./axis_gains.js";
 import { AxisChoice } from "./trace.js";
+import { hasGainParameters, ParameterBench } from "./tuning_parameters.js";
 
 export function TuningPage({ at }) {
-  const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.can("set_gains"));
+  const axes = [...useRigs().values()]
+    .flatMap((rig) => [...rig.axes.values()])
+    .filter((axis) => axis.can("set_gains") || hasGainParameters(axis));
   const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis) ?? axes[0];
   if (!axis) return html`<h1>Tuning</h1><p>No axis with a position loop of its own is known yet.</p>`;
   return html`<h1>Tuning</h1>
     <${AxisChoice} axes=${axes} axis=${axis} page="tuning" />
-    <${Bench} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`;
+    ${
+      hasGainParameters(axis)
+        ? html`<${ParameterBench} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`
+        : html`<${Bench} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`
+    }`;
 }
 
 function Bench({ axis }) {
