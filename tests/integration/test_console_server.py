@@ -222,7 +222,7 @@ async def test_rigs_are_lost_and_regained_behind_daemons_and_routers(tmp_path):
     assert [(rig["name"], rig["endpoint"]) for rig in described] == [("other", routed), ("sim", direct)]
     assert [reply.get("status") for reply in both.document["rigs"].values()] == ["stopping"] * 2, both.document
     assert {rig["connected"] for rig in lost} == {False}
-    assert all("daemon is not there" in rig["problem"] for rig in lost)
+    assert all("daemon offline" in rig["problem"] for rig in lost)
     assert all(len(rig["axes"]) == 4 for rig in lost)
     assert all(reply["code"] in ("session_failed", "outcome_unknown") for reply in neither.document["rigs"].values())
     assert all(len(reply["axes"]) == 4 for reply in regained.document["rigs"].values())
