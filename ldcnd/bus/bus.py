@@ -109,8 +109,11 @@ class Bus:
 
     # -- for users of the line ---------------------------------------------------------------------------------------
 
-    async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND) -> ReplyT:
+    async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
         """Run one exchange in its lane's turn and return the decoded reply.
+
+        With `once` it is not sent again when the node says that our packet was damaged: the damage may be in what the
+        node says, and then the packet was executed.
 
         Cancelling the caller never leaves half a packet on the wire; what was sent is completed and its reply dropped.
 
@@ -122,7 +125,7 @@ class Bus:
             PacketRejected: the node refused our packet as damaged at every attempt; it was not executed.
             BadReply: the reply was intact but makes no sense.
         """
-        return await self._submit(exchange, lane)
+        return await self._submit(exchange, lane, once=once)
 
     async def change_baud(self, exchange: Exchange[ReplyT], baud: int) -> ReplyT:
         """Run the exchange that tells the nodes to change their rate, then change ours before anything else is sent.
@@ -262,12 +265,18 @@ class Bus:
         return self.resync.quiet_s + flush_s + self.resync.settle_s + (self.longest_s(probe) if probe else 0.0)
 
     async def _submit(
-        self, exchange: Exchange[ReplyT], lane: Lane, *, then_baud: int | None = None, at_baud: int | None = None
+        self,
+        exchange: Exchange[ReplyT],
+        lane: Lane,
+        *,
+        then_baud: int | None = None,
+        at_baud: int | None = None,
+        once: bool = False,
     ) -> ReplyT:
         if self._line is None:
             raise self._down()
         future: asyncio.Future[ReplyT] = self._loop.create_future()
-        job = Job(exchange, lane, self._loop.time(), future, attempts=self.settings.attempts)
+        job = Job(exchange, lane, self._loop.time(), future, attempts=1 if once else self.settings.attempts)
         job.then_baud, job.at_baud = then_baud, at_baud
         self._queue.push(job, lane)
         self._kick()

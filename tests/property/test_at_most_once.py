@@ -124,9 +124,7 @@ async def live(chain: Chain, dice: random.Random) -> tuple[int, list[str]]:
 def schedule(seed: int) -> tuple[int, list[str]]:
     dice = random.Random(seed)
     share = dice.choice((0.0, 0.05, 0.2, 0.4))
-    # a falsified reply may say that its packet was rejected, and a start that a drive rejects is sent again
-    others = (FaultKind.UNPLUGGED, FaultKind.ECHO, FaultKind.REPLY_FALSIFIED)
-    kinds = [kind for kind in FaultKind if kind not in others]
+    kinds = [kind for kind in FaultKind if kind not in (FaultKind.UNPLUGGED, FaultKind.ECHO)]
     faults = tuple(Fault(kind, share / len(kinds), FAULTS_FROM_S, longest_s=0.02) for kind in kinds)
     if dice.random() < 0.2:
         faults = (*faults, Fault(FaultKind.UNPLUGGED, 0.02, FAULTS_FROM_S, longest_s=0.3))

@@ -35,7 +35,7 @@ from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
 from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, SERVO_CYCLE_S, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
-from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, WrongState
+from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, WrongState
 from ldcnd.exchange import Exchange
 from ldcnd.model.catalogue import verbs_for
 from ldcnd.model.commands import Capability, HomeMethod, PinMode, Verb
@@ -447,8 +447,14 @@ class LdcnAxis(AxisDriver):
 
         Raises:
             OutcomeUnknown: acknowledged, but nothing shows that it has started.
+            PacketRejected: the drive received it damaged, and nothing shows that it has started; it is not sent again.
         """
-        status = await self._bus.execute(commands.start_motion(self._node))
+        try:
+            status = await self._bus.execute(commands.start_motion(self._node), once=True)
+        except PacketRejected:
+            if await self._has_started():
+                return  # it was the reply that was damaged
+            raise
         if status.flags & StatusFlag.MOVE_DONE and not await self._has_started():
             raise OutcomeUnknown(
                 f"axis {self.spec.name}: the start was acknowledged, but the drive shows no sign of it",
