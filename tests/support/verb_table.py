@@ -33,7 +33,6 @@ EXPLAINED = {
     ("outcome", "console"): "the events of the rig show it",
     ("rehearse", "console"): "a loss is rehearsed at the machine, with `ldcnd drill`",
     ("move_relative", "documentation"): "`ldcnd axis move --relative`, in the reference of the command line",
-    ("read_parameter", "console"): "the page of the parameters reads all of them",
     ("read_monitors", "console"): "the page of the axis shows the monitors as they are published",
     ("move_together", "console"): "answered by the console's server; no page sends it yet: `ldcnd group move`",
     ("set_outputs", "console"): "not there yet: `ldcnd axis outputs`",
