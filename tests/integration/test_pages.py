@@ -32,6 +32,7 @@ NOT_RUN = {
         "test_the_example_follows_a_moving_axis_to_its_target"
     ),
     (FIRST_RIG, "python3 -m venv ldcnd-env"): "fetches packages",
+    ("docs/how-to/write-a-client.md", "import asyncio, ldcnd"): "test_the_first_program_runs",
     ("docs/how-to/console.md", "pip install 'ldcnd[console]'"): (
         "fetches packages; tests/integration/test_console_server.py runs the console"
     ),

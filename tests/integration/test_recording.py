@@ -90,7 +90,7 @@ async def test_the_file_says_what_was_recorded(tmp_path):
     await record_a_move(path, 1.0)
 
     documents = attached(path)
-    described = {"daemon.json", "commands.json", "plan.json", "configuration.json", "axes/x.json", "buses/line0.json"}
+    described = {"daemon.json", "commands.json", "budget.json", "configuration.json", "axes/x.json", "buses/line0.json"}
     assert described <= set(documents)
     assert RigConfig.model_validate(documents["configuration.json"]).bus[0].axis[0].name == "x"
     assert documents["axes/x.json"]["unit"] == "mm"
