@@ -50,7 +50,7 @@ async def test_low_axes_are_polled_now_and_then_even_where_high_ones_want_all_of
     config = ranked_config({"high": Asked(1, 200.0), "low": Asked(30, 10.0)}, baud=19_200)
 
     async with running_rig(config) as rig:
-        await asyncio.sleep(2.0)
+        await asyncio.sleep(12.0)  # two rounds, until the rates are known
         seen = await granted(rig, 30)
 
     assert seen.of("low")[0] * 10.0 >= ALIVE_HZ * 0.9
@@ -92,7 +92,7 @@ async def test_a_trace_as_fast_as_possible_takes_nothing_from_high_axes_of_a_ful
     asked = {"high": Asked(2, 50.0), "normal": Asked(20, 40.0), "low": Asked(1, 40.0)}
 
     async with running_rig(ranked_config(asked, order=order)) as rig:
-        await asyncio.sleep(2.0)
+        await asyncio.sleep(10.0)
         before = await granted(rig, 4)
         await arm_trace(rig.client, "low23", TakeTrace(channels=("position",), samples=5000))
         await asyncio.sleep(1.0)

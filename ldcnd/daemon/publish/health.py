@@ -46,12 +46,14 @@ class _Rate:
             now_s: when the report is made.
             least_s: how long it takes to tell.
         """
-        lasted_s, more = (at_ns - self._at_ns) / 1e9, count - self._count
-        hz = more / lasted_s if more > 0 and lasted_s > 0 else 0.0
-        if now_s - self._looked_s >= least_s - CLOCK_S and now_s > self._looked_s:
-            self._hz = hz
-            self._looked_s, self._count, self._at_ns = now_s, count, at_ns
-        return self._hz or hz
+        if count > self._count and at_ns > self._at_ns:
+            hz = (count - self._count) * 1e9 / (at_ns - self._at_ns)
+            if now_s - self._looked_s >= least_s - CLOCK_S and now_s > self._looked_s:
+                self._hz = hz
+                self._looked_s, self._count, self._at_ns = now_s, count, at_ns
+            return self._hz or hz
+        # what comes every five seconds is not missed before some of these have passed
+        return self._hz if (now_s - self._looked_s) * self._hz < TURNS else 0.0
 
 
 class HealthWatch:
