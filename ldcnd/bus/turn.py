@@ -4,6 +4,8 @@ import asyncio
 from abc import ABC, abstractmethod
 from typing import Any
 
+from typing_extensions import override
+
 from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.queue import Lane
@@ -74,12 +76,12 @@ class PollTurn(Turn):
         self.order = order
 
     @property
+    @override
     def laborious(self) -> bool:
-        """See `Turn`."""
         return self.poller.laborious
 
+    @override
     def completed(self, reply: bytes, timing: Timing) -> None:
-        """See `Turn`."""
         if self.order and reply:
             self.order.observe(self.exchange.node, timing)
         try:
@@ -89,13 +91,13 @@ class PollTurn(Turn):
             return
         self.poller.deliver(value, timing)
 
+    @override
     def lost(self, error: BusError) -> bool:
-        """See `Turn`."""
         self.poller.missed(error)
         return False
 
+    @override
     def rejected(self) -> bool:
-        """See `Turn`."""
         self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
         return False
 
@@ -129,8 +131,8 @@ class Job(Turn):
         if not self.future.done():
             self.future.set_exception(error)
 
-    def completed(self, reply: bytes, timing: Timing) -> None:  # noqa: ARG002 - part of the contract
-        """See `Turn`."""
+    @override
+    def completed(self, reply: bytes, timing: Timing) -> None:
         if self.future.done():
             return
         try:
@@ -140,8 +142,8 @@ class Job(Turn):
             return
         self.future.set_result(value)
 
+    @override
     def lost(self, error: BusError) -> bool:
-        """See `Turn`."""
         exchange = self.exchange
         if not exchange.repeatable:
             self.fail(
@@ -162,8 +164,8 @@ class Job(Turn):
         )
         return False
 
+    @override
     def rejected(self) -> bool:
-        """See `Turn`."""
         if self.attempts_left > 0:
             return True
         self.fail(

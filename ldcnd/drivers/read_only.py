@@ -2,6 +2,8 @@
 
 from typing import NoReturn
 
+from typing_extensions import override
+
 from ldcnd.drivers.driver import (
     AnalogMotion,
     AxisDriver,
@@ -24,41 +26,41 @@ class ReadOnlyAxis(AxisDriver):
         """See `AxisDriver`; one exchange cannot tell so much here."""
         self._refuse(f"read {', '.join(sorted(items))} at once")
 
-    def quantise(self, motion: Motion) -> Motion:  # noqa: ARG002 - part of the contract
-        """See `AxisDriver`."""
+    @override
+    def quantise(self, motion: Motion) -> Motion:
         self._refuse("move")
 
+    @override
     async def power(self, *, on: bool) -> None:
-        """See `AxisDriver`."""
         self._refuse("be enabled" if on else "be disabled")
 
+    @override
     async def load(
         self,
-        motion: Motion | AnalogMotion | PwmOutput,  # noqa: ARG002 - part of the contract
+        motion: Motion | AnalogMotion | PwmOutput,
         *,
-        home: HomeCapture | None = None,  # noqa: ARG002 - part of the contract
+        home: HomeCapture | None = None,
     ) -> None:
-        """See `AxisDriver`."""
         self._refuse("move")
 
+    @override
     async def start(self) -> None:
-        """See `AxisDriver`."""
         self._refuse("move")
 
-    async def stop(self, mode: StopMode) -> None:  # noqa: ARG002 - part of the contract
-        """See `AxisDriver`."""
+    @override
+    async def stop(self, mode: StopMode) -> None:
         self._refuse("be stopped")
 
+    @override
     async def captured_home(self) -> int:
-        """See `AxisDriver`."""
         self._refuse("home")
 
+    @override
     async def reset(self) -> None:
-        """See `AxisDriver`."""
         self._refuse("be reset")
 
-    async def set_gains(self, gains: Gains) -> None:  # noqa: ARG002 - part of the contract
-        """See `AxisDriver`."""
+    @override
+    async def set_gains(self, gains: Gains) -> None:
         self._refuse("take gains")
 
     def _refuse(self, what: str) -> NoReturn:

@@ -6,6 +6,8 @@ On a virtual clock it is reproducible bit by bit. On the wall clock its replies 
 
 import asyncio
 
+from typing_extensions import override
+
 from ldcnd.errors import TransportLost
 from ldcnd.sim.chain import Chain
 from ldcnd.transport.transport import Receiver, Transport
@@ -32,14 +34,14 @@ class SimulatedLine(Transport):
         """Return for how long bytes have been on the chain's lines since it was built."""
         return self._chain.wire_busy_s
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self._receiver = receiver
         self._chain.discard(self._loop.time())
         self._arm()
 
+    @override
     def write(self, data: bytes) -> None:
-        """See `Transport`."""
         if self._gone:
             raise TransportLost(self._gone)
         self._chain.write(self._loop.time(), data)
@@ -48,19 +50,19 @@ class SimulatedLine(Transport):
     def expect(self, reply_bytes: int) -> None:
         """Do nothing: the chain's delivery decides how replies are cut into pieces."""
 
+    @override
     def discard_input(self) -> None:
-        """See `Transport`."""
         self._chain.discard(self._loop.time())
         self._arm()
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         if self._gone:
             raise TransportLost(self._gone)
         self._chain.baud = baud
 
+    @override
     async def close(self) -> None:
-        """See `Transport`."""
         self._disarm()
         if self._farewell:
             self._farewell.cancel()

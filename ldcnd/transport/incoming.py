@@ -2,6 +2,8 @@
 
 import asyncio
 
+from typing_extensions import override
+
 from ldcnd.errors import TransportLost
 from ldcnd.transport.transport import Receiver
 
@@ -36,13 +38,13 @@ class Incoming(asyncio.Protocol):
         self.reason = self.reason or f"{self._name} was lost: {why}"
         return TransportLost(self.reason, remedy="check the adapter and its cable; the port is opened again by itself")
 
+    @override
     def data_received(self, data: bytes) -> None:
-        """See `asyncio.Protocol`."""
         if self._receiver and not self.reason:
             self._receiver.data_received(data)
 
+    @override
     def connection_lost(self, exc: Exception | None) -> None:
-        """See `asyncio.Protocol`."""
         self.lost(str(exc) if exc else "the far end closed it")
         self.ended.set()
         self._report()

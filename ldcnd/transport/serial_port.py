@@ -22,6 +22,7 @@ from typing import Literal
 import serial
 import serial_asyncio
 import structlog
+from typing_extensions import override
 
 from ldcnd.errors import TransportLost
 from ldcnd.transport.adapter import LineErrors, line_errors
@@ -178,12 +179,12 @@ class SerialPort(Transport):
         """See `Transport`: standard rates were tried when the port was opened, another one shows when it is set."""
         return baud not in STANDARD_BAUDS or baud in self._port.bauds
 
+    @override
     def line_errors(self) -> LineErrors | None:
-        """See `Transport`."""
         return None if self._incoming.reason else line_errors(self._descriptor)
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self.discard_input()
         self._incoming.attach(receiver)
 
@@ -206,8 +207,8 @@ class SerialPort(Transport):
             return f"the USB adapter is gone, unplugged or reset ({what})"
         return "the far end closed it" if self._is_pseudo else what
 
+    @override
     def write(self, data: bytes) -> None:
-        """See `Transport`."""
         self._require_usable()
         try:
             written = os.write(self._descriptor, data)
@@ -227,8 +228,8 @@ class SerialPort(Transport):
             self._least_bytes = reply_bytes
             self._set_least_bytes()
 
+    @override
     def collect(self) -> None:
-        """See `Transport`."""
         if self._least_bytes > 1 and not self._incoming.reason:
             self._readable()
 
@@ -248,15 +249,15 @@ class SerialPort(Transport):
             termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
             self._settings[self._least_bytes] = fcntl.ioctl(self._descriptor, termios.TCGETS, bytes(SETTINGS_BYTES))
 
+    @override
     def discard_input(self) -> None:
-        """See `Transport`."""
         if not self._incoming.reason:
             # a port that is gone has no input; its reader reports the loss
             with contextlib.suppress(*PortFault):
                 self._port.reset_input_buffer()
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         self._require_usable()
         try:
             made = self._port.tune(baud)

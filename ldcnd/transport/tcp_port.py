@@ -9,6 +9,8 @@ import contextlib
 import os
 import socket
 
+from typing_extensions import override
+
 from ldcnd.errors import NotSupported, TransportLost
 from ldcnd.transport.incoming import Incoming
 from ldcnd.transport.transport import Receiver, Transport
@@ -54,13 +56,13 @@ class TcpPort(Transport):
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
         self._descriptor: int = end.fileno()
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self.discard_input()
         self._incoming.attach(receiver)
 
+    @override
     def write(self, data: bytes) -> None:
-        """See `Transport`."""
         if self._incoming.reason or self._stream.is_closing():
             raise self._incoming.lost("the far end closed it")
         self._stream.write(data)
@@ -73,8 +75,8 @@ class TcpPort(Transport):
     def expect(self, reply_bytes: int) -> None:
         """Ignore the hint: a stream has no such threshold worth a system call."""
 
+    @override
     def discard_input(self) -> None:
-        """See `Transport`."""
         if self._incoming.reason:
             return
         # nothing more to read ends it; the end of the stream stays readable, so the loop still reports it

@@ -16,6 +16,8 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Protocol
 
+from typing_extensions import override
+
 from ldcnd.errors import ReplayDeviation, TransportLost
 from ldcnd.transport.transport import Receiver, Transport
 from ldcnd.wirelog.recorder import ARRIVALS, AT_ONCE_REMARK, WireEvent, WireRecord
@@ -281,12 +283,12 @@ class ReplayLine(Transport):
         """See `Transport`: a host that was held up still took what it found then."""
         return self._replay.lag_s()
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self.receiver = receiver
 
+    @override
     def write(self, data: bytes) -> None:
-        """See `Transport`."""
         self._require_open()
         self._replay.sent(data)
 
@@ -296,13 +298,13 @@ class ReplayLine(Transport):
     def discard_input(self) -> None:
         """Do nothing: what was dropped then is not in the capture."""
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         self._require_open()
         self._replay.baud_set(baud)
 
+    @override
     async def close(self) -> None:
-        """See `Transport`."""
         self.receiver = None
         self._replay.closed(self)
 

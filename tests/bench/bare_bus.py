@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 
 import structlog
+from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
@@ -31,16 +32,18 @@ class Asker(Poller[Status]):
         # polls know no short replies, see `LdcnAxis.reading`
         self._exchange = replace(commands.read_status(Node(address, PROFILES["ls-182ap"]), ITEMS), total_bytes=None)
 
+    @override
     def next_exchange(self, now_s: float) -> Exchange[Status]:
-        """See `Poller`."""
         self.due_at_s = self.deadline_at_s = now_s
         return self._exchange
 
+    @override
     def deliver(self, reply: Status, timing: Timing) -> None:
-        """See `Poller`."""
+        pass
 
+    @override
     def missed(self, error: BusError) -> None:
-        """See `Poller`."""
+        pass
 
 
 async def main(terminal: str, modules: int) -> None:

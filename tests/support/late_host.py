@@ -5,6 +5,8 @@ have come.
 import asyncio
 import random
 
+from typing_extensions import override
+
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
 from ldcnd.transport.transport import Receiver, Transport
@@ -30,45 +32,45 @@ class LateHost(Transport, Receiver):
         self._written_by_s = self._received_by_s = 0.0
         self._pending: set[asyncio.TimerHandle] = set()
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self._receiver = receiver
         self._line.attach(self)
 
+    @override
     def write(self, data: bytes) -> None:
-        """See `Transport`."""
         self._asked_at_s = self._loop.time()
         self._written_by_s = at_s = max(self._written_by_s, self._loop.time() + self._dice.uniform(*self._range_s))
         self._later(at_s, lambda: self._line.write(data))
 
+    @override
     def expect(self, reply_bytes: int) -> None:
-        """See `Transport`."""
         self._line.expect(reply_bytes)
 
+    @override
     def discard_input(self) -> None:
-        """See `Transport`."""
         self._line.discard_input()
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         self._line.set_baud(baud)
 
+    @override
     async def close(self) -> None:
-        """See `Transport`."""
         for handle in self._pending:
             handle.cancel()
         await self._line.close()
 
+    @override
     def data_received(self, data: bytes) -> None:
-        """See `Receiver`."""
         self._received_by_s = at_s = max(self._received_by_s, self._loop.time() + self._dice.uniform(*self._range_s))
         if self._receiver:
             self.busy_s += at_s - self._asked_at_s
             receiver = self._receiver
             self._later(at_s, lambda: receiver.data_received(data))
 
+    @override
     def transport_lost(self, reason: str) -> None:
-        """See `Receiver`."""
         if self._receiver:
             self._receiver.transport_lost(reason)
 

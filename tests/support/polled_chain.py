@@ -6,6 +6,8 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.settings import BusSettings, ServoCycle
@@ -39,20 +41,20 @@ class DrivePoller(Poller[Status]):
         self.errors: list[BusError] = []
         self._exchange = commands.read_status(Node(address, PROFILES["ls-182ap"]), ITEMS)
 
+    @override
     def next_exchange(self, now_s: float) -> Exchange[Status]:
-        """See `Poller`."""
         self.asked_at_s.append(now_s)
         self.due_at_s += max(1, 1 + int((now_s - self.due_at_s) / self.period_s)) * self.period_s
         self.deadline_at_s = self.due_at_s + self.period_s
         return self._exchange
 
+    @override
     def deliver(self, reply: Status, timing: Timing) -> None:
-        """See `Poller`."""
         del reply
         self.timings.append(timing)
 
+    @override
     def missed(self, error: BusError) -> None:
-        """See `Poller`."""
         self.errors.append(error)
 
 

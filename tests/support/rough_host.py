@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from typing_extensions import override
+
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
 from ldcnd.transport.transport import Receiver
@@ -115,12 +117,12 @@ class RoughHost(Receiver):
         self.heard = bytearray()
         line.attach(self)
 
+    @override
     def data_received(self, data: bytes) -> None:
-        """See `Receiver`."""
         self.heard += data
 
+    @override
     def transport_lost(self, reason: str) -> None:
-        """See `Receiver`."""
         raise AssertionError(reason)
 
     async def do(self, deeds: Iterable[Deed], cuts: Iterator[tuple[int, float]]) -> None:

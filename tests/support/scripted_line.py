@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from typing_extensions import override
+
 from ldcnd.errors import TransportLost
 from ldcnd.transport.transport import Receiver, Transport
 
@@ -96,12 +98,12 @@ class ScriptedLine(Transport):
 
     # -- transport ---------------------------------------------------------------------------------------------------
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self._receiver = receiver
 
+    @override
     def write(self, data: bytes) -> None:
-        """See `Transport`."""
         if self._gone or self.fails_to_write:
             self.history.append("refused")
             raise TransportLost("the port is gone")
@@ -122,8 +124,8 @@ class ScriptedLine(Transport):
         if len(self._held) >= reply_bytes:
             self._loop.call_soon(self.collect)
 
+    @override
     def collect(self) -> None:
-        """See `Transport`."""
         data, self._held = self._held, b""
         if data and self._receiver and not self._gone:
             self._receiver.data_received(data)
@@ -133,15 +135,15 @@ class ScriptedLine(Transport):
         self._held = b""
         self.history.append("discard")
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         if self._gone:
             raise TransportLost("the port is gone")
         self.history.append(f"baud {baud}")
         self.baud = baud
 
+    @override
     async def close(self) -> None:
-        """See `Transport`."""
         self._silence()
         self.history.append("close")
 

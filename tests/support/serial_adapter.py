@@ -32,6 +32,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from typing_extensions import override
+
 from ldcnd.errors import TransportLost
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
@@ -78,8 +80,8 @@ class Fifo(Holding):
     byte_s: float
     trigger: int = 8
 
+    @override
     def due_s(self, held: int, last_byte_s: float, handed_over_s: float) -> float:
-        """See `Holding`."""
         return last_byte_s if held >= self.trigger else last_byte_s + 4 * self.byte_s
 
 
@@ -126,13 +128,13 @@ class SerialAdapter(Transport, Receiver):
         self._timer: asyncio.TimerHandle | None = None
         self.takes_bytes = math.inf
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self._receiver = receiver
         self._line.attach(self)
 
+    @override
     def offers(self, baud: int) -> bool:
-        """See `Transport`."""
         return self._offered(baud)
 
     def write(self, data: bytes) -> None:
@@ -150,24 +152,24 @@ class SerialAdapter(Transport, Receiver):
         """See `Transport`: what the chip still holds comes later, as it does from real ones."""
         self._line.discard_input()
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         self._line.set_baud(baud)
 
+    @override
     async def close(self) -> None:
-        """See `Transport`."""
         self._disarm()
         self._receiver = None
         await self._line.close()
 
+    @override
     def data_received(self, data: bytes) -> None:
-        """See `Receiver`."""
         self._held.add(data, self._loop.time())
         self._disarm()
         self._timer = self._loop.call_at(max(self._held.due_s(), self._loop.time()), self._hand_over)
 
+    @override
     def transport_lost(self, reason: str) -> None:
-        """See `Receiver`."""
         self._disarm()
         if self._receiver:
             self._receiver.transport_lost(reason)

@@ -6,6 +6,8 @@ real lines, neither address nor number of a reply is checked before it is credit
 
 from collections.abc import Set as AbstractSet
 
+from typing_extensions import override
+
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
 from ldcnd.errors import BadReply, BusError
@@ -133,11 +135,11 @@ class ToyPoller(Poller[int]):
         self.due_at_s += max(1, 1 + int((now_s - self.due_at_s) / self.period_s)) * self.period_s
         return exchange(len(self.asked_at_s) & 0x7FFF, self.node)
 
+    @override
     def deliver(self, reply: int, timing: Timing) -> None:
-        """See `Poller`."""
         self.delivered.append(reply)
         self.timings.append(timing)
 
+    @override
     def missed(self, error: BusError) -> None:
-        """See `Poller`."""
         self.errors.append(error)

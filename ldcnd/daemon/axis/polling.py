@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from typing_extensions import override
+
 from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.driver import AxisDriver, AxisReading
 from ldcnd.errors import BusError
@@ -68,8 +70,8 @@ class AxisPoller(Poller[AxisReading]):
         self._slower_s = {item: 1.0 / rate for item, rate in rates_hz.items() if 1.0 / rate > self._period_s}
         self._fastest = frozenset(rates_hz) - frozenset(self._slower_s)
 
+    @override
     def prepare(self, at_s: float) -> None:
-        """See `Poller`."""
         self._prepared = self._turn_at(at_s)
 
     def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
@@ -111,6 +113,6 @@ class AxisPoller(Poller[AxisReading]):
             self.deadline_at_s = timing.received_at_s + AGAIN_S
         self._reschedule(self)
 
+    @override
     def missed(self, error: BusError) -> None:
-        """See `Poller`."""
         self._missed(error)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from pydantic import ValidationError
+from typing_extensions import override
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import of_one_line
@@ -56,8 +57,8 @@ class OverheardSession(MemorySession):
         super().__init__(broker)
         self._take = take
 
+    @override
     def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
-        """See `Session`."""
         self._take(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
         super().publish(key, payload, encoding=encoding, qos=qos, measured_at_ns=measured_at_ns)
 

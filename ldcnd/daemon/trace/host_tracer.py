@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority, next_on_grid
 from ldcnd.drivers.driver import AxisDriver, AxisReading
@@ -139,8 +141,8 @@ class HostCapture(Poller[AxisReading]):
         if len(self.samples) >= self._wanted.samples:
             self.done.set()
 
-    def missed(self, error: BusError) -> None:  # noqa: ARG002 - their number is enough
-        """See `Poller`."""
+    @override
+    def missed(self, error: BusError) -> None:
         self.missed_polls += 1
 
     def fail(self, error: BusError) -> None:
@@ -231,8 +233,8 @@ class HostTracer(Tracer):
         self._require_reachable = require_reachable
         self._capture: HostCapture | None = None
 
+    @override
     async def arm(self, request: TakeTrace) -> ArmedTrace:
-        """See `Tracer`."""
         axis = self._driver.spec.name
         require_channels(axis, request, self.channels)
         require_no_full_scale(axis, request, request.full_scale)
@@ -279,8 +281,8 @@ class HostTracer(Tracer):
         """See `Tracer`; a capture dies with the daemon that made it."""
         return False
 
+    @override
     def disconnected(self) -> None:
-        """See `Tracer`."""
         if self._capture:
             self._capture.fail(BusDown("the drive or its line was lost while it was traced"))
 
@@ -298,8 +300,8 @@ class ArmedCapture(ArmedTrace):
         self._wait_s = wait_s
         self._limit_s = limit_s
 
+    @override
     async def record(self, progress: Progress) -> Recorded:
-        """See `ArmedTrace`."""
         capture = self._capture
         try:
             async with self._limit(self._wait_s, "the trigger did not come"):

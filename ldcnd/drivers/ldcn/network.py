@@ -9,6 +9,8 @@ from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from typing import Any
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.bus.resync import Resync
@@ -64,12 +66,12 @@ class ModuleWatch(Poller[Status]):
         self.deadline_at_s = self.due_at_s + PERIOD_S
         return self._exchange
 
-    def deliver(self, reply: Status, timing: Timing) -> None:  # noqa: ARG002 - part of the contract
-        """See `Poller`."""
+    @override
+    def deliver(self, reply: Status, timing: Timing) -> None:
         self.status = int(reply.flags)
 
-    def missed(self, error: BusError) -> None:  # noqa: ARG002 - part of the contract
-        """See `Poller`."""
+    @override
+    def missed(self, error: BusError) -> None:
         self.status = None
 
 
@@ -270,17 +272,17 @@ class LdcnNetwork(Network):
     # -- while the line is up ----------------------------------------------------------------------------------------
 
     @property
+    @override
     def modules(self) -> tuple[FoundModule, ...]:
-        """See `Network`."""
         return tuple(self._module(address, identity) for address, identity in sorted(self._identities.items()))
 
     @property
+    @override
     def watches(self) -> tuple[Poller[Any], ...]:
-        """See `Network`."""
         return tuple(self._watches.values())
 
+    @override
     def incomplete(self) -> bool:
-        """See `Network`."""
         return any(self._bus.misses(each.address) >= MISSES_UNTIL_MUTE for each in self._expected)
 
     async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:
@@ -295,16 +297,16 @@ class LdcnNetwork(Network):
         heard = await self._rejoin.look(silent, addressing)
         return frozenset(self._names[address] for address in heard if address in self._names)
 
+    @override
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
-        """See `Network`."""
         await self._groups.stop(mode, names)
 
+    @override
     async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
-        """See `Network`."""
         await self._groups.start(motions, still_wanted)
 
+    @override
     async def snapshot(self) -> Mapping[str, int]:
-        """See `Network`."""
         return await self._groups.snapshot()
 
     def _module(self, address: int, identity: Identity) -> FoundModule:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from enum import IntFlag
 from functools import partial
 
+from typing_extensions import override
+
 from ldcnd.drivers.ldcn.commands import Destination
 from ldcnd.drivers.ldcn.packet import MOST_ADDRESS, Command, Packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import PIC_IO, Profile
@@ -274,8 +276,8 @@ class IoNode(Destination[IoStatus]):
                 f"node address {self.address} is outside 0 to {MOST_ADDRESS}", value=self.address, limit=MOST_ADDRESS
             )
 
+    @override
     def exchange(self, request: bytes, items: int | None, *, repeatable: bool) -> Exchange[IoStatus]:
-        """See `Destination`."""
         asked = self.items if items is None else IoItem(items)
         reply_bytes, rejected_bytes = io_status_bytes(asked), io_status_bytes(self.items)
         return Exchange(

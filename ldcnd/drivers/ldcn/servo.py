@@ -13,6 +13,8 @@ from dataclasses import asdict, replace
 from types import MappingProxyType
 from typing import Any
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers import driver
@@ -177,8 +179,8 @@ class LdcnAxis(AxisDriver):
         """One servo cycle (LS-182AP manual, "Encoder Input")."""
         return SERVO_CYCLE_S * (self.state.servo_divisor if self.profile.divisor_slows_profile else 1)
 
+    @override
     def registers(self) -> tuple[Register, ...]:
-        """See `AxisDriver`."""
         return self._book.all()
 
     # -- reading -----------------------------------------------------------------------------------------------------
@@ -213,8 +215,8 @@ class LdcnAxis(AxisDriver):
 
     # -- power -------------------------------------------------------------------------------------------------------
 
+    @override
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
-        """See `AxisDriver`."""
         trajectory = trajectory_of(motion, self.state.servo_divisor, self.profile)
         return commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
@@ -329,8 +331,8 @@ class LdcnAxis(AxisDriver):
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
+    @override
     def quantise(self, motion: Motion) -> Motion:
-        """See `AxisDriver`."""
         return quantised(motion, self.state.servo_divisor, self.profile)
 
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
@@ -487,8 +489,8 @@ class LdcnAxis(AxisDriver):
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
         await self._bus.execute(replace(exchange, repeatable=False))
 
+    @override
     async def captured_home(self) -> int:
-        """See `AxisDriver`."""
         status = await self._bus.execute(commands.read_status(self._node, StatusItem.HOME))
         if status.home is None:
             raise BadReply(f"axis {self.spec.name}: the status packet lacks the home position")
@@ -496,8 +498,8 @@ class LdcnAxis(AxisDriver):
 
     # -- registers ---------------------------------------------------------------------------------------------------
 
+    @override
     async def set_gains(self, gains: driver.Gains) -> None:
-        """See `AxisDriver`."""
         exchange = commands.set_gain(self._node, Gains(**asdict(gains)))
         values = gain_values(gains)
         self._book.doubt(values)

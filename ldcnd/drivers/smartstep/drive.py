@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
 from ldcnd.drivers.driver import AxisReading, AxisSpec, Fault, ReadingListeners
@@ -92,8 +94,8 @@ class SmartStepAxis(ReadOnlyAxis):
         self._poller: UnitPoller | None = None
 
     @property
+    @override
     def parameters(self) -> ParameterAccess:
-        """See `AxisDriver`."""
         return self._parameters
 
     def identified(self, type_word: int, version: int) -> None:
@@ -103,8 +105,8 @@ class SmartStepAxis(ReadOnlyAxis):
         title = "R7D-APL or R7D-APH" if known is DriverType.R7D_AP else f"unlisted type {type_word:04X}H"
         self.identity = f"SmartStep {title} (version {version:04X}H)"
 
+    @override
     def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any]:
-        """See `AxisDriver`."""
 
         def read(words: UnitWords, item: TelemetryItem, timing: Timing) -> None:
             listeners.observed(self.interpret(words), frozenset({item}), timing)

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
 from ldcnd.drivers.driver import AxisDriver
@@ -50,8 +52,8 @@ class SmartStepPort(Transport):
 
     # -- transport ---------------------------------------------------------------------------------------------------
 
+    @override
     def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
         self._receiver = receiver
         self._port.attach(self)
 
@@ -65,20 +67,20 @@ class SmartStepPort(Transport):
             else:
                 self._send()
 
+    @override
     def expect(self, reply_bytes: int) -> None:
-        """See `Transport`."""
         self._port.expect(reply_bytes)
 
+    @override
     def collect(self) -> None:
-        """See `Transport`."""
         self._port.collect()
 
+    @override
     def discard_input(self) -> None:
-        """See `Transport`."""
         self._port.discard_input()
 
+    @override
     def set_baud(self, baud: int) -> None:
-        """See `Transport`."""
         self._port.set_baud(baud)
 
     async def close(self) -> None:
@@ -90,13 +92,13 @@ class SmartStepPort(Transport):
     # -- receiver ----------------------------------------------------------------------------------------------------
 
     def data_received(self, data: bytes) -> None:
-        """See `Receiver`."""
+        """Pass bytes of the line on, without their parity where that is kept in software."""
         self._quiet_from_s = self._loop.time()
         if self._receiver:
             self._receiver.data_received(strip_parity(data) if self._soft_parity else data)
 
     def transport_lost(self, reason: str) -> None:
-        """See `Receiver`."""
+        """Tell the receiver that the line is gone."""
         self._forget()
         if self._receiver:
             self._receiver.transport_lost(reason)

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from typing_extensions import override
+
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.parameter_access import ClearedCounter, ParameterAccess, Written
 from ldcnd.drivers.smartstep.addresses import Register
@@ -340,24 +342,24 @@ class UnitParameters(ParameterAccess):
         self._cleared = cleared
 
     @property
+    @override
     def self_hearing(self) -> bool:
-        """See `ParameterAccess`."""
         return self._words.self_hearing
 
+    @override
     def known(self) -> tuple[ParameterInfo, ...]:
-        """See `ParameterAccess`."""
         return tuple(map(parameter_info, PARAMETERS))
 
+    @override
     async def read(self, parameter: str, *, unlisted: bool = False) -> ParameterValue:
-        """See `ParameterAccess`."""
         return await self._store.read(self._store.find(parameter, unlisted=unlisted))
 
+    @override
     async def read_all(self) -> tuple[ParameterValue, ...]:
-        """See `ParameterAccess`."""
         return await self._store.read_all()
 
+    @override
     async def facts(self) -> DriveFacts:
-        """See `ParameterAccess`."""
         words = self._words
         return DriveFacts(
             driver_type=await words.read(Register.DRIVER_TYPE),
@@ -367,28 +369,28 @@ class UnitParameters(ParameterAccess):
             switches=tuple(each.name or "" for each in function_switches(await words.read(Register.FUNCTION_SWITCHES))),
         )
 
+    @override
     async def plan(self, request: PlanParameters) -> PlannedParameters:
-        """See `ParameterAccess`."""
         return plan_writes(request, await self._store.read_all(), await self.facts())
 
+    @override
     async def write(self, request: WriteParameter) -> Written:
-        """See `ParameterAccess`."""
         return await self._store.write(request)
 
+    @override
     async def clear_counter(self, counter: CounterName) -> ClearedCounter:
-        """See `ParameterAccess`."""
         cleared = await clear_counter(self._words, COUNTERS[counter])
         self._cleared()
         return ClearedCounter(cleared.value, cleared.remarks)
 
+    @override
     async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
-        """See `ParameterAccess`."""
         present = _entry(await self._words.read(Register.PRESENT_ALARM))
         history = [_entry(await self._words.read(Register.ALARM_HISTORY + place)) for place in range(HISTORY_LENGTH)]
         return present, tuple(history)
 
+    @override
     async def monitors(self, names: tuple[MonitorName, ...]) -> tuple[MonitorValue, ...]:
-        """See `ParameterAccess`."""
         values = []
         for name in names or tuple(MonitorName):
             try:
@@ -403,8 +405,8 @@ class UnitParameters(ParameterAccess):
             return counter_value(name, value.signed, resolved=value.quality is CounterQuality.RESOLVED)
         return word_value(name, await self._words.read(WORDS[name].address), self._profile)
 
+    @override
     def assumptions(self) -> tuple[AssumptionInfo, ...]:
-        """See `ParameterAccess`."""
         return tuple(assumption_info(self._profile, each) for each in self._profile.assumptions)
 
 

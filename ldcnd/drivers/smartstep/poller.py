@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.drivers.monitor_value import MonitorValue
@@ -171,8 +173,8 @@ class UnitPoller(Poller[int | Refusal]):
             self._address = wanted.address if wanted else self._left.pop(0)
         return with_response_time(reference(self.node, self._address), self._profile)
 
+    @override
     def deliver(self, reply: int | Refusal, timing: Timing) -> None:
-        """See `Poller`."""
         if self._misses >= MISSES_BEFORE_BACKOFF:
             self._misses = 0
             self._back(timing.received_at_s)
@@ -193,8 +195,8 @@ class UnitPoller(Poller[int | Refusal]):
         # behind the others that are due, also with what is late: units take turns word by word
         self._next_turn(timing.received_at_s if self._item else max(timing.received_at_s, due_s))
 
+    @override
     def missed(self, error: BusError) -> None:
-        """See `Poller`."""
         self._misses += 1
         self._abandon()
         self._at_rest_since_position = False

@@ -18,6 +18,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from typing_extensions import override
+
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.smartstep.addresses import OperatingMode, Register, TraceRegister
@@ -346,8 +348,8 @@ class ArmedSmartStep(ArmedTrace):
             raise
         self._running_at_s = self._execution.sent_s
 
+    @override
     async def record(self, progress: Progress) -> Recorded:
-        """See `ArmedTrace`."""
         words, setup = self._words, self._setup
         try:
             late_s = TRIGGER_LATE_S if setup.trigger else 0.0

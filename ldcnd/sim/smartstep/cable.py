@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Sequence
 from functools import partial
 
+from typing_extensions import override
+
 from ldcnd.drivers.smartstep.config import SimulatedEventConfig, SimulatedUnitConfig
 from ldcnd.drivers.smartstep.monitors import function_switches
 from ldcnd.drivers.smartstep.packet import DAMAGED, add_parity, strip_parity
@@ -117,13 +119,13 @@ class SimulatedSmartSteps(Module):
         self.framing = framing
         self._arriving: deque[Transmission] = deque()
 
+    @override
     def hear(self, value: int | None, at_s: float) -> None:
-        """See `Module`."""
         self.cable.host_sends(self._heard(value), at_s - CHARACTER_S)
         self._look(at_s)
 
+    @override
     def advance(self, to_s: float) -> Reply | None:
-        """See `Module`."""
         self._look(to_s)
         if not self._arriving:
             return None

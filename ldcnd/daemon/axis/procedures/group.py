@@ -6,6 +6,8 @@ others have arrived; then the line starts them together, or none of them moves.
 
 import asyncio
 
+from typing_extensions import override
+
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.permit import start_together
@@ -149,8 +151,8 @@ class GroupMember(Procedure):
         """See `Procedure`: there are no further steps."""
         return False
 
+    @override
     async def step(self) -> bool:
-        """See `Procedure`."""
         return False
 
     def _not_started(self, error: LdcndError) -> None:

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from typing_extensions import override
+
 from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import LARGEST_COUNT, AxisMotion, MotionPlan
@@ -138,8 +140,8 @@ class HomeSequence(Procedure):
         self._search = plan_search(motion.config, motion.driver, request)
         self._leg = Leg.SEARCH
 
+    @override
     async def begin(self) -> CommandReply:
-        """See `Procedure`."""
         motion = self._motion
         view = motion.tracker.view()
         guards.check_may_move(view)
@@ -157,15 +159,15 @@ class HomeSequence(Procedure):
             update={"position": search.position, "velocity": plan.velocity, "acceleration": plan.acceleration}
         )
 
+    @override
     def calls_for_step(self, reading: AxisReading) -> bool:
-        """See `Procedure`."""
         resting = reading.profile_done and self._motion.tracker.at_rest
         if self._leg in (Leg.BRAKE, Leg.CLEAR, Leg.FOUND):
             return resting
         return not reading.homing or resting
 
+    @override
     async def step(self) -> bool:
-        """See `Procedure`."""
         turn = self.turn
         reading = self._motion.latest()
         match self._leg:

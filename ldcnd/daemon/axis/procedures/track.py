@@ -1,5 +1,7 @@
 """A stream of set-points that an axis follows without a profile, bounded in step and rate."""
 
+from typing_extensions import override
+
 from ldcnd.config.axis import TrackingConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion
@@ -65,8 +67,8 @@ class SetPoint(Procedure):
         tracker.started(motion.clock.now_s())
         return motion.reply(self.turn).model_copy(update={"position": motion.telemetry.position(target)})
 
-    def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - silence alone ends a stream
-        """See `Procedure`."""
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
         return False
 
     async def step(self) -> bool:
