@@ -1,6 +1,7 @@
 """Which clock a test runs on, and what no test may leave behind."""
 
 import asyncio
+import signal
 from collections.abc import AsyncIterator, Callable, Mapping
 
 import pytest
@@ -12,6 +13,12 @@ from ldcnd.sim.jumping_loop import JumpingLoop
 settings.register_profile("same", derandomize=True, deadline=None, print_blob=True)
 settings.register_profile("new", deadline=None, print_blob=True)
 settings.load_profile("same")
+
+
+def pytest_configure() -> None:
+    """Let programs that tests start take an interrupt, also where the tests themselves run in the background."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_asyncio_loop_factories(

@@ -1,7 +1,10 @@
 """Every verb of an axis and of the rig, typed: what it prints, in which units, and how it ends."""
 
+import asyncio
+
 import pytest
 
+from ldcnd.model.samples import Moving
 from tests.support.command_line import run_all
 from tests.support.process import ROOT, client, daemon
 
@@ -30,12 +33,15 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
             "trace channels x",
             "events --axis x --count 3",
             "stop",
-            "reset",
-            "power off",
         ]
+        typed_at_rest = ["reset", "power off"]
         at = f"-e {endpoint.removeprefix('tcp/')}"
         lines = (f"ldcnd {line.replace(' -- ', f' {at} -- ')}" for line in typed)
         ran = await run_all(tmp_path, *(line if " -- " in line else f"{line} {at}" for line in lines))
+        while {(await rig.state(axis)).moving for axis in "xyzc"} != {Moving.NO}:  # reset is refused until then
+            await asyncio.sleep(0.05)
+        ran += await run_all(tmp_path, *(f"ldcnd {line} {at}" for line in typed_at_rest))
+        typed += typed_at_rest
         state = await rig.state("x")
 
     went = dict(zip(typed, ran, strict=True))
