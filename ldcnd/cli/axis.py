@@ -5,11 +5,10 @@ import click
 from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.derived import derived
 from ldcnd.cli.jog import jog
-from ldcnd.cli.names import axis_of
-from ldcnd.cli.numbers import Finite
 from ldcnd.cli.quantities import decimals, number, sample_text, seconds, state_word
 from ldcnd.cli.rig import stop_rig
 from ldcnd.cli.sending import Sender, commanding
+from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import NotSupported
 from ldcnd.model.commands import (

@@ -8,7 +8,7 @@ import click
 
 from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.numbers import Finite
+from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli.address import address_option
 from ldcnd.cli.connection import DEFAULT_ENDPOINT
+from ldcnd.cli.typed import address_option
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging

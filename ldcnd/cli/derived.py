@@ -7,8 +7,8 @@ from typing import Any, get_args
 import click
 
 from ldcnd.cli.connection import of_options
-from ldcnd.cli.numbers import Finite
 from ldcnd.cli.sending import Sender, Sent, commanding
+from ldcnd.cli.typed import Finite
 from ldcnd.model.commands import AxisCommand
 from ldcnd.model.frozen import attribute_docstrings
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.numbers import Finite
+from ldcnd.cli.typed import Finite
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import WrongState

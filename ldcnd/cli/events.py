@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.names import axis_of
+from ldcnd.cli.typed import axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.events import CommandEvent

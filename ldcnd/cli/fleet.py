@@ -5,8 +5,8 @@ import asyncio
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.numbers import Finite
 from ldcnd.cli.quantities import state_word
+from ldcnd.cli.typed import Finite
 from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.errors import SessionError
 from ldcnd.messaging.session import Session

@@ -11,11 +11,10 @@ import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.names import axis_of
-from ldcnd.cli.numbers import Finite
 from ldcnd.cli.output import show_lines
 from ldcnd.cli.quantities import rounded
 from ldcnd.cli.sending import NAME, halted, halting
+from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError

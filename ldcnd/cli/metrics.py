@@ -4,9 +4,9 @@ import asyncio
 
 import click
 
-from ldcnd.cli.address import address_option
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
+from ldcnd.cli.typed import address_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress

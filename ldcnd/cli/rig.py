@@ -9,11 +9,10 @@ import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.names import axis_of
-from ldcnd.cli.numbers import Finite
 from ldcnd.cli.output import FAILED, show_lines
 from ldcnd.cli.quantities import outcome, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, halted
+from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LeaseExpired

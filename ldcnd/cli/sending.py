@@ -11,9 +11,9 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.names import axis_of
 from ldcnd.cli.output import FAILED, show_lines
 from ldcnd.cli.quantities import number, outcome, values_of
+from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import AxisCommand, CommandReply, Halt, Verb

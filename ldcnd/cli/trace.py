@@ -8,9 +8,8 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.names import axis_of
-from ldcnd.cli.numbers import Finite
 from ldcnd.cli.trace_plot import plot_trace
+from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace

@@ -5,8 +5,8 @@ import sys
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.names import axis_of
-from ldcnd.cli.remedies import in_typed_terms
+from ldcnd.cli.output import in_typed_terms
+from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.commands import WhyReply
 

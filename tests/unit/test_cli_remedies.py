@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import ldcnd
-from ldcnd.cli.remedies import in_typed_terms
+from ldcnd.cli.output import in_typed_terms
 from ldcnd.model.commands import Verb
 
 SOURCES = Path(ldcnd.__file__).parent

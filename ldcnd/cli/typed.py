@@ -1,0 +1,74 @@
+"""What people type: names with the nearest right one, finite numbers, addresses to serve at."""
+
+import math
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
+from typing import TypeVar
+
+import click
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import ConfigError, UnknownAxis
+from ldcnd.listen_address import ListenAddress, parse_listen_address
+from ldcnd.model.meta import AxisInfo
+
+NEAR = 0.4
+"""How alike two names must be, from 0 to 1."""
+
+
+def unknown(what: str, name: str, known: Iterable[str]) -> UnknownAxis:
+    """Return the refusal of a name."""
+    names = sorted(known)
+    by_fold = {each.casefold(): each for each in names}
+    near = by_fold.get(name.casefold()) or next(iter(get_close_matches(name, names, 1, NEAR)), None)
+    meant = f"; did you mean {near!r}?" if near else ""
+    return UnknownAxis(
+        f"there is no {what} {name!r}{meant}", value=name, remedy=f"there are: {', '.join(names) or 'none'}"
+    )
+
+
+async def axis_of(client: RigClient, name: str) -> AxisInfo:
+    """Return what an axis is.
+
+    Raises:
+        UnknownAxis: the rig has none of that name.
+    """
+    axes = {info.axis: info for info in await client.axes()}
+    if name not in axes:
+        raise unknown("axis", name, axes)
+    return axes[name]
+
+
+class Finite(click.FloatRange):
+    """A number, within limits if there are any."""
+
+    name = "number"
+
+    def convert(self, value: float | str, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return it; wrong usage if it is none."""
+        number = float(super().convert(value, param, ctx))  # type: ignore[arg-type]  # click hands over text
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+CommandT = TypeVar("CommandT", bound=Callable[..., object])
+
+
+def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
+    """Return an option of that name, whose value is a `ListenAddress`; anything but HOST:PORT is wrong usage."""
+    return click.option(
+        name,
+        callback=_parsed,
+        default=default,
+        show_default=True,
+        metavar="HOST:PORT",
+        help="Where to serve; port 0 is any.",
+    )
+
+
+def _parsed(_context: click.Context, _parameter: click.Parameter, value: str) -> ListenAddress:
+    try:
+        return parse_listen_address(value)
+    except ConfigError as error:
+        raise click.BadParameter(error.message) from error
