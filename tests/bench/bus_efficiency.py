@@ -1,7 +1,13 @@
-"""How much of the line the whole daemon uses, and what it costs, against the floor in interleaved rounds."""
+"""How much of the line the whole daemon uses, and what it costs, against two floors in interleaved rounds.
+
+How well the line is used is compared with a program in C. What that costs the processor is compared with the least that
+a Python program does (`tests.bench.minimal_master`): the same interpreter, the same sort of system calls, so that the
+ratio says what our code adds, on any machine and at any hour.
+"""
 
 import random
 import statistics
+import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +34,8 @@ ITEMS = ("position", "velocity", "adc", "state")
 STATUS_ITEMS, REPLY_BYTES = 0x0F, 10
 """What a poll for these items asks a PIC-SERVO for, and what comes back."""
 FLOOR = "C floor"
+MINIMAL = "minimal Python master"
+FLOORS = (FLOOR, MINIMAL)
 SETTLE_S = 0.5
 ROUND_S = 1.0
 TRIES = 3
@@ -73,7 +81,12 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Medians over all rounds; ratios are medians of the ratios within a round."""
+    """Medians over all rounds; ratios are medians of the ratios within a round.
+
+    Attributes:
+        efficiency_ratio: to the floor in C.
+        cpu_ratio: to the minimal master in Python.
+    """
 
     conditions: Conditions
     subject: str
@@ -91,7 +104,7 @@ class Result:
 
 
 def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, rounds: int) -> list[Result]:
-    """Run floor, daemon on asyncio and daemon on uvloop side by side."""
+    """Run both floors, daemon on asyncio and daemon on uvloop side by side."""
     line_program, floor_program = programs
     baud = conditions.baud
     new_line = partial(
@@ -103,8 +116,14 @@ def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, r
         command = (floor_program, *line.terminals, str(baud), str(MODULES), str(STATUS_ITEMS), str(REPLY_BYTES))
         running = stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10))
         subjects = [Subject(FLOOR, running, line)]
-        listeners = {}
-        subjects[0].stop()
+        line = stack.enter_context(new_line(ready_baud=baud))
+        endpoint = free_endpoint()
+        arguments = (*line.terminals, str(baud), str(MODULES), str(STATUS_ITEMS), endpoint)
+        command = (sys.executable, "-m", "tests.bench.minimal_master", *arguments)
+        subjects.append(Subject(MINIMAL, stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10)), line))
+        listeners = {MINIMAL: stack.enter_context(subscriber(endpoint))}
+        for subject in subjects:
+            subject.stop()
         for name, uvloop in (("ldcnd, asyncio", False), ("ldcnd, uvloop", True)):
             line = stack.enter_context(new_line())
             config = folder / f"bench-{baud}-{uvloop}.toml"
@@ -166,8 +185,7 @@ def _summary(conditions: Conditions, rounds: list[dict[str, Round]]) -> list[Res
     results = []
     for name in rounds[0]:
         own = [each[name] for each in rounds]
-        floor = [each[FLOOR] for each in rounds]
-        pairs = list(zip(own, floor, strict=True))
+        pairs = [(each[name], each[FLOOR]) for each in rounds]
         results.append(
             Result(
                 conditions=conditions,
@@ -179,13 +197,13 @@ def _summary(conditions: Conditions, rounds: list[dict[str, Round]]) -> list[Res
                 turnaround_p50_us=_median(each.turnaround_p50_us for each in own),
                 turnaround_p99_us=_median(each.turnaround_p99_us for each in own),
                 cpu_us=_median(each.cpu_us for each in own),
-                cpu_ratio=_median(each.cpu_us / base.cpu_us for each, base in pairs),
+                cpu_ratio=_median(each[name].cpu_us / each[MINIMAL].cpu_us for each in rounds),
                 cpu_us_per_sample=_median(each.cpu_us / (each.samples or 1) for each in own),
                 core=_median(each.core for each in own),
                 line_late_p99_us=_median(each.line_late_p99_us for each in own),
             )
         )
-    return sorted(results, key=lambda result: (result.subject != FLOOR, result.subject))
+    return sorted(results, key=lambda result: (result.subject not in FLOORS, result.subject))
 
 
 def _median(values) -> float:
