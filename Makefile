@@ -5,12 +5,16 @@ PYTHON ?= python3
 # where byte code must not be written, each of the hundreds of programs that tests start would compile every module anew
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test check fix docs dist soak mutants bench screenshots clean
+.PHONY: run test tests check fix docs dist soak mutants bench screenshots clean
 
 run: .venv/ready
 	.venv/bin/ldcnd run --config $(CONFIG) $(ARGS)
 
-test: .venv/ready check
+# side by side: the checks leave one processor idle
+test: .venv/ready
+	$(MAKE) --no-print-directory -j 2 check tests
+
+tests: .venv/ready
 	$(PY) -m pytest -n 3 --dist worksteal
 
 check: .venv/ready

@@ -9,7 +9,7 @@ from tests.bench.commands_and_polls import CALLERS, CROWDS, MOST_ROUNDS, MOST_WA
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("drives", CROWDS)
 def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(order, drives):
-    seen = shared(order, drives, Load.HALF, 6.0)
+    seen = shared(order, drives, Load.HALF, 2.5)
 
     assert seen.commands == pytest.approx(0.5, abs=0.05)
     assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
@@ -19,7 +19,7 @@ def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(ord
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("drives", CROWDS)
 def test_commands_that_always_wait_leave_every_axis_a_poll_in_two_rounds(order, drives):
-    seen = shared(order, drives, Load.FULL, 6.0)
+    seen = shared(order, drives, Load.FULL, 2.5)
 
     assert CALLERS > COMMANDS_PER_POLL
     assert seen.commands > 0.6

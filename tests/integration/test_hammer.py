@@ -1,4 +1,4 @@
-"""Two hundred clients hammer one axis for a minute while stop is called every second, on the jumping clock."""
+"""Two hundred clients hammer one axis for twenty seconds while stop is called every second, on the jumping clock."""
 
 import asyncio
 import random
@@ -11,7 +11,7 @@ from ldcnd.model.samples import AxisState
 from tests.support.rig import running_rig
 
 CLIENTS = 200
-DURATION_S = 60.0
+DURATION_S = 20.0
 LONGEST_EXCHANGE_S = (5 + 12) * 10 / 115_200 + 0.000512 + 0.0015
 """A poll of position, velocity, state and A/D on the wire, one servo cycle, and the time a start is lingered over."""
 STOP_EXCHANGES = 2
@@ -65,8 +65,8 @@ async def test_every_query_gets_one_answer_and_every_stop_keeps_its_bound():
 
     print(answers, f"longest stop {max(waits_s) * 1e3:.2f} ms")
     assert answers["sent"] == sum(answers.values()) - answers["sent"]
-    assert answers["sent"] > 3000
-    assert answers["accepted"] > 100
+    assert answers["sent"] > 1000
+    assert answers["accepted"] > 30
     assert answers["internal"] == answers["outcome_unknown"] == 0
     assert len(waits_s) >= DURATION_S - 2
     assert max(waits_s) <= (1 + STOP_EXCHANGES) * LONGEST_EXCHANGE_S

@@ -237,7 +237,7 @@ NOISE = tuple(
 )
 
 
-@pytest.mark.parametrize("seed", [1, 2, 11])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (2, 11))])
 async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
     print(f"seed {seed}")
     chain = build_chain(

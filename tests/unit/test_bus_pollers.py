@@ -121,9 +121,9 @@ async def test_one_mute_node_does_not_slow_thirty_healthy_ones():
     healthy = [ToyPoller(node, period_s) for node in range(1, 31)]
     dead = ToyPoller(31, period_s)
 
-    await polled(rig, [*healthy, dead], 60.0)
+    await polled(rig, [*healthy, dead], 20.0)
 
-    assert min(len(poller.delivered) for poller in healthy) / (60.0 / period_s) >= 0.98
+    assert min(len(poller.delivered) for poller in healthy) / (20.0 / period_s) >= 0.98
     assert all(not poller.errors for poller in healthy)
     assert not dead.delivered
 
