@@ -22,6 +22,7 @@ class BringUpReport:
         reset: the drives were reset, so their positions count from 0.
         remarks: what differs from the configuration or deserves a look.
         open_loops: axes whose drives an earlier host has left with an open loop: nothing in them would end a raw duty.
+        restarted: axes whose drives had lost power, on a line that was not reset.
     """
 
     baud: int
@@ -29,6 +30,7 @@ class BringUpReport:
     reset: bool
     remarks: tuple[str, ...] = ()
     open_loops: frozenset[str] = frozenset()
+    restarted: frozenset[str] = frozenset()
 
 
 class Network(ABC):

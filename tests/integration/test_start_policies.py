@@ -8,7 +8,8 @@ import pytest
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import LoadTrajectory
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.errors import LdcndError
+from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power
 from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
@@ -135,7 +136,9 @@ async def test_a_drive_that_moves_is_not_reset_by_the_fallback():
 
     assert still_moving
     assert "address 1, Logosol LS-182AP (id 90, version 20), moves" in bus.problem
-    assert (later.up, later.started_by) == (True, "reset")
+    assert (later.up, later.started_by) == (True, "adoption")
+    assert any("address 4 had lost power" in remark for remark in later.remarks)
+    assert Command.HARD_RESET not in commands_in(rig.sent)
 
 
 def creep(chain, counts_per_tick):
@@ -195,6 +198,57 @@ async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_move
         await asyncio.sleep(5)
 
     assert drive(chain, 1).loop.servo_on
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+async def test_a_drive_that_a_restarted_one_keeps_from_hearing_is_not_reset(stopped):
+    chain = chain_of()
+    loop = asyncio.get_running_loop()
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
+        await rig.until("y", lambda state: state.link is LinkState.UP)
+        await rig.client.command("y", Power(on=True))
+        await rig.client.command("y", MoveVelocity(velocity=1.0))
+        before_outage = len(rig.sent)
+        chain.unplug(loop.time(), 1.0)
+        chain.modules[0].power(on=False, at_s=loop.time())
+        await rig.until("x", lambda state: state.link is LinkState.DOWN)
+        chain.modules[0].power(on=True, at_s=loop.time())
+        if stopped:
+            with contextlib.suppress(LdcndError):
+                await rig.client.stop("y")
+        async with asyncio.timeout(5):
+            await rig.daemon.wait_up()
+        states = {axis: await rig.until(axis, lambda state: state.link is LinkState.UP) for axis in ("x", "y")}
+        before = drive(chain, 2).loop.position
+        await asyncio.sleep(1)
+        moved = drive(chain, 2).loop.position - before
+        (bus,) = await rig.client.buses()
+        sent = commands_in(rig.sent[before_outage:])
+
+    assert bus.started_by == "adoption"
+    assert any("address 1 had lost power" in remark for remark in bus.remarks)
+    assert Command.HARD_RESET not in sent
+    assert (states["x"].enabled, states["x"].referenced) == (False, False)
+    assert (abs(moved) < 100) == stopped
+    assert drive(chain, 2).loop.servo_on
+
+
+async def test_a_line_that_was_lost_while_its_rate_changed_is_brought_to_one_rate():
+    chain = chain_of()
+    loop = asyncio.get_running_loop()
+    async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
+        await rig.until("y", lambda state: state.link is LinkState.UP)
+        await rig.client.command("y", Power(on=True))
+        await rig.client.command("y", MoveVelocity(velocity=1.0))
+        chain.unplug(loop.time(), 1.0)
+        chain.modules[2].baud = 57_600.0
+        await rig.until("x", lambda state: state.link is LinkState.DOWN)
+        async with asyncio.timeout(5):
+            await rig.daemon.wait_up()
+        (bus,) = await rig.client.buses()
+
+    assert (bus.started_by, bus.baud) == ("adoption", 115_200)
+    assert drive(chain, 2).loop.servo_on
 
 
 @pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9])

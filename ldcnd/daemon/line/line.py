@@ -126,6 +126,8 @@ class BusService:
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue
             retry_s, self.problem = FIRST_RETRY_S, ""
+            for name in report.restarted:
+                self._restarted(name)
             for axis in self.axes:
                 if report.reset:
                     axis.cannot_move()

@@ -110,8 +110,9 @@ class Adoption:
     async def not_standing(self) -> tuple[str, ...]:
         """Return in words what keeps the line from a reset: what moves, and what is not known to stand.
 
-        A module that waits for its address has just been powered on or reset, and so has what is behind it if it is
-        silent; a silent one is not known to stand otherwise.
+        A silent module is not known to stand, also behind one that waits for its address: it may only be kept from
+        hearing, and go on with its motion. `Rejoin.gather` makes such modules audible. Where nothing answers but a
+        module that waits for its address, the line has been powered on or reset as a whole.
 
         Raises:
             BusError: the line failed meanwhile.
@@ -131,7 +132,7 @@ class Adoption:
             if _moves(before[address], after[address]):
                 obstacles.append(f"address {address}, {found.identity}, moves")
         silent = [each for each in self._expected if each.address not in self.found]
-        if silent and not await self._newcomer():
+        if silent and (self.found or not await self._newcomer()):
             obstacles += [f"address {each.address} ({each.what}) does not answer and may move" for each in silent]
         return tuple(obstacles)
 
@@ -239,6 +240,33 @@ class Rejoin:
         # those behind a newcomer are heard again, too
         self._suspect(each.address for each in self._expected if each.address not in heard)
         return frozenset(each.address for each in mute if each.address in heard)
+
+    async def gather(self, found: Mapping[int, Found], addressing: Callable[[int], None]) -> bool:
+        """Make a line audible that answers in part; tell whether there was something to do.
+
+        Newcomers get their addresses, which lets those behind them hear again, and modules that a lost host has left
+        at different rates are brought to the working rate. Nothing is moved or reset.
+
+        Args:
+            found: who answered, at which rate; at least one.
+            addressing: told the address of a newcomer before it is given that address.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        if not self._rate.changeable and self._bus.baud != RESET_BAUD:
+            return False
+        lost = [each for each in self._expected if each.address not in found]
+        rates = {each.baud for each in found.values()}
+        if len(rates) == 1 and not (lost and await self._rate.who_is_at(RESET_BAUD, UNADDRESSED)):
+            return False
+        for baud in rates - {RESET_BAUD, self._bus.baud}:
+            await self._rate.host_to(baud)
+            await self._addressing.without_leaders()
+            await self._rate.everybody_to(RESET_BAUD)
+            await self._rate.host_to(self._rate.working)
+        await self._at_reset_baud(lost, addressing)
+        return True
 
     async def _anybody_there(self, mute: tuple[Expected, ...]) -> bool:
         """Ask for a newcomer at 19200 baud, and for one of those that may have strayed."""

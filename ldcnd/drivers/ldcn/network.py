@@ -97,6 +97,7 @@ class LdcnNetwork(Network):
         self._identities: dict[int, Identity] = {}
         self._watches: dict[int, ModuleWatch] = {}
         self._was_up = False
+        self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
         self._expected = _expected(specs, line)
         plan = GroupPlan(line.groups, self._names)
         self._rate = LineRate(
@@ -127,18 +128,40 @@ class LdcnNetwork(Network):
         remarks: tuple[str, ...] = ()
         if self._was_up or self._line.start is StartPolicy.ADOPT:
             try:
-                adopted = await self._adoption.attempt()
+                adopted = await self._adopt()
             except NetworkMismatch as error:
                 await self._check_may_reset(error)
                 remarks = (error.message,)
             else:
                 found_open = frozenset() if self._was_up else self._open_loops(adopted)
+                restarted = frozenset(self._names[address] for address in self._restarted & self._drives.keys())
                 report = self._up(adopted.identities, self._take_over(adopted), reset=False)
-                return replace(report, open_loops=found_open)
+                return replace(report, open_loops=found_open, restarted=restarted)
         for drive in self._drives.values():
             drive.forget()
         modules, found = await self._start_afresh()
         return self._up(modules, remarks + found, reset=True)
+
+    async def _adopt(self) -> Adopted:
+        """Take the line over; where only a part of it answers, make the rest audible if more than reading is allowed.
+
+        Raises:
+            NetworkMismatch: it cannot be taken over.
+        """
+
+        def addressing(address: int) -> None:
+            self._restarted.add(address)
+            if address in self._drives:
+                self._drives[address].forget()
+
+        try:
+            return await self._adoption.attempt()
+        except NetworkMismatch:
+            reads_only = not self._was_up and self._line.adopt_fallback is AdoptFallback.REFUSE
+            found = self._adoption.found
+            if reads_only or not found or not await self._rejoin.gather(found, addressing):
+                raise
+        return await self._adoption.attempt()
 
     def _open_loops(self, adopted: Adopted) -> frozenset[str]:
         return frozenset(
@@ -155,6 +178,7 @@ class LdcnNetwork(Network):
         for address, drive in self._drives.items():
             drive.identity = str(modules[address])
         self._was_up = True
+        self._restarted.clear()
         log.info("network up", bus=self._bus.settings.name, modules=len(modules), baud=self._bus.baud, reset=reset)
         return BringUpReport(
             baud=self._bus.baud,
@@ -164,11 +188,13 @@ class LdcnNetwork(Network):
         )
 
     def _take_over(self, adopted: Adopted) -> tuple[str, ...]:
-        """Learn what the drives are doing; return remarks."""
+        """Learn what the drives are doing that have not restarted; return remarks."""
         self._rate.working = adopted.baud
         for address, drive in self._drives.items():
-            drive.adopted(adopted.states[address], known=self._was_up)
+            if address not in self._restarted:
+                drive.adopted(adopted.states[address], known=self._was_up)
         remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
+        remarks += [f"address {address} had lost power and is disabled" for address in sorted(self._restarted)]
         if adopted.baud != self._baud:
             remarks.append(f"the configuration asks for {self._baud} baud; the line stays at {adopted.baud}")
         return tuple(remarks)
