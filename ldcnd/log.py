@@ -12,9 +12,10 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, MutableMapping
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
-import structlog
+if TYPE_CHECKING:
+    import structlog
 
 from ldcnd.printable import printable
 
@@ -22,10 +23,24 @@ PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERR
 """Levels as syslog and the journal number them."""
 
 
-def get_logger(name: str) -> structlog.typing.FilteringBoundLogger:
+def get_logger(name: str) -> "structlog.typing.FilteringBoundLogger":
     """Return the logger of one part of the daemon; `name` is its noun."""
-    logger: structlog.typing.FilteringBoundLogger = structlog.get_logger(f"ldcnd.{name}")
-    return logger
+    return cast("structlog.typing.FilteringBoundLogger", _Logger(f"ldcnd.{name}"))
+
+
+class _Logger:
+    """Loads structlog with the first record: that takes as long as a call, and most programs log nothing."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, method: str) -> object:
+        if method == "_logger":
+            import structlog  # noqa: PLC0415 - see the class
+
+            self._logger = structlog.get_logger(self._name)
+            return self._logger
+        return getattr(self._logger, method)
 
 
 class LogLimit:
@@ -65,6 +80,8 @@ def configure_logging(*, json: bool = False, level: str = "info") -> None:
         json: one JSON object a line instead of text, also in the journal.
         level: debug, info, warning or error.
     """
+    import structlog  # noqa: PLC0415 - only programs that log load it
+
     journal = not json and is_journal(sys.stderr, os.environ)
     processors: list[structlog.typing.Processor] = [structlog.processors.format_exc_info, _fit_for_terminals]
     if journal:

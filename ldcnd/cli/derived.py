@@ -28,7 +28,6 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
         sender.send(axis, of_options(command, **given), wait=wait)
 
     params: list[click.Parameter] = [click.Argument(["axis"])]
-    texts = attribute_docstrings(command)
     for field, described in command.model_fields.items():
         if field in AxisCommand.model_fields:
             continue
@@ -36,7 +35,7 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
         if field in arguments:
             params.append(click.Argument([field], type=kind))
         else:
-            params.append(click.Option([f"--{field.replace('_', '-')}"], type=kind, help=texts.get(field)))
+            params.append(_FieldOption(command, field, kind))
     if moves:
         params.append(click.Option(["--wait"], is_flag=True, help="Return when it has ended; Ctrl-C halts the axis."))
     target = getattr(callback, "__click_params__", [])
@@ -47,6 +46,20 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
         help=command.summary(),
         context_settings={"ignore_unknown_options": True},  # a value may be negative
     )
+
+
+class _FieldOption(click.Option):
+    """An option for a field; what it means is read in the source of the class when help asks for it."""
+
+    def __init__(self, command: type[Sent], field: str, kind: click.ParamType[Any]) -> None:
+        super().__init__([f"--{field.replace('_', '-')}"], type=kind)
+        self._command = command
+        self._field = field
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return how it is written and what it means."""
+        self.help = attribute_docstrings(self._command).get(self._field)
+        return super().get_help_record(ctx)
 
 
 def _kind(annotation: object) -> click.ParamType[Any]:

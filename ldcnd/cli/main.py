@@ -1,6 +1,7 @@
 """The entry point: finds the subcommand's module only when it is called, so that help and completion stay quick."""
 
 import importlib
+import os
 import sys
 from typing import NoReturn
 
@@ -76,6 +77,8 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Run the command line and exit with a documented code."""
+    # looking for plugins of pydantic reads what every installed package says about itself
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         cli.main(standalone_mode=False)
         sys.stdout.flush()

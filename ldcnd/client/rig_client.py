@@ -42,7 +42,6 @@ from ldcnd.model.traces import TraceChunk, TraceHeader
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
 
-NO_QUESTION = Why()
 ITEMS = frozenset(item.value for item in TelemetryItem)
 KEPT_SAMPLES = 256
 """A watcher that is too slow keeps so many samples; the oldest give way."""
@@ -216,9 +215,9 @@ class RigClient:
         """
         return await self._answer(axis, command, timeout_s)
 
-    async def why(self, axis: str, question: Why = NO_QUESTION) -> WhyReply:
+    async def why(self, axis: str, question: Why | None = None) -> WhyReply:
         """Ask why a motion of an axis would be refused now, and what would clear that."""
-        return await self.ask(question, axis)
+        return await self.ask(question or Why(), axis)
 
     async def preview(self, axis: str, question: Preview) -> PreviewReply:
         """Ask what a motion would do; no effect."""

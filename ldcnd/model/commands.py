@@ -8,7 +8,8 @@ they answer with; `ldcnd.model.catalogue` has them all.
 
 from enum import StrEnum
 from functools import cache
-from typing import ClassVar, Generic, Literal, TypeVar
+from types import GenericAlias
+from typing import TYPE_CHECKING, ClassVar, Generic, Literal, TypeVar, get_args
 
 from pydantic import ConfigDict, Field
 
@@ -141,6 +142,12 @@ class Command(Frozen, Generic[ReplyT_co]):
     answer_s: ClassVar[float] = ANSWER_S
     role: ClassVar[Role] = Role.OPERATOR
 
+    if not TYPE_CHECKING:  # the reply is no part of the fields: pydantic need not make a model for each
+
+        def __class_getitem__(cls, reply: object) -> GenericAlias:
+            """Return the class with what it is answered with."""
+            return GenericAlias(cls, reply)
+
     @classmethod
     def reply_model(cls) -> type[ReplyT_co]:
         """Return what the command is answered with."""
@@ -155,9 +162,10 @@ class Command(Frozen, Generic[ReplyT_co]):
 @cache
 def _reply_model(command: type[Command[ReplyT_co]]) -> type[ReplyT_co]:
     for base in command.__mro__:
-        if issubclass(base, Command) and (arguments := base.__pydantic_generic_metadata__["args"]):
-            reply: type[ReplyT_co] = arguments[0]
-            return reply
+        for generic in vars(base).get("__orig_bases__", ()):
+            for reply in get_args(generic):
+                if isinstance(reply, type):
+                    return reply
     raise TypeError(f"{command.__name__} does not say what it is answered with")
 
 

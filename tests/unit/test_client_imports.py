@@ -1,8 +1,10 @@
-"""What a program loads that only wants to be a client: nothing of the daemon, and no serial port."""
+"""What a client and a call of the command line load: nothing of the daemon, no serial port, nothing that takes long."""
 
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from tests.support.process import ROOT
 
@@ -21,12 +23,43 @@ OTHERS = {
 }
 
 
-def test_the_client_loads_nothing_of_the_daemon(tmp_path: Path) -> None:
-    program = f"import sys, {', '.join(MODULES)}; print(*sys.modules, sep='\\n')"
-    loaded = subprocess.run(  # noqa: S603 - our own program
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=tmp_path, timeout=60
+SLOW_TO_LOAD = {"structlog", "rich", "matplotlib", "textual", "starlette", "hypothesis"}
+MODULES_OF_A_CALL = 420
+CALL = """
+import sys
+from ldcnd.cli.main import main
+sys.argv = ["ldcnd", *{words!r}]
+try:
+    main()
+except SystemExit as end:
+    sys.stdout.flush()
+    sys.stdout.write("\\n".join([str(end.code), *sys.modules]))
+"""
+
+
+def printed_by(program: str, folder: Path) -> list[str]:
+    return subprocess.run(  # noqa: S603 - our own program
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, cwd=folder, timeout=60
     ).stdout.split()
+
+
+def test_the_client_loads_nothing_of_the_daemon(tmp_path: Path) -> None:
+    loaded = printed_by(f"import sys, {', '.join(MODULES)}; print(*sys.modules, sep='\\n')", tmp_path)
 
     assert set(MODULES) <= set(loaded)
     assert not {f"ldcnd.{name}" for name in OURS} & set(loaded)
-    assert not OTHERS & set(loaded)
+    assert not (OTHERS | SLOW_TO_LOAD) & set(loaded)
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    "words", ["axis list", "axis move x 1", "axis gains x --kp 1", "stop", "why x", "trace channels x"]
+)
+def test_a_call_of_the_command_line_loads_little(words: str, tmp_path: Path) -> None:
+    code, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
+
+    assert code == "3"
+    assert "ldcnd.messaging.zenoh_session" in loaded
+    assert not {f"ldcnd.{name}" for name in OURS - {"cli"}} & set(loaded)
+    assert not (OTHERS - {"click"} | SLOW_TO_LOAD) & set(loaded)
+    assert len(loaded) < MODULES_OF_A_CALL
