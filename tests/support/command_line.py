@@ -1,11 +1,30 @@
 """Several commands of `ldcnd` in one process: starting an interpreter for each costs more than what they do."""
 
 import asyncio
+import contextlib
+import io
 import json
+import shlex
+import signal
 import sys
 from asyncio.subprocess import PIPE
+from collections.abc import AsyncIterator, Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+
+from ldcnd.cli import connection
+from ldcnd.cli.main import main
+from ldcnd.client import connecting
+from ldcnd.config.rig import RigConfig
+from ldcnd.messaging.session import Session
+from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.sim.jumping_loop import JumpingLoop
+from tests.support.rig import RunningRig, running_rig
+
+ResultT = TypeVar("ResultT")
 
 PROGRAM = """
 import contextlib, io, json, shlex, sys
@@ -48,3 +67,72 @@ async def run_all(folder: Path, *commands: str) -> list[Ran]:
         printed, errors = await running.communicate()
     assert running.returncode == 0, errors.decode()
     return [Ran(*result) for result in json.loads(printed)]
+
+
+class VirtualRig:
+    """A daemon on the jumping clock and the command line in front of it, in one process; made by `virtual_rig`.
+
+    Time passes while a command waits for the daemon, and while the test waits for something; otherwise it stands.
+
+    Attributes:
+        rig: the daemon, and a client of it.
+    """
+
+    def __init__(self, loop: JumpingLoop, rig: RunningRig) -> None:
+        self.rig = rig
+        self._loop = loop
+
+    def run(self, line: str) -> Ran:
+        """Run a command line such as `axis list --json`."""
+        return run_here(*shlex.split(line))
+
+    def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:
+        """Let something happen."""
+        return self._loop.run_until_complete(work)
+
+
+@contextlib.contextmanager
+def virtual_rig(patch: pytest.MonkeyPatch, config: RigConfig | None = None) -> Iterator[VirtualRig]:
+    """Run a daemon, and let commands find it, until the context ends; only for tests that are no coroutines."""
+    loop = JumpingLoop()
+    running: asyncio.Future[RunningRig] = loop.create_future()
+    over = asyncio.Event()
+
+    async def serve() -> None:
+        async with running_rig(config) as rig:
+            running.set_result(rig)
+            await over.wait()
+
+    @contextlib.asynccontextmanager
+    async def open_session(_settings: ZenohSettings) -> AsyncIterator[Session]:
+        async with running.result().broker.session() as session:
+            yield session
+
+    serving = loop.create_task(serve(), name="rig")
+    try:
+        either: set[asyncio.Future[Any]] = {running, serving}  # of two types
+        loop.run_until_complete(asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED))
+        with patch.context() as patched:
+            patched.setattr(asyncio, "run", loop.run_until_complete)
+            patched.setattr(connection, "open_zenoh_session", open_session)
+            patched.setattr(connecting, "open_zenoh_session", open_session)
+            yield VirtualRig(loop, running.result())
+    finally:
+        over.set()
+        loop.run_until_complete(serving)
+        loop.close()
+
+
+def run_here(*words: str) -> Ran:
+    """Run one command line in this process."""
+    printed, errors = io.StringIO(), io.StringIO()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
+        patch.setattr(sys, "argv", ["ldcnd", *words])
+        patch.setattr(sys, "stdin", io.StringIO())
+        with pytest.raises(SystemExit) as end:
+            main()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    assert isinstance(end.value.code, int)
+    return Ran(end.value.code, printed.getvalue(), errors.getvalue())
