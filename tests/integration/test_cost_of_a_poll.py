@@ -1,17 +1,13 @@
 """What a poll costs the daemon, counted in calls of its own functions: exact where times scatter."""
 
 import asyncio
-import sys
 from itertools import pairwise
-from pathlib import Path
-from types import CodeType, FrameType
 
-import ldcnd
 from ldcnd.bus.queue import CHOICE
 from ldcnd.config.rig import RigConfig
+from tests.support.counted import counted_calls
 from tests.support.rig import running_rig
 
-PACKAGE = str(Path(ldcnd.__file__).parent)
 ITEMS = ("position", "velocity", "adc", "state")
 AXES = (1, 8, 31)
 HZ = 1000.0
@@ -32,31 +28,15 @@ def config(*, axes: int, items: tuple[str, ...], order: str) -> RigConfig:
     )
 
 
-def is_daemons(code: CodeType) -> bool:
-    """Tell whether code is the daemon's own; what simulates the line is not."""
-    file = code.co_filename
-    simulates = "/sim/" in file or "simulat" in file or code.co_qualname.startswith("PacketReader.")
-    return file.startswith(PACKAGE) and not simulates
-
-
 async def calls_of_a_poll(*, axes: int = 8, items: tuple[str, ...] = ITEMS, order: str = "deadline") -> float:
     """Poll a line as often as it can be, and return how many functions a poll calls on average."""
-    calls = 0
-
-    def count(frame: FrameType, event: str, _argument: object) -> None:
-        nonlocal calls
-        calls += event == "call" and is_daemons(frame.f_code)
-
     async with running_rig(config(axes=axes, items=items, order=order)) as rig:
         statistics = rig.daemon.rig.buses[0].bus.statistics
         await asyncio.sleep(1.0)
         before = statistics.replies
-        sys.setprofile(count)
-        try:
+        with counted_calls() as count:
             await asyncio.sleep(COUNTED_S)
-        finally:
-            sys.setprofile(None)
-        return calls / (statistics.replies - before)
+        return count.calls / (statistics.replies - before)
 
 
 async def test_a_further_item_adds_an_eighth_of_the_first_at_most_whatever_else_is_read():

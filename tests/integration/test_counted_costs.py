@@ -1,0 +1,122 @@
+"""What a poll, a command, a stop and a sample cost in counts that no machine changes, held by upper bounds.
+
+Times scatter from hour to hour; these numbers do not, so a change that costs more fails here and says what. Each is an
+upper bound: whoever lowers a cost lowers its bound.
+"""
+
+import asyncio
+from dataclasses import dataclass
+
+import pytest
+
+from ldcnd.config.rig import RigConfig
+from ldcnd.messaging.codec import Encoding, encode
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Qos
+from ldcnd.model.commands import MoveRelative, Power
+from ldcnd.model.samples import TelemetryItem
+from tests.integration.test_cost_of_a_poll import ITEMS, config
+from tests.support.counted import Count, counted_bytecodes, counted_calls
+from tests.support.rig import RunningRig, running_rig
+
+GAINS = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "cl": 0, "el": 4000, "sr": 1, "deadband": 0}
+POLLS_S = 0.2
+TIMES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """The most that one poll, command, stop or sample may cost."""
+
+    calls: float
+    turns: float
+    bytecodes: float = 0.0
+
+
+POLL = Bound(calls=130, turns=3.5, bytecodes=3650)
+"""One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
+COMMAND = Bound(calls=1500, turns=78)
+"""A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started."""
+STOP = Bound(calls=275, turns=10.5)
+SAMPLE = Bound(calls=15.5, turns=2.0)
+"""From what a session delivers to what a program's loop over samples has in its hands."""
+
+
+def quiet_rig() -> RigConfig:
+    """One drive that is hardly polled, so that what is counted is the command's."""
+    drive = {"name": "a1", "address": 1, "model": "ls-182ap", "velocity": 1, "acceleration": 100, "gains": GAINS}
+    rates = dict.fromkeys(ITEMS, 0.0) | {"state": 1.0}
+    bus = {
+        "name": "line0",
+        "port": "sim:line0",
+        "baud": 115_200,
+        "stop_probe_hz": 0.0,
+        "axis": [drive | {"rates": rates}],
+    }
+    sim = {"name": "line0", "module": [{"model": "ls182ap"}]}
+    return RigConfig.model_validate({"rig": "sim", "bus": [bus], "sim": [sim]})
+
+
+def each(count: Count, times: float) -> Bound:
+    found = Bound(count.calls / times, count.turns / times, count.bytecodes / times)
+    print(f"each of {times:g}: {found.calls:.1f} calls, {found.turns:.2f} turns, {found.bytecodes:.0f} bytecodes")
+    return found
+
+
+def holds(found: Bound, bound: Bound) -> bool:
+    return found.calls <= bound.calls and found.turns <= bound.turns and found.bytecodes <= bound.bytecodes
+
+
+async def polls(rig: RunningRig, counting) -> Bound:
+    statistics = rig.daemon.rig.buses[0].bus.statistics
+    await asyncio.sleep(1.0)
+    before = statistics.replies
+    with counting() as count:
+        await asyncio.sleep(POLLS_S)
+    return each(count, statistics.replies - before)
+
+
+async def test_a_poll_of_five_items_costs_so_much_and_no_more():
+    async with running_rig(config(axes=8, items=ITEMS, order="deadline")) as rig:
+        assert holds(await polls(rig, counted_bytecodes), POLL)
+
+
+async def test_a_command_costs_so_much_and_no_more():
+    async with running_rig(quiet_rig()) as rig:
+        await rig.until("a1", lambda state: state.link == "up")
+        await rig.client.command("a1", Power(on=True))
+        await asyncio.sleep(1.0)
+        with counted_calls() as count:
+            for _ in range(TIMES):
+                await rig.client.command("a1", MoveRelative(distance=0.001, buffer_mode="aborting"))
+
+    assert holds(each(count, TIMES), COMMAND)
+
+
+async def test_a_stop_costs_so_much_and_no_more():
+    async with running_rig(quiet_rig()) as rig:
+        await rig.until("a1", lambda state: state.link == "up")
+        await rig.client.command("a1", Power(on=True))
+        await asyncio.sleep(1.0)
+        with counted_calls() as count:
+            for _ in range(TIMES):
+                await rig.client.stop("a1")
+
+    assert holds(each(count, TIMES), STOP)
+
+
+@pytest.mark.parametrize("batch", [1, 32])
+async def test_a_sample_costs_a_client_so_much_and_no_more(batch):
+    async with running_rig(quiet_rig()) as rig:
+        key = Keys("sim").telemetry("a1", TelemetryItem.STATE)
+        async with rig.client.samples("a1", "state") as samples, rig.broker.session() as sender:
+            _, sample = await anext(samples)
+            payload, encoding = encode(sample, Encoding.MSGPACK)
+            with counted_calls() as count:
+                for _ in range(TIMES):
+                    for _ in range(batch):
+                        sender.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY)
+                    for _ in range(batch):
+                        await anext(samples)
+
+    assert holds(each(count, TIMES * batch), SAMPLE)

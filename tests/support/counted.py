@@ -1,0 +1,93 @@
+"""What code costs in counts that no machine changes: calls, bytecodes, turns of the loop."""
+
+import asyncio
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import CodeType, FrameType
+
+import ldcnd
+
+PACKAGE = str(Path(ldcnd.__file__).parent)
+
+
+@dataclass(slots=True)
+class Count:
+    """What was counted.
+
+    Attributes:
+        calls: of functions of ours.
+        bytecodes: executed in them; 0 unless they were asked for.
+        turns: of the event loop: what wakes a process that has nothing else to do.
+    """
+
+    calls: int = 0
+    bytecodes: int = 0
+    turns: int = 0
+
+
+def is_daemons(code: CodeType) -> bool:
+    """Tell whether code is the daemon's own; what simulates the line is not."""
+    file = code.co_filename
+    simulates = "/sim/" in file or "simulat" in file or code.co_qualname.startswith("PacketReader.")
+    return file.startswith(PACKAGE) and not simulates
+
+
+@contextmanager
+def counted_calls() -> Iterator[Count]:
+    """Count the calls of functions of the daemon and its client while the context lasts."""
+    count = Count()
+
+    def see(frame: FrameType, event: str, _argument: object) -> None:
+        count.calls += event == "call" and is_daemons(frame.f_code)
+
+    with _turns(count):
+        sys.setprofile(see)
+        try:
+            yield count
+        finally:
+            sys.setprofile(None)
+
+
+@contextmanager
+def counted_bytecodes() -> Iterator[Count]:
+    """Count calls and bytecodes; a hundred times slower than without."""
+    count = Count()
+
+    def within(_frame: FrameType, event: str, _argument: object) -> object:
+        count.bytecodes += event == "opcode"
+        return within
+
+    def enter(frame: FrameType, _event: str, _argument: object) -> object:
+        if not is_daemons(frame.f_code):
+            return None
+        count.calls += 1
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        return within
+
+    before = sys.gettrace()
+    with _turns(count):
+        sys.settrace(enter)  # type: ignore[arg-type] # typeshed knows no tracer that may leave a frame alone
+        try:
+            yield count
+        finally:
+            sys.settrace(before)
+
+
+@contextmanager
+def _turns(count: Count) -> Iterator[None]:
+    """Count the turns of the running loop."""
+    selector = asyncio.get_running_loop()._selector  # type: ignore[attr-defined]
+    select = selector.select
+
+    def counting(timeout: float | None = None) -> object:
+        count.turns += 1
+        return select(timeout)
+
+    selector.select = counting
+    try:
+        yield
+    finally:
+        del selector.select
