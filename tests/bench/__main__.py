@@ -22,6 +22,7 @@ from tests.bench import (
     virtual_time,
 )
 from tests.bench.bus_efficiency import FLOOR, FLOORS, MINIMAL, Conditions, Result
+from tests.bench.machine_speed import MachineSpeed
 from tests.bench.processes import build_programs
 from tests.bench.report import Row, table
 from tests.bench.sources import NoCompiler
@@ -55,11 +56,17 @@ def main() -> None:
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
 
     rows: list[Row] = []
+    speed = MachineSpeed()
+    speed.look()
     if not options.no_processes:
-        rows += _processes(options.rounds)
+        rows += _processes(options.rounds, speed)
         rows += round_trip.rows()
+        speed.look()
         rows += stops_under_load.rows()
+        speed.look()
     rows += virtual_time.rows(options.virtual_seconds)
+    speed.look()
+    rows = speed.rows() + speed.judged(rows)
     print(table(rows))
     if any(row.name.endswith(BUSY) and row.value > BUSY_US for row in rows):
         print(f"{BUSY} is above {BUSY_US} us: others used this machine, and what depends on time says little")
@@ -72,7 +79,7 @@ def main() -> None:
         options.json.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=2))
 
 
-def _processes(rounds: int) -> list[Row]:
+def _processes(rounds: int, speed: MachineSpeed) -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
@@ -84,9 +91,12 @@ def _processes(rounds: int) -> list[Row]:
         for conditions in (FAST, SLOW, *MORE):
             for result in bus_efficiency.measure(programs, folder, conditions, rounds):
                 rows += _efficiency_rows(result)
+            speed.look()
         rows += system_calls.rows(programs[0], folder)
         rows += saturated_command.rows(programs[0], folder)
-        return rows + scaling.rows(programs[0], folder, rounds)
+        rows += scaling.rows(programs[0], folder, rounds)
+        speed.look()
+        return rows
 
 
 def _efficiency_rows(result: Result) -> list[Row]:

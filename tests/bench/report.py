@@ -9,6 +9,7 @@ class Row:
 
     Attributes:
         at_most: the target is an upper limit; otherwise a lower one.
+        exact: a count, or measured on the jumping clock: the same on any machine at any hour.
         doubt: why the figure says little of the daemon in this run; it is not judged then.
     """
 
@@ -17,6 +18,7 @@ class Row:
     unit: str = ""
     target: float | None = None
     at_most: bool = False
+    exact: bool = False
     doubt: str = ""
 
     @property

@@ -73,7 +73,7 @@ def _daemon(line: PacedLines, folder: Path) -> Iterator[subprocess.Popen]:
 
 def _row(name: str, strace: str, running: subprocess.Popen, folder: Path, target: float | None = None) -> Row:
     calls = min(_calls_of_a_poll(strace, running, folder / "calls.txt") for _ in range(TRIES))
-    return Row(name, calls, "", target, at_most=True)
+    return Row(name, calls, "", target, at_most=True, exact=True)
 
 
 def _calls_of_a_poll(strace: str, running: subprocess.Popen, trace: Path) -> float:

@@ -6,6 +6,7 @@ import random
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -38,6 +39,7 @@ def rows(seconds: float) -> list[Row]:
     ]
     found += commands_and_polls.rows(seconds)
     found += trace_upload.rows()
+    found = [replace(row, exact=True) for row in found]
     for drives in (1, 8, DRIVES):
         speed = _run(drives, lambda rig: _speed(rig, min(seconds, 10.0)))
         found.append(Row(f"simulated line and daemon, {drives} drive(s): virtual seconds per second", speed, "x"))

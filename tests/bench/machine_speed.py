@@ -1,0 +1,69 @@
+"""How fast this machine is while the bench runs: two fixed loops, one of Python and one of system calls.
+
+Figures of time are compared within a run only. A machine whose own speed changes during the run, because others use it
+or because it throttles, spoils that too: then the bench prints such rows and judges none of them.
+"""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+from tests.bench.report import Row
+
+TURNS, CALLS, TRIES = 200_000, 100_000, 5
+MOST_VARIATION = 0.15
+
+
+def _python_loop() -> None:
+    total = 0
+    for number in range(TURNS):
+        total += number & 7
+
+
+def _syscall_loop() -> None:
+    for _ in range(CALLS):
+        os.getppid()
+
+
+def _least_s(loop: Callable[[], None]) -> float:
+    """Return the processor time of the quickest of some runs: the others were disturbed."""
+    found = []
+    for _ in range(TRIES):
+        began_s = time.thread_time()
+        loop()
+        found.append(time.thread_time() - began_s)
+    return min(found)
+
+
+@dataclass(slots=True)
+class MachineSpeed:
+    """The two loops, timed whenever `look` is called."""
+
+    python_ms: list[float] = field(default_factory=list)
+    syscall_ms: list[float] = field(default_factory=list)
+
+    def look(self) -> None:
+        """Time both loops; takes about 0.2 s."""
+        self.python_ms.append(_least_s(_python_loop) * 1e3)
+        self.syscall_ms.append(_least_s(_syscall_loop) * 1e3)
+
+    @property
+    def variation(self) -> float:
+        """Return by which share the slowest look took longer than the quickest."""
+        return max(max(each) / min(each) - 1 for each in (self.python_ms, self.syscall_ms))
+
+    def rows(self) -> list[Row]:
+        """Say how fast the machine was."""
+        return [
+            Row(f"machine: {TURNS} turns of a Python loop", min(self.python_ms), "ms"),
+            Row(f"machine: {CALLS} system calls", min(self.syscall_ms), "ms"),
+            Row("machine: slowest / quickest look, less one", self.variation),
+        ]
+
+    def judged(self, rows: Sequence[Row]) -> list[Row]:
+        """Return the rows as they may be judged: those of time only if the machine kept its speed."""
+        if self.variation <= MOST_VARIATION:
+            return list(rows)
+        doubt = f"the machine's speed varied by {self.variation:.0%} during the run"
+        return [row if row.exact or row.doubt else replace(row, doubt=doubt) for row in rows]
