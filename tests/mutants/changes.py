@@ -1,18 +1,21 @@
 """What can be changed in a module so that it still runs but does something else."""
 
 import ast
-import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import CodeType
 
 COMPARISONS = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
 }  # fmt: skip
 OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd}
+DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 LOGGED = frozenset({"debug", "info", "warning", "error", "exception"})
 """Calls whose loss changes nothing but the log."""
+SHOWN = 100
+"""Longest text of one side of a change, in characters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,42 +24,86 @@ class Mutant:
 
     Attributes:
         path: of the module, below the project's folder.
-        line: where it is changed.
-        change: what was done, in words.
-        before: the line as it was.
-        source: the whole module after the change.
+        place: qualified name of the function or class that is changed; empty for the module itself.
+        function: qualified name of the outermost function around the change; empty where there is none.
+        lines: first and last line of what is changed.
+        node: number of the changed node, as `ast.walk` counts.
+        kind: which of the changes of that node.
+        change: the code before and after.
     """
 
     path: str
-    line: int
+    place: str
+    function: str
+    lines: tuple[int, int]
+    node: int
+    kind: str
     change: str
-    before: str
-    source: str
+
+    def module(self, root: Path) -> CodeType:
+        """Compile the changed module; its lines keep their numbers."""
+        file = root / self.path
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        target = next(node for number, node in enumerate(ast.walk(tree)) if number == self.node)
+        _make(target, self.kind)
+        return compile(ast.fix_missing_locations(tree), str(file), "exec", dont_inherit=True)
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.lines[0]} {self.place}: {self.change}"
 
 
 def mutants_of(path: str, root: Path) -> Iterator[Mutant]:
-    """Yield all changes of a module, in the order of its lines."""
-    text = (root / path).read_text(encoding="utf-8")
-    lines = text.splitlines()
-    tree = ast.parse(text)
-    decorating = {
-        id(part)
-        for node in ast.walk(tree)
-        for decorator in getattr(node, "decorator_list", ())
-        for part in ast.walk(decorator)
-    }
+    """Yield all changes of a module, in the order of its nodes."""
+    tree = ast.parse((root / path).read_text(encoding="utf-8"))
+    places = {id(tree): ("", "")} | dict(_places(tree, "", ""))
+    left_alone = {id(part) for node in ast.walk(tree) for root_of in _left_alone(node) for part in ast.walk(root_of)}
     for number, node in enumerate(ast.walk(tree)):
-        if id(node) in decorating:
+        if id(node) in left_alone:
             continue
-        for change in _changes(node):
-            changed = copy.deepcopy(tree)
-            target = next(other for at, other in enumerate(ast.walk(changed)) if at == number)
-            _make(target, change)
-            line = getattr(node, "lineno", 0)
-            yield Mutant(path, line, change, lines[line - 1].strip(), ast.unparse(ast.fix_missing_locations(changed)))
+        place, function = places[id(node)]
+        for kind in _kinds(node):
+            if kind == "assignment removed" and place.endswith("__init__"):
+                continue  # any test would miss the attribute
+            before = ast.unparse(node.test if isinstance(node, ast.If) else node).partition("\n")[0][:SHOWN]
+            yield Mutant(path, place, function, _lines(node), number, kind, f"{kind}: {before}")
 
 
-def _changes(node: ast.AST) -> Iterator[str]:
+def _places(node: ast.AST, place: str, function: str) -> Iterator[tuple[int, tuple[str, str]]]:
+    """Yield where each node stands: the innermost function or class, and the outermost function."""
+    for child in ast.iter_child_nodes(node):
+        yield id(child), (place, function)
+        name = f"{place}.{child.name}".lstrip(".") if isinstance(child, DEFINITIONS) else place
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield id(child.args), (name, function)
+            yield from _places(child.args, name, function)  # defaults are computed outside
+            body = ast.Module(child.body, [])
+            yield from _places(body, name, function or name)
+        else:
+            yield from _places(child, name, function)
+
+
+def _left_alone(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield parts of a node that carry no behaviour: types, decorators, the wording of messages, `zip(strict=...)`."""
+    match node:
+        case ast.FunctionDef() | ast.AsyncFunctionDef():
+            yield from node.decorator_list
+            yield from (part for part in (node.returns,) if part)
+        case ast.ClassDef():
+            yield from node.decorator_list
+            yield from node.bases
+        case ast.arg(annotation=ast.expr() as annotation) | ast.AnnAssign(annotation=annotation):
+            yield annotation
+        case ast.JoinedStr():
+            yield node
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="log"), attr=attr)) if attr in LOGGED:
+            yield node
+        case ast.keyword(arg="strict"):
+            yield node
+        case ast.If(test=ast.Name(id="TYPE_CHECKING")):
+            yield node
+
+
+def _kinds(node: ast.AST) -> Iterator[str]:
     """Yield the names of what can be done to a node."""
     match node:
         case ast.Compare(ops=[op]) if type(op) in COMPARISONS:
@@ -90,7 +137,14 @@ def _is_logged(value: ast.expr) -> bool:
             return False
 
 
-def _make(node: ast.AST, change: str) -> None:
+def _lines(node: ast.AST) -> tuple[int, int]:
+    """Return the lines of which one must have run for the change to be able to matter."""
+    shown = node.test if isinstance(node, ast.If) else node
+    assert isinstance(shown, ast.expr | ast.stmt)
+    return shown.lineno, shown.end_lineno or shown.lineno
+
+
+def _make(node: ast.AST, kind: str) -> None:
     """Change a node in place."""
     match node:
         case ast.Compare():
@@ -102,9 +156,9 @@ def _make(node: ast.AST, change: str) -> None:
         case ast.UnaryOp():
             node.op, node.operand = ast.Not(), ast.UnaryOp(ast.Not(), node.operand)
         case ast.If():
-            node.test = ast.Constant(change == "condition true")
+            node.test = ast.Constant(kind == "condition true")
         case ast.Constant():
             node.value = not node.value
         case ast.Expr() | ast.Assign() | ast.AugAssign() | ast.Raise():
             node.__class__ = ast.Pass  # type: ignore[assignment]
-            node._fields = ()
+            node._fields = ()  # type: ignore[misc]

@@ -1,53 +1,89 @@
-"""The tool behind `make mutants`: what it changes, and that it notices whether a test notices."""
+"""The tool behind `make mutants`: what it changes, and which tests it runs for a change."""
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 
-from tests.mutants.__main__ import ROOT, SUBJECTS
-from tests.mutants.changes import mutants_of
-from tests.mutants.covering import CoveringTests
+import pytest
+
+from tests.mutants.__main__ import SUBJECTS, TESTS, report
+from tests.mutants.campaign import Judgement, Verdict
+from tests.mutants.changes import Mutant, mutants_of
+from tests.mutants.covering import ROOT, Covering
 
 MODULE = """
 @dataclass(frozen=True)
-def allowed(speed, limit, latched):
+def allowed(speed: int | str, limit, latched, hurry=False):
     if latched and speed > 0:
-        raise ValueError(speed)
+        raise ValueError(f"{speed + 1}")
     check(limit)
     log.info("asked")
     return not latched and speed <= limit
 """
 
 
-def test_each_change_compiles_and_differs(tmp_path: Path):
+@pytest.fixture
+def mutants(tmp_path: Path) -> Mapping[str, Mutant]:
     (tmp_path / "module.py").write_text(MODULE)
+    return {mutant.change: mutant for mutant in mutants_of("module.py", tmp_path)}
 
-    mutants = list(mutants_of("module.py", tmp_path))
 
-    assert {mutant.change for mutant in mutants} == {
-        "condition true", "condition false", "and to or", "Gt to GtE", "raise removed", "call removed", "not removed",
-        "LtE to Lt",
+def test_conditions_guards_and_calls_are_changed_but_no_types_messages_and_logs(mutants: Mapping[str, Mutant]):
+    assert set(mutants) == {
+        "condition true: latched and speed > 0", "condition false: latched and speed > 0",
+        "and to or: latched and speed > 0", "Gt to GtE: speed > 0", "raise removed: raise ValueError(f'{speed + 1}')",
+        "call removed: check(limit)", "and to or: not latched and speed <= limit", "not removed: not latched",
+        "LtE to Lt: speed <= limit", "the other truth value: False",
     }  # fmt: skip
-    assert len({mutant.source for mutant in mutants}) == len(mutants)
-    for mutant in mutants:
-        compile(mutant.source, "module.py", "exec")
 
 
-def test_a_change_is_made_where_it_says(tmp_path: Path):
-    (tmp_path / "module.py").write_text(MODULE)
+def test_each_change_changes_the_code(mutants: Mapping[str, Mutant], tmp_path: Path):
+    same = compile(MODULE, str(tmp_path / "module.py"), "exec")
 
-    (removed,) = [mutant for mutant in mutants_of("module.py", tmp_path) if mutant.change == "call removed"]
-
-    assert (removed.line, removed.before) == (6, "check(limit)")
-    assert "check(limit)" not in removed.source
-    assert "log.info" in removed.source
+    assert all(mutant.module(tmp_path) != same for mutant in mutants.values())
 
 
-def test_the_quickest_covering_tests_are_taken_until_their_time_is_over():
-    covering = CoveringTests({"a.py": {"3": [0, 1, 2]}}, ["slow", "quick", "middling"], [9.0, 0.1, 1.0])
+def test_a_change_is_made_where_it_says(mutants: Mapping[str, Mutant], tmp_path: Path):
+    removed = mutants["call removed: check(limit)"]
 
-    assert covering.of("a.py", 3, within_s=2.0) == ["quick", "middling"]
-    assert covering.of("a.py", 3, within_s=0.01) == ["quick"]
-    assert covering.of("a.py", 4, within_s=2.0) == []
+    (function,) = [code for code in removed.module(tmp_path).co_consts if hasattr(code, "co_names")]
+    assert (removed.lines, removed.place) == ((6, 6), "allowed")
+    assert "check" not in function.co_names
+    assert "log" in function.co_names
 
 
-def test_every_subject_exists_and_there_are_enough_changes():
-    assert [glob for glob in SUBJECTS if not list(ROOT.glob(glob))] == []
+def test_a_default_is_changed_where_the_function_is_defined(mutants: Mapping[str, Mutant]):
+    assert mutants["the other truth value: False"].function == ""
+    assert mutants["call removed: check(limit)"].function == "allowed"
+
+
+def test_covering_tests_are_taken_quickest_first_and_lines_are_followed_by_their_text(tmp_path: Path):
+    subject = "tests/mutants/__init__.py"
+    text = (ROOT / subject).read_text()
+    (tmp_path / "sources").mkdir()
+    (tmp_path / "sources" / "before").write_text("import gone\n" + text)
+    record = {
+        "module": "tests/unit/test_mutants.py", "digest": "", "seconds": {"slow": 9.0, "quick": 0.1},
+        "lines": {subject: {"2": [0, 1]}}, "sources": {subject: "before"},
+    }  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(record))
+
+    covering = Covering([subject], tmp_path)
+
+    assert covering.of(subject, [1]) == ["quick", "slow"]
+    assert covering.of(subject, [2]) == []
+
+
+def test_a_campaign_fails_on_a_survivor_and_on_too_few_killed(
+    mutants: Mapping[str, Mutant], capsys: pytest.CaptureFixture[str]
+):
+    chosen = list(mutants.values())
+    killed = [Judgement(number, Verdict.KILLED, "a test", 0.1) for number in range(len(chosen))]
+
+    assert report(chosen, killed, 1.0) == 0
+    assert report(chosen, [*killed[1:], Judgement(0, Verdict.SURVIVED, "", 0.1)], 1.0) == 1
+    assert f"survived: {chosen[0]}" in capsys.readouterr().out
+
+
+def test_every_subject_and_folder_of_tests_exists():
+    assert [glob for glob in (*SUBJECTS, *TESTS) if not list(ROOT.glob(glob))] == []

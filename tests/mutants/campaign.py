@@ -1,0 +1,281 @@
+"""Judges mutants in forked processes: a plugin of pytest that takes the place of its loop over the tests.
+
+Pytest imports and collects all tests once. A mutant is then a fork in which the code of one function is replaced and
+the tests that run it are run, so that it costs little more than these tests. Changes of what runs at import, in a
+module or a class, cannot be made so late: those mutants get a pytest of their own (`applied`).
+
+A test that fails decides only if it fails again by itself, and passes by itself on the code as it is.
+"""
+
+import contextlib
+import gc
+import json
+import os
+import resource
+import select
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from types import CodeType, FunctionType
+
+import pytest
+
+from tests.mutants.applied import MUTANT
+from tests.mutants.changes import Mutant
+from tests.mutants.covering import ROOT, Covering
+
+HANGING_S = 30.0
+"""Shortest wall time after which a test is called hanging."""
+HANGING_RATIO = 30
+"""Wall time after which a test is called hanging, as a multiple of the processor time that it costs."""
+LEAST_TESTS = 3
+"""Fewest tests for a mutant, where so many run the line: the budget may be less than what one of them costs."""
+MEMORY_BYTES = 4 << 30
+"""Address space of a fork: a mutant that appends for ever ends here."""
+FRESH_TESTS = 40
+"""Most tests for a mutant that needs a pytest of its own."""
+
+
+class Verdict(StrEnum):
+    """What became of a mutant."""
+
+    KILLED = "killed"
+    TIMED_OUT = "killed by time-out"
+    SURVIVED = "survived"
+    UNCOVERED = "no test runs the line"
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What became of one mutant.
+
+    Attributes:
+        number: of the mutant in the campaign.
+        verdict: what became of it.
+        test: the test that killed it, if any.
+        seconds: wall time it took.
+    """
+
+    number: int
+    verdict: Verdict
+    test: str
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """How a row of tests ended: the test that failed, and whether it hung; no test if all passed."""
+
+    failed: str = ""
+    hung: bool = False
+
+
+class Campaign:
+    """Forks for each mutant instead of running the tests; `judgements` fills while it runs."""
+
+    def __init__(
+        self, mutants: Sequence[Mutant], covering: Covering, seconds: float, workers: int, ends_s: float
+    ) -> None:
+        self.judgements: list[Judgement] = []
+        self._mutants = mutants
+        self._covering = covering
+        self._seconds = seconds
+        self._workers = workers
+        self._ends_s = ends_s
+        self._items: dict[str, pytest.Item] = {}
+        self._sound: dict[str, bool] = {}
+        self._failed = False
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Judge all mutants, in as many processes as there are workers."""
+        self._items = {item.nodeid: item for item in session.items}
+        reading, writing = os.pipe()
+        children = []
+        for worker in range(self._workers):
+            if not (child := os.fork()):
+                os.close(reading)
+                with _child_ends():
+                    self._work(worker, writing)
+            children.append(child)
+        os.close(writing)
+        with os.fdopen(reading, encoding="utf-8") as lines:
+            for line in lines:
+                number, verdict, test, seconds = json.loads(line)
+                self.judgements.append(judgement := Judgement(number, Verdict(verdict), test, seconds))
+                _print(self._mutants[number], judgement)
+        for child in children:
+            os.waitpid(child, 0)
+        return True
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Remember in a fork that a test failed."""
+        self._failed = self._failed or report.failed
+
+    def _work(self, worker: int, writing: int) -> None:
+        for number in range(worker, len(self._mutants), self._workers):
+            if time.monotonic() > self._ends_s:
+                return
+            begun_s = time.monotonic()
+            verdict, test = self._judged(self._mutants[number])
+            line = json.dumps((number, verdict, test, round(time.monotonic() - begun_s, 2)))
+            os.write(writing, line.encode() + b"\n")  # one write of less than a page: lines of workers do not mix
+
+    def _judged(self, mutant: Mutant) -> tuple[Verdict, str]:
+        lines = range(mutant.lines[0], mutant.lines[1] + 1)
+        tests = [test for test in self._covering.of(mutant.path, lines) if test in self._items]
+        if not tests:
+            return Verdict.UNCOVERED, ""
+        code = mutant.module(ROOT)
+        is_early = not mutant.function or self._covering.is_imported(mutant.path, lines)
+        if is_early or not _is_replaceable(mutant, code):
+            return _judged_freshly(mutant, tests)
+        tests = self._affordable(tests)
+        while (run := self._run(tests, mutant, code)).failed:
+            alone = run if run.hung or len(tests) == 1 else self._run([run.failed], mutant, code)
+            if alone.failed and self._is_sound(run.failed):
+                return Verdict.TIMED_OUT if alone.hung else Verdict.KILLED, run.failed
+            tests = [test for test in tests if test != run.failed]
+        return Verdict.SURVIVED, ""
+
+    def _affordable(self, tests: Sequence[str]) -> list[str]:
+        """Return the quickest tests, as many as the budget pays for."""
+        chosen: list[str] = []
+        took_s = 0.0
+        for test in tests:
+            took_s += self._covering.seconds[test]
+            if len(chosen) >= LEAST_TESTS and took_s > self._seconds:
+                break
+            chosen.append(test)
+        return chosen
+
+    def _is_sound(self, test: str) -> bool:
+        """Return whether a test passes by itself, in a fork, on the code as it is."""
+        if test not in self._sound:
+            self._sound[test] = not self._run([test], None, None).failed
+        return self._sound[test]
+
+    def _run(self, tests: Sequence[str], mutant: Mutant | None, code: CodeType | None) -> _Run:
+        """Run tests in a fork until one fails."""
+        reading, writing = os.pipe()
+        if not (child := os.fork()):
+            os.close(reading)
+            with _child_ends():
+                _isolate()
+                if mutant and code:
+                    _replace(mutant, code)
+                self._run_items([self._items[test] for test in tests], writing)
+        os.close(writing)
+        begun = -1
+        try:
+            while True:
+                cost_s = self._covering.seconds[tests[max(begun, 0)]]
+                if not select.select([reading], [], [], max(HANGING_S, HANGING_RATIO * cost_s))[0]:
+                    return _Run(tests[max(begun, 0)], hung=True)
+                if not (told := os.read(reading, 4096)):
+                    break
+                begun += len(told)
+        finally:
+            os.close(reading)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGKILL)
+            status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        return _Run(tests[max(begun, 0)]) if status else _Run()
+
+    def _run_items(self, items: Sequence[pytest.Item], writing: int) -> None:
+        """Run items in the fork: one byte at the beginning of each; the exit status is 1 at the first that fails."""
+        for item, following in zip(items, [*items[1:], None], strict=True):
+            os.write(writing, b".")
+            item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
+            if self._failed:
+                os._exit(1)
+        os._exit(0)
+
+
+@contextlib.contextmanager
+def _child_ends() -> Iterator[None]:
+    """End a fork where its work ends, whatever happens in it."""
+    try:
+        yield
+    except BaseException:  # noqa: BLE001 - the fork must not go on as a second parent
+        traceback.print_exc()
+        os._exit(3)
+    os._exit(0)
+
+
+def _isolate() -> None:
+    """Let a fork print nothing, use bounded memory, and be ended with all that it starts."""
+    os.setpgid(0, 0)
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for standard in range(3):
+        os.dup2(nothing, standard)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+
+
+def _functions(mutant: Mutant) -> list[FunctionType]:
+    """Return the loaded functions that a mutant changes: more than one, where a decorator has made copies."""
+    file = str(ROOT / mutant.path)
+    return [
+        function
+        for function in gc.get_objects()
+        if type(function) is FunctionType
+        and function.__code__.co_qualname == mutant.function
+        and function.__code__.co_filename == file
+    ]
+
+
+def _changed_code(mutant: Mutant, module: CodeType, first_line: int) -> CodeType | None:
+    """Return the changed code of the outermost function that begins at a line."""
+    found = [
+        code for code in _codes(module) if (code.co_qualname, code.co_firstlineno) == (mutant.function, first_line)
+    ]
+    return found[0] if found else None
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _is_replaceable(mutant: Mutant, module: CodeType) -> bool:
+    """Return whether the change can be made in functions that are already loaded."""
+    pairs = [(each, _changed_code(mutant, module, each.__code__.co_firstlineno)) for each in _functions(mutant)]
+    return bool(pairs) and all(code and code.co_freevars == each.__code__.co_freevars for each, code in pairs)
+
+
+def _replace(mutant: Mutant, module: CodeType) -> None:
+    for function in _functions(mutant):
+        if code := _changed_code(mutant, module, function.__code__.co_firstlineno):
+            function.__code__ = code
+
+
+def _judged_freshly(mutant: Mutant, tests: Sequence[str]) -> tuple[Verdict, str]:
+    """Judge a mutant in a pytest of its own, which imports the changed module."""
+    command = ("-q", "-x", "--no-header", "-rN", "--tb=no", "-p", "tests.mutants.applied", *tests[:FRESH_TESTS])
+    try:
+        run = subprocess.run(  # noqa: S603
+            (sys.executable, "-m", "pytest", *command), cwd=ROOT, timeout=600, check=False, capture_output=True,
+            env=os.environ | {MUTANT: json.dumps((mutant.path, mutant.node, mutant.kind))}, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return Verdict.TIMED_OUT, "a pytest of its own"
+    return (Verdict.SURVIVED, "") if run.returncode == 0 else (Verdict.KILLED, "a pytest of its own")
+
+
+def _print(mutant: Mutant, judgement: Judgement) -> None:
+    by = f"  [{judgement.test}]" if judgement.test else ""
+    sys.__stdout__.write(f"{judgement.verdict}: {mutant}{by} {judgement.seconds:.1f} s\n")  # type: ignore[union-attr]
+    sys.__stdout__.flush()  # type: ignore[union-attr]
+
+
+def run(campaign: Campaign, tests: Sequence[Path]) -> None:
+    """Collect the test modules and judge."""
+    command = ("-q", "-s", "--no-header", "--no-summary", "-m", "not soak and not real_time", *map(str, tests))
+    pytest.main(list(command), plugins=[campaign])

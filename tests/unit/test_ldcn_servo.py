@@ -1,0 +1,321 @@
+"""What a servo drive is told and what is believed of it, without a line: exchanges go straight into a simulated drive."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.bus.queue import Lane
+from ldcnd.drivers.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drivers.ldcn.controls import HomingControl
+from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
+from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.errors import DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
+from ldcnd.model.commands import HomeMethod, PinMode
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.plant import MotorPlant
+from tests.support.simulated_axis import SimulatedAxis
+
+GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
+THERE = Motion(20_000, 20_000.0, 100_000.0)
+JOG = Motion(None, 5000.0, 100_000.0)
+SWITCHES = MotorPlant(reverse_limit_counts=-20_000, forward_limit_counts=20_000)
+
+Interference = Callable[[], object]
+"""What happens instead of the first exchange of a command: it may raise."""
+
+
+class DirectBus:
+    """Takes exchanges as a `Bus` does and carries them to a simulated drive at once.
+
+    Attributes:
+        sent: what was sent, with its lane.
+        instead: what happens in place of the next packet of a command.
+    """
+
+    def __init__(self, host: SimulatedAxis) -> None:
+        self.host = host
+        self.sent: list[tuple[Command, Lane]] = []
+        self.instead: dict[Command, Interference] = {}
+
+    async def execute(self, exchange, lane=Lane.COMMAND, *, once=False):
+        packet = packet_of(exchange.request)
+        command = Command(packet.command)
+        self.sent.append((command, lane))
+        if command in self.instead:
+            answer = self.instead.pop(command)()
+            if asyncio.iscoroutine(answer):
+                answer = await answer
+        self.host.chain.write(self.host.now_s, exchange.request)
+        return exchange.decode(self.host.wait(0.03))
+
+    def commands(self, since: int = 0) -> list[Command]:
+        return [command for command, _ in self.sent[since:]]
+
+
+def packet_of(request: bytes) -> Packet:
+    reader = PacketReader()
+    (received,) = [received for value in request if (received := reader.feed(value))]
+    return received.packet
+
+
+class Drive:
+    """A drive under test: the axis, the bus it speaks on, and the simulated module behind it."""
+
+    def __init__(self, model: str = "ls182ap", profile=LS_182AP, plant=SWITCHES, **spec: object) -> None:
+        self.host = SimulatedAxis(model, closed=False, plant=plant)
+        self.bus = DirectBus(self.host)
+        self.axis = LdcnAxis(AxisSpec("x", 1, "any", GAINS, **spec), profile, self.bus)
+        self.axis.forget()
+
+    @property
+    def module(self) -> SimulatedDrive:
+        self.host.drive.catch_up(self.host.now_s)
+        return self.host.drive
+
+    async def power_on(self) -> "Drive":
+        await self.axis.power(on=True)
+        return self
+
+    async def runs(self) -> bool:
+        """Return whether the shaft moves."""
+        before = self.module.shaft.position_counts
+        self.host.wait(0.5)
+        return abs(self.module.shaft.position_counts - before) > 50
+
+
+async def powered(**spec: object) -> Drive:
+    return await Drive(**spec).power_on()
+
+
+def ignored(bus: DirectBus) -> None:
+    """Let the drive acknowledge the next Start Motion without starting."""
+
+    def hold_back() -> None:
+        execute, drive = bus.host.drive.execute, bus.host.drive
+        drive.execute = lambda _command: setattr(drive, "execute", execute)
+
+    bus.instead[Command.START_MOTION] = hold_back
+
+
+def rejected(bus: DirectBus, *, executed: bool) -> None:
+    """Let the reply to the next Start Motion say that the packet was damaged."""
+
+    def reject() -> None:
+        if executed:
+            bus.host.send(1, Command.START_MOTION)
+        raise PacketRejected("damaged")
+
+    bus.instead[Command.START_MOTION] = reject
+
+
+# -- starting ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("motion", [THERE, JOG])
+async def test_an_acknowledged_start_that_no_status_confirms_is_not_known_to_have_started(motion):
+    drive = await powered()
+    await drive.axis.load(motion)
+    ignored(drive.bus)
+
+    with pytest.raises(OutcomeUnknown, match="no sign"):
+        await drive.axis.start()
+
+    assert not await drive.runs()
+
+
+async def test_a_start_is_sent_once_and_a_running_profile_needs_no_second_look():
+    drive = await powered()
+    await drive.axis.load(THERE)
+    before = len(drive.bus.sent)
+
+    await drive.axis.start()
+
+    assert drive.bus.commands(before) == [Command.START_MOTION]
+    assert await drive.runs()
+
+
+async def test_a_move_so_short_that_it_is_over_with_its_acknowledgement_has_started():
+    drive = await powered()
+    await drive.axis.load(replace(THERE, target_counts=10))
+    ignored(drive.bus)
+
+    await drive.axis.start()  # 10 counts off the target is there, started or not
+
+    await drive.axis.load(replace(THERE, target_counts=17))
+    ignored(drive.bus)
+    with pytest.raises(OutcomeUnknown):
+        await drive.axis.start()
+
+
+async def test_a_start_whose_reply_alone_was_damaged_has_started():
+    drive = await powered()
+    await drive.axis.load(THERE)
+    rejected(drive.bus, executed=True)
+
+    await drive.axis.start()
+
+    assert await drive.runs()
+
+
+async def test_a_start_that_was_received_damaged_is_reported_and_not_sent_again():
+    drive = await powered()
+    await drive.axis.load(THERE)
+    rejected(drive.bus, executed=False)
+    before = len(drive.bus.sent)
+
+    with pytest.raises(PacketRejected):
+        await drive.axis.start()
+
+    assert drive.bus.commands(before).count(Command.START_MOTION) == 1
+    assert not await drive.runs()
+
+
+async def test_a_jog_too_slow_for_the_status_counts_as_started_and_a_duty_as_well():
+    drive = await powered()
+    for motion in (Motion(None, 100.0, 100_000.0), PwmOutput(0.1, 100_000.0)):
+        await drive.axis.load(motion)
+        ignored(drive.bus)
+        await drive.axis.start()
+
+
+# -- stopping and homing -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", StopMode)
+async def test_a_stop_goes_out_in_the_lane_of_stops_and_disarms_a_search(mode):
+    drive = await powered()
+    await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX))
+    await drive.axis.start()
+    before = len(drive.bus.sent)
+
+    await drive.axis.stop(mode)
+    await drive.axis.stop(mode)
+
+    assert drive.bus.sent[before:] == [
+        (Command.STOP_MOTOR, Lane.STOP), (Command.SET_HOMING_MODE, Lane.STOP), (Command.STOP_MOTOR, Lane.STOP),
+    ]  # fmt: skip
+    assert drive.module.loop.search is None
+    assert drive.module.loop.servo_on is (mode is not StopMode.OFF)
+
+
+async def test_a_stop_that_comes_while_a_search_is_being_armed_disarms_it():
+    drive = await powered()
+
+    async def stopped() -> None:
+        await drive.axis.stop(StopMode.SMOOTH)
+        raise ReplyTimeout("the line was taken for the stop")
+
+    drive.bus.instead[Command.SET_HOMING_MODE] = stopped
+    before = len(drive.bus.sent)
+    with pytest.raises(ReplyTimeout):
+        await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX))
+
+    assert drive.bus.sent[before:] == [
+        (Command.SET_HOMING_MODE, Lane.COMMAND), (Command.STOP_MOTOR, Lane.STOP),
+        (Command.SET_HOMING_MODE, Lane.STOP),
+    ]  # fmt: skip
+
+
+async def test_a_motion_that_is_no_search_disarms_the_search_before_it():
+    drive = await powered()
+    await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX))
+
+    await drive.axis.load(THERE)
+    before = len(drive.bus.sent)
+    await drive.axis.load(THERE)
+
+    assert drive.module.loop.search is None
+    assert drive.bus.commands(before) == [Command.LOAD_TRAJECTORY]  # nothing is armed, so nothing is disarmed
+
+
+async def test_homing_on_a_pin_that_is_an_output_is_refused_before_anything_is_armed():
+    drive = await powered(model="picservo-v4", profile=PIC_SERVO_V4)
+    await drive.axis.set_outputs(PinMode.HIGH, None)
+    before = len(drive.bus.sent)
+
+    with pytest.raises(WrongState, match="is an output"):
+        await drive.axis.load(JOG, home=HomeCapture(HomeMethod.REVERSE_LIMIT))
+
+    assert drive.bus.commands(before) == []
+    await drive.axis.load(JOG, home=HomeCapture(HomeMethod.FORWARD_LIMIT))
+
+
+# -- limit switches that stop a motion ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("motion", "armed"),
+    [
+        (THERE, HomingControl.LIMIT2 | HomingControl.STOP_SMOOTH),
+        (replace(THERE, target_counts=-20_000), HomingControl.LIMIT1 | HomingControl.STOP_SMOOTH),
+        (JOG, HomingControl.LIMIT2 | HomingControl.STOP_SMOOTH),
+        (replace(JOG, velocity_counts_per_s=-5000.0), HomingControl.LIMIT1 | HomingControl.STOP_SMOOTH),
+        (PwmOutput(0.1, 100_000.0), HomingControl.LIMIT2 | HomingControl.MOTOR_OFF),
+        (PwmOutput(-0.1, 100_000.0), HomingControl.LIMIT1 | HomingControl.MOTOR_OFF),
+        (
+            AnalogMotion(500, 5000.0, 100_000.0),
+            HomingControl.LIMIT1 | HomingControl.LIMIT2 | HomingControl.STOP_SMOOTH,
+        ),
+    ],
+)
+async def test_only_the_switches_ahead_of_a_motion_are_armed(motion, armed):
+    drive = await powered(limit_stop=True)
+
+    await drive.axis.load(motion)
+
+    assert drive.module.loop.search.control == armed
+
+
+@pytest.mark.parametrize(
+    ("plant", "way"), [(MotorPlant(forward_limit_counts=-1), 1), (MotorPlant(reverse_limit_counts=1), -1)]
+)
+async def test_a_motion_onto_the_switch_that_the_axis_stands_on_is_refused_and_one_away_from_it_is_not(plant, way):
+    drive = await powered(limit_stop=True, plant=plant)
+
+    with pytest.raises(WrongState, match="stands on its"):
+        await drive.axis.load(replace(JOG, velocity_counts_per_s=way * 5000.0))
+
+    await drive.axis.load(replace(JOG, velocity_counts_per_s=way * -5000.0))
+    await drive.axis.load(AnalogMotion(500, 5000.0, 100_000.0))  # which way it goes is the drive's
+
+
+# -- power -------------------------------------------------------------------------------------------------------------
+
+
+async def test_a_loop_that_does_not_close_is_a_fault_with_its_cause():
+    drive = Drive()
+    drive.host.suffer(Condition.STOP_INPUT)
+
+    with pytest.raises(DriveFault, match="stop"):
+        await drive.axis.power(on=True)
+
+    assert not drive.module.loop.servo_on
+
+
+async def test_a_drive_is_initialised_once_before_its_loop_is_closed():
+    drive = await powered()
+    first = drive.bus.commands()
+    await drive.axis.power(on=False)
+    before = len(drive.bus.sent)
+
+    await drive.axis.power(on=True)
+
+    assert first.count(Command.SET_GAIN) == 1
+    assert first.index(Command.LOAD_TRAJECTORY) < first.index(Command.CLEAR_STICKY_BITS)
+    assert Command.LOAD_TRAJECTORY not in drive.bus.commands(before)
+    assert Command.SET_GAIN not in drive.bus.commands(before)
+    assert drive.module.loop.servo_on
+
+
+def test_readings_ask_for_no_more_than_is_wanted() -> None:
+    drive = Drive(model="picservo-v4", profile=PIC_SERVO_V4)
+    mask: Mapping[frozenset[str], bytes] = {
+        items: drive.axis.reading(frozenset(items)).request for items in (frozenset(), frozenset({"adc"}))
+    }
+
+    assert drive.axis.reading(frozenset()) is drive.axis.reading(frozenset())
+    assert len(set(mask.values())) == 2
