@@ -50,7 +50,7 @@ soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
 	$(PY) -m pytest -m soak -n 2 --timeout 3600
 
-# changes safety-relevant code in 300 ways and prints what no test notices; hours, see CONTRIBUTING.md
+# changes safety-relevant code in 300 ways and prints what no test notices, see CONTRIBUTING.md
 mutants: .venv/ready
 	$(PY) -m tests.mutants
 

@@ -1,4 +1,4 @@
-"""What a servo drive is told and what is believed of it, without a line: exchanges go straight into a simulated drive."""
+"""What a servo drive is told and what is believed of it; exchanges go straight into a simulated drive."""
 
 import asyncio
 from collections.abc import Callable, Mapping

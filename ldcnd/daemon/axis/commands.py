@@ -65,6 +65,7 @@ class AxisCommands:
         self._tracker = motion.tracker
         self._gains = motion.driver.spec.gains
         self._procedure: Procedure | None = None
+        self._retry_s: float | None = None  # when the step that was not taken is taken again
 
     async def carry_out(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says; returns once the drive has acknowledged it.
@@ -126,7 +127,9 @@ class AxisCommands:
     @property
     def deadline_s(self) -> float:
         """When the procedure takes its next step at the latest, in loop time; infinite without one."""
-        return self._procedure.deadline_s if self._procedure else NEVER_S
+        if self._procedure is None:
+            return NEVER_S
+        return self._procedure.deadline_s if self._retry_s is None else self._retry_s
 
     def observed(self, reading: AxisReading, timing: Timing) -> None:
         """Take the latest reading, after the tracker has."""
@@ -153,16 +156,14 @@ class AxisCommands:
             self._drop_procedure()
             return
         delay_s = STEP_RETRY_S if self._tracker.link is LinkState.UP else BLIND_RETRY_S
-        due_s, retry_s = procedure.deadline_s, self._motion.clock.now_s() + delay_s
-        procedure.deadline_s = retry_s
+        self._retry_s = self._motion.clock.now_s() + delay_s
         try:
             goes_on = await self._take_step(procedure)
         finally:
             self.step_due = False  # what was read during the step called for the one that is over
+        self._retry_s = None
         if procedure is self._procedure and not goes_on:
             self._drop_procedure()
-        elif procedure.deadline_s == retry_s:
-            procedure.deadline_s = due_s
         self._motion.publish_state()
 
     async def _take_step(self, procedure: Procedure) -> bool:
@@ -183,18 +184,21 @@ class AxisCommands:
             return False
 
     def _drop_procedure(self) -> None:
-        self._procedure, self.step_due = None, False
+        self._take_up(None)
+
+    def _take_up(self, procedure: Procedure | None) -> None:
+        self._procedure, self._retry_s, self.step_due = procedure, None, False
 
     async def _undertake(self, procedure: Procedure) -> CommandReply:
         """Begin a procedure; it takes steps only from then on, also when nobody knows whether the drive has begun."""
         try:
             reply = await procedure.begin()
         except OutcomeUnknown:
-            self._procedure, self.step_due = procedure, False
+            self._take_up(procedure)
             raise
         command = self._tracker.command
         if command and command.command_id == procedure.turn.command_id:  # else a stop has ended it meanwhile
-            self._procedure, self.step_due = procedure, False
+            self._take_up(procedure)
         return reply
 
     # -- power -------------------------------------------------------------------------------------------------------

@@ -1,0 +1,523 @@
+"""Stops, successors, pending stops and readings of one axis, on a drive that only records what it is told."""
+
+import asyncio
+import contextlib
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.daemon.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
+from ldcnd.daemon.axis.permit import Right
+from ldcnd.drivers.driver import Fault, StopMode
+from ldcnd.errors import (
+    BusDown,
+    CommandExpired,
+    LdcndError,
+    LeaseExpired,
+    NotSupported,
+    OutcomeUnknown,
+    PositionLimit,
+    ReplyTimeout,
+    ShuttingDown,
+    StopLatched,
+    TooManyRequests,
+    WrongState,
+)
+from ldcnd.exchange import Timing
+from ldcnd.model.commands import (
+    BufferMode,
+    Halt,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    QuickStop,
+    Reset,
+    Stop,
+    Verb,
+)
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.samples import AxisState, LinkState, Moving
+from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
+
+THERE = MoveAbsolute(position=10.0)
+LOST = ReplyTimeout("no reply")
+
+
+async def moving(bench: AxisBench) -> None:
+    await bench.send(THERE, "first")
+    await bench.pass_s(0.1, **RUNNING)
+    bench.drive.told.clear()
+
+
+def now() -> Timing:
+    now_s = asyncio.get_running_loop().time()
+    return Timing(now_s, now_s, now_s, now_s)
+
+
+# -- stops -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("command", "mode"), [(Stop(), StopMode.SMOOTH), (QuickStop(), StopMode.ABRUPT)])
+async def test_a_stop_is_the_only_thing_that_is_sent_and_ends_the_motion(command, mode):
+    async with axis_bench() as bench:
+        await moving(bench)
+
+        reply = await bench.axis.execute(command)
+
+        assert bench.drive.told == [("stop", mode)]
+        assert (reply.axis, reply.verb) == ("x", command.verb)
+        assert (bench.tracker.state, bench.tracker.stop_latched) == (AxisState.STOPPING, True)
+        assert [node for node, _ in bench.bus.withdrawn] == [1]
+        assert ("first", CommandStatus.ABORTED) in {ended[:2] for ended in bench.ended}
+        await bench.settled()
+        assert (bench.tracker.state, bench.tracker.command) == (AxisState.STANDSTILL, None)
+
+
+async def test_a_stop_refuses_what_waits_and_what_is_under_way():
+    async with axis_bench() as bench:
+        released = asyncio.Event()
+        bench.drive.during["load"] = released.wait
+        async with asyncio.TaskGroup() as group:
+            first = group.create_task(outcome(bench.send(THERE)), name="first")
+            await asyncio.sleep(0)
+            waiting = group.create_task(outcome(bench.send(MoveRelative(distance=1.0))), name="waiting")
+            await asyncio.sleep(0)
+            await bench.stop()
+            assert isinstance(await waiting, StopLatched)
+            released.set()
+
+        assert isinstance(first.result(), StopLatched)
+        assert bench.drive.calls == ["load", "stop"]
+
+
+async def test_so_many_commands_wait_and_no_more():
+    async with axis_bench() as bench:
+        released = asyncio.Event()
+        bench.drive.during["load"] = released.wait
+        async with asyncio.TaskGroup() as group:
+            tasks = []
+            for _ in range(QUEUED_COMMANDS + 2):
+                tasks.append(group.create_task(outcome(bench.send(THERE)), name="move"))
+                await asyncio.sleep(0)
+            await asyncio.sleep(0.1)
+            assert [isinstance(task.result(), TooManyRequests) for task in tasks if task.done()] == [True]
+            released.set()
+
+
+async def test_a_stop_of_a_disabled_axis_leaves_its_loop_open():
+    async with axis_bench(powered=False) as bench:
+        await bench.settled()
+
+        await bench.stop()
+
+        assert bench.drive.told == [("stop", StopMode.OFF)]
+        assert (bench.tracker.state, bench.tracker.stop_latched) == (AxisState.DISABLED, True)
+
+
+async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive_confirms_it():
+    async with axis_bench() as bench:
+        await moving(bench)
+        sent = []
+
+        async def lost(mode):
+            sent.append(mode)
+            raise LOST
+
+        stop, bench.drive.stop = bench.drive.stop, lost
+        assert not await bench.axis.stop(StopMode.ABRUPT)
+        assert sent == [StopMode.ABRUPT] * STOP_ROUNDS
+        assert bench.axis.stop_is_pending
+        assert bench.axis.stop_wanted.is_set()
+        assert [fault.code for fault in bench.tracker.active_faults] == ["stop_unconfirmed"]
+
+        await bench.axis.bring_to_rest(StopMode.SMOOTH)
+        await bench.axis.send_pending_stop()
+        assert sent[-1] is StopMode.ABRUPT  # the stronger one is still owed
+        assert len(sent) == 2 * STOP_ROUNDS + 1
+        assert bench.axis.stop_is_pending
+
+        bench.drive.stop = stop
+        await bench.axis.send_pending_stop()
+        assert bench.drive.told == [("stop", StopMode.ABRUPT)]
+        assert not bench.axis.stop_is_pending
+        assert bench.tracker.active_faults == ()
+        assert bench.notes == [(Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")]
+
+        await bench.axis.send_pending_stop()
+        assert bench.drive.calls == ["stop"]  # nothing is owed any more
+
+
+async def test_a_weaker_stop_that_is_confirmed_does_not_settle_a_stronger_one():
+    async with axis_bench() as bench:
+        await moving(bench)
+        bench.bus.is_open = False
+        bench.drive.during["stop"] = raising(BusDown("the port is gone"))
+        assert not await bench.axis.stop(StopMode.OFF)
+        assert bench.drive.calls == ["stop"]  # no further round on a closed line
+
+        bench.bus.is_open = True
+        assert await bench.axis.bring_to_rest(StopMode.SMOOTH)
+
+        assert bench.axis.stop_is_pending
+        await bench.axis.send_pending_stop()
+        assert bench.drive.told[-1] == ("stop", StopMode.OFF)
+        assert not bench.axis.stop_is_pending
+
+
+async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
+    async with axis_bench() as bench:
+        await moving(bench)
+        bench.axis.line_up = False
+
+        assert not await bench.axis.stop(StopMode.SMOOTH)
+
+        assert bench.drive.calls == []
+        assert bench.bus.withdrawn == []
+        assert bench.axis.stop_is_pending
+        bench.axis.cannot_move()  # it had no power
+        assert not bench.axis.stop_is_pending
+        assert not bench.tracker.stop_pending
+
+
+async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent():
+    async with axis_bench(powered=False) as bench:
+        bench.axis.line_up = False
+        await bench.axis.stop(StopMode.SMOOTH)
+        bench.axis.line_up = True
+        bench.bus.during = raising(LOST)
+
+        await bench.axis.send_pending_stop()
+        assert bench.drive.calls == []  # how it was left is not known: a smooth stop would close an open loop
+        assert bench.axis.stop_is_pending
+
+        await bench.axis.send_pending_stop()
+        assert bench.drive.told == [("stop", StopMode.OFF)]
+        assert not bench.axis.stop_is_pending
+
+
+async def test_a_motor_that_must_be_off_first_is_switched_off():
+    async with axis_bench() as bench:
+        bench.axis.switch_off()
+        assert bench.axis.stop_is_pending
+
+        await bench.axis.send_pending_stop()
+
+        assert bench.drive.told == [("stop", StopMode.OFF)]
+        assert bench.tracker.state is AxisState.DISABLED
+
+
+async def test_a_reading_from_a_drive_that_owes_a_confirmation_calls_for_the_stop():
+    async with axis_bench() as bench:
+        bench.axis.switch_off()
+        bench.axis.stop_wanted.clear()
+
+        bench.show()
+
+        assert bench.axis.stop_wanted.is_set()
+
+
+async def test_a_drive_that_takes_no_stop_over_its_line_is_neither_latched_nor_told_anything():
+    async with axis_bench() as bench:
+        bench.axis.stoppable = False
+
+        assert not await bench.axis.stop(StopMode.SMOOTH)
+        assert not await bench.axis.bring_to_rest(StopMode.SMOOTH)
+        bench.axis.switch_off()
+
+        assert (bench.tracker.stop_latched, bench.tracker.stop_pending, bench.drive.calls) == (False, False, [])
+
+
+# -- successors --------------------------------------------------------------------------------------------------------
+
+
+async def in_turn(bench: AxisBench, move, right: Right = Right(), command_id: str = "next"):  # noqa: B008 - immutable
+    permit = bench.axis.permit(move.verb, right)
+    return await bench.axis.in_turn(move, permit, lambda: bench.axis.execute(move, command_id, permit))
+
+
+def buffered(position: float = 20.0, mode: BufferMode = BufferMode.BUFFERED) -> MoveAbsolute:
+    return MoveAbsolute(position=position, buffer_mode=mode)
+
+
+async def test_a_buffered_move_begins_when_the_one_before_it_has_ended():
+    async with axis_bench() as bench:
+        await moving(bench)
+        async with asyncio.TaskGroup() as group:
+            waiting = group.create_task(in_turn(bench, buffered()), name="next")
+            await bench.pass_s(0.1)
+            assert bench.drive.calls == []
+            await bench.pass_s(0.1, **STANDING)
+            await waiting
+
+        assert bench.drive.calls == ["load", "start"]
+        assert bench.tracker.command.command_id == "next"
+
+
+async def test_a_buffered_move_does_not_begin_after_a_policy_has_brought_the_axis_to_rest():
+    async with axis_bench() as bench:
+        await moving(bench)
+        async with asyncio.TaskGroup() as group:
+            waiting = group.create_task(outcome(in_turn(bench, buffered())), name="next")
+            await asyncio.sleep(0.1)
+            await bench.axis.bring_to_rest(StopMode.SMOOTH)
+            await bench.settled()
+
+        assert isinstance(waiting.result(), StopLatched)
+        assert bench.drive.calls == ["stop"]
+
+
+async def test_a_buffered_move_whose_sender_has_lost_the_axis_is_refused_when_its_turn_comes():
+    def lost():
+        raise LeaseExpired("the lease has ended")
+
+    async with axis_bench() as bench:
+        await moving(bench)
+        async with asyncio.TaskGroup() as group:
+            waiting = group.create_task(outcome(in_turn(bench, buffered(), Right(holds=lost))), name="next")
+            await bench.pass_s(0.1, **STANDING)
+
+        assert isinstance(waiting.result(), LeaseExpired)
+        assert bench.drive.calls == []
+
+
+async def test_a_buffered_move_that_waits_when_the_daemon_ends_is_refused():
+    async with axis_bench() as bench:
+        await moving(bench)
+        waiting = asyncio.create_task(outcome(in_turn(bench, buffered())), name="next")
+        await asyncio.sleep(0.1)
+    assert isinstance(await waiting, ShuttingDown)
+
+
+async def test_buffered_moves_follow_each_other_in_the_order_in_which_they_came():
+    async with axis_bench() as bench:
+        await moving(bench)
+        async with asyncio.TaskGroup() as group:
+            for position in (11.0, 12.0):
+                group.create_task(in_turn(bench, buffered(position), command_id=f"to {position}"), name="next")
+                await asyncio.sleep(0)
+            await bench.pass_s(0.1, **STANDING)
+            assert bench.tracker.command.command_id == "to 11.0"
+            await bench.pass_s(0.1, **RUNNING)
+            await bench.pass_s(0.1, **STANDING)
+
+        assert bench.tracker.command.command_id == "to 12.0"
+
+
+async def test_an_aborting_move_halts_what_runs_and_then_begins():
+    async with axis_bench() as bench:
+        await moving(bench)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(in_turn(bench, buffered(mode=BufferMode.ABORTING)), name="next")
+            await bench.pass_s(0.1)
+            assert bench.drive.told == [("stop", StopMode.SMOOTH)]
+            await bench.settled()
+
+        assert bench.drive.calls == ["stop", "load", "start"]
+
+
+async def test_an_aborting_move_on_an_axis_that_stands_halts_nothing():
+    async with axis_bench() as bench:
+        await in_turn(bench, buffered(mode=BufferMode.ABORTING))
+
+        assert bench.drive.calls == ["load", "start"]
+
+
+@pytest.mark.parametrize(
+    ("move", "refusal"),
+    [
+        (buffered(200.0, BufferMode.ABORTING), PositionLimit),
+        (MoveRelative(distance=200.0, buffer_mode=BufferMode.ABORTING), PositionLimit),
+        (MoveVelocity(velocity=0.0, buffer_mode=BufferMode.ABORTING), Exception),
+    ],
+)
+async def test_an_aborting_move_that_would_be_refused_halts_nothing(move, refusal):
+    async with axis_bench(limits={"position_max": 100.0}) as bench:
+        await moving(bench)
+
+        with pytest.raises(refusal):
+            await in_turn(bench, move)
+
+        assert bench.drive.calls == []
+
+
+async def test_an_aborting_move_whose_sender_has_no_right_halts_nothing():
+    def late():
+        raise CommandExpired("too late")
+
+    async with axis_bench() as bench:
+        await moving(bench)
+
+        with pytest.raises(CommandExpired):
+            await in_turn(bench, buffered(mode=BufferMode.ABORTING), Right(in_time=late))
+
+        assert bench.drive.calls == []
+
+
+# -- admission ---------------------------------------------------------------------------------------------------------
+
+
+async def test_what_the_drive_cannot_do_is_refused_before_anything_is_sent():
+    async with axis_bench() as bench:
+        bench.drive.capabilities = frozenset({Verb.STOP})
+
+        with pytest.raises(NotSupported):
+            await bench.send(THERE)
+
+        assert bench.drive.calls == []
+
+
+async def test_a_right_is_asked_before_the_turn_comes_and_again_before_the_packet():
+    asked = []
+    async with axis_bench() as bench:
+        await bench.send(THERE, right=Right(holds=lambda: asked.append(list(bench.drive.calls))))
+
+    assert asked[0] == []
+    assert ["load"] in asked  # directly before the start
+
+
+async def test_a_command_is_late_only_until_its_motion_has_begun():
+    asked = []
+    async with axis_bench() as bench:
+        await bench.send(THERE, right=Right(in_time=lambda: asked.append(list(bench.drive.calls))))
+
+    assert asked[-1] == ["load"]
+    assert ["load", "start"] not in asked
+
+
+# -- readings ----------------------------------------------------------------------------------------------------------
+
+
+async def test_a_drive_that_answers_again_after_it_was_away_is_reported_once():
+    async with axis_bench() as bench:
+        returned = []
+        bench.axis.returned = lambda: returned.append(bench.tracker.link)
+        bench.show()
+        bench.axis.disconnected()
+        bench.show()
+        bench.show()
+
+    assert returned == [LinkState.UP]
+
+
+async def test_the_first_reading_of_an_axis_is_no_return():
+    async with axis_bench(powered=False) as bench:
+        returned = []
+        bench.axis.returned = lambda: returned.append("returned")
+        bench.show()
+
+    assert returned == []
+
+
+async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away():
+    async with axis_bench() as bench:
+        for counts in (0, 0, 500_000, 500_000):
+            asks_again = bench.axis.judged(_reading(bench, position_counts=counts), frozenset(), now())
+            await asyncio.sleep(0.05)
+
+        assert not asks_again
+        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert not bench.tracker.referenced
+
+
+async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost():
+    async with axis_bench() as bench:
+        verdicts = [
+            bench.axis.judged(_reading(bench, position_counts=90_000 * step), frozenset(), now()) for step in range(5)
+        ]
+
+        assert verdicts == [False, True, True, True, False]
+        assert bench.tracker.link is LinkState.DEGRADED
+        assert bench.drive.shown.position_counts == 0
+
+
+async def test_misses_take_an_axis_down_only_in_a_row():
+    async with axis_bench() as bench:
+        for _ in range(10):
+            bench.axis.missed(LOST)
+            bench.axis.missed(LOST)
+            bench.show()
+        assert bench.tracker.link is LinkState.UP
+        assert bench.tracker.referenced
+
+        for _ in range(3):
+            bench.axis.missed(LOST)
+        assert bench.tracker.link is LinkState.DOWN
+        assert not bench.tracker.referenced
+
+
+async def test_an_axis_is_at_work_while_it_has_a_command_or_may_move():
+    async with axis_bench() as bench:
+        assert not bench.axis.at_work
+        await moving(bench)
+        assert bench.axis.at_work
+        await bench.settled()
+        assert not bench.axis.at_work
+        bench.axis.disconnected()
+        assert (bench.tracker.command, bench.tracker.moving) == (None, Moving.UNKNOWN)
+        assert bench.axis.at_work
+
+
+async def test_a_referenced_line_counts_from_the_drives_zero_again():
+    async with axis_bench() as bench:
+        bench.axis.telemetry.origin_counts = 77.0
+        bench.axis.connected(referenced=False)
+        assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (False, 77.0)
+
+        bench.axis.connected(referenced=True)
+        assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (True, 0.0)
+
+
+async def test_a_reset_or_power_of_an_axis_out_of_reach_is_refused():
+    async with axis_bench() as bench:
+        bench.axis.disconnected()
+        for command in (Reset(), Power(on=False), Halt(), THERE):
+            with pytest.raises(Exception, match="does not answer"):
+                await bench.send(command)
+
+    assert bench.drive.calls == []
+
+
+async def test_a_fault_during_a_motion_ends_it_and_nothing_follows():
+    async with axis_bench() as bench:
+        await moving(bench)
+        bench.show(enabled=False, faults=(Fault("position_error", "stuck"),), **STANDING)
+
+        assert bench.tracker.state is AxisState.ERROR_STOP
+        with pytest.raises(WrongState):
+            await bench.send(THERE)
+        assert bench.drive.calls == []
+
+
+async def test_a_start_with_an_unknown_outcome_is_left_to_the_readings():
+    async with axis_bench() as bench:
+        bench.drive.during["start"] = raising(OutcomeUnknown("no reply"))
+        with pytest.raises(OutcomeUnknown):
+            await bench.send(THERE, "first")
+
+        assert bench.tracker.command.command_id == "first"
+        await bench.pass_s(0.1, **RUNNING)
+        assert bench.tracker.state is AxisState.DISCRETE_MOTION
+        await bench.pass_s(0.1, **STANDING)
+        assert bench.ended[-1] == ("first", CommandStatus.DONE, None)
+
+
+async def test_a_start_that_was_not_taken_ends_the_command_at_once():
+    async with axis_bench() as bench:
+        bench.drive.during["start"] = raising(LOST)
+        with contextlib.suppress(ReplyTimeout):
+            await bench.send(THERE, "first")
+
+        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
+        assert bench.ended[-1] == ("first", CommandStatus.FAILED, "no reply")
+
+
+def _reading(bench: AxisBench, **changes):
+    return replace(bench.drive.shown, **changes)
+
+
+async def outcome(call):
+    try:
+        return await call
+    except LdcndError as error:
+        return error

@@ -1,0 +1,847 @@
+"""Homing, jogs, duties, set-points, analog and group moves step by step, on a drive that only records."""
+
+import asyncio
+import contextlib
+import math
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.daemon.axis.permit import Right
+from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
+from ldcnd.drivers.driver import AnalogMotion, Fault, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.errors import (
+    LdcndError,
+    LeaseExpired,
+    MalformedRequest,
+    NotReferenced,
+    NotSupported,
+    OutcomeUnknown,
+    PositionLimit,
+    ReplyTimeout,
+    StopLatched,
+    TooManyRequests,
+    ValueOutOfRange,
+    VelocityLimit,
+    WrongState,
+)
+from ldcnd.model.commands import (
+    Home,
+    HomeMethod,
+    HomeStop,
+    MoveAbsolute,
+    MoveAnalog,
+    MoveVelocity,
+    Power,
+    SetPwm,
+    Track,
+)
+from ldcnd.model.events import CommandStatus
+from ldcnd.model.samples import AxisState
+from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
+
+LOST = ReplyTimeout("no reply")
+OVERHEAT = Fault("overheat", "let it cool down")
+SEARCHING = {**RUNNING, "homing": True}
+CAPTURED = {**RUNNING, "homing": False}
+RESTING = {**STANDING, "homing": False}
+
+
+def loads(bench: AxisBench) -> list:
+    return [what for name, what in bench.drive.told if name == "load"]
+
+
+def status(bench: AxisBench, command_id: str) -> list[tuple[CommandStatus, str | None]]:
+    return [(status, reason) for ended, status, reason in bench.ended if ended == command_id]
+
+
+# -- homing ------------------------------------------------------------------------------------------------------------
+
+INDEX = Home(method=HomeMethod.INDEX, velocity=5.0, position=100.0)
+ONTO_SWITCH = Home(method=HomeMethod.FORWARD_LIMIT, velocity=5.0, position=20.0)
+
+
+async def test_a_search_is_armed_started_once_and_taken_over_when_it_has_captured():
+    async with axis_bench() as bench:
+        bench.drive.home_counts = 1234
+        reply = await bench.send(INDEX, "home")
+        assert (reply.position, reply.velocity, reply.acceleration) == (100.0, 5.0, 200.0)
+        assert bench.drive.calls == ["load", "start"]
+        motion, capture = loads(bench)[0]
+        assert capture == HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH)
+        assert motion == Motion(round(5000 * 60.0 * 1.1), 5000.0, 200_000.0)
+        assert (bench.tracker.state, bench.tracker.referenced) == (AxisState.HOMING, False)
+
+        await bench.pass_s(0.5, **SEARCHING)
+        assert bench.drive.calls == ["load", "start"]
+        await bench.pass_s(0.5, position_counts=1300, **CAPTURED)
+        assert bench.drive.calls == ["load", "start", "stop", "captured_home", "clear_warnings"]
+        assert bench.tracker.referenced
+        assert bench.axis.telemetry.position(1234) == 100.0
+        assert bench.tracker.state is AxisState.HOMING  # until it has come to rest
+        await bench.settled(position_counts=1300)
+        assert (bench.tracker.state, status(bench, "home")) == (AxisState.STANDSTILL, [(CommandStatus.DONE, None)])
+
+
+async def test_a_search_that_comes_to_rest_without_a_capture_has_failed():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"distance": 3.0}), "home")
+        assert loads(bench)[0][0].target_counts == 3000
+        await bench.pass_s(0.5, **SEARCHING)
+        await bench.settled(homing=True, position_counts=3000)
+
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        assert status(bench, "home") == [(CommandStatus.FAILED, "no index within 3 mm")]
+        assert not bench.tracker.referenced
+
+
+async def test_a_search_is_given_up_at_its_deadline():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"timeout_s": 2.0, "distance": 30.0}), "home")
+        await bench.pass_s(1.9, **SEARCHING)
+        assert bench.drive.calls == ["load", "start"]
+        await bench.pass_s(0.2, **SEARCHING)
+        assert bench.drive.calls == ["load", "start", "stop"]
+        await bench.settled(homing=False)
+
+    assert status(bench, "home") == [(CommandStatus.FAILED, "no index within 2 s")]
+
+
+@pytest.mark.parametrize(("here", "velocity"), [(0x7FFF_0000, 5.0), (-0x7FFF_0000, -5.0)])
+async def test_a_search_ends_within_the_counter_of_the_drive(here, velocity):
+    async with axis_bench() as bench:
+        await bench.settled(position_counts=here)
+        await bench.send(INDEX.model_copy(update={"velocity": velocity}))
+
+        assert loads(bench)[0][0].target_counts == math.copysign(0x7FFF_FFFF, velocity)
+
+
+@pytest.mark.parametrize("call", ["load", "start", "stop", "captured_home", "clear_warnings"])
+async def test_a_stop_at_any_step_of_a_search_leaves_no_reference_and_no_command(call):
+    async with axis_bench() as bench:
+        bench.drive.during[call] = bench.stop
+        with contextlib.suppress(StopLatched):
+            await bench.send(INDEX, "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, **CAPTURED)
+        await bench.settled(homing=False)
+
+        assert not bench.tracker.referenced
+        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
+        assert bench.tracker.stop_latched
+        assert bench.drive.calls.count("start") == (0 if call == "load" else 1)
+
+
+async def test_a_stop_while_a_search_looks_at_its_switch_starts_nothing():
+    async with axis_bench() as bench:
+        bench.bus.during = bench.stop
+        with pytest.raises(StopLatched):
+            await bench.send(ONTO_SWITCH)
+
+        assert bench.drive.calls == ["stop"]
+        assert bench.tracker.referenced  # as before
+
+
+async def test_a_stop_while_a_search_that_failed_is_ended_leaves_the_command_of_the_stop():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"timeout_s": 1.0}), "home")
+        bench.drive.during["stop"] = bench.stop
+        await bench.pass_s(1.1, **SEARCHING)
+        assert bench.tracker.command.verb == "stop"
+        await bench.settled(homing=False)
+
+    assert status(bench, "home") == [(CommandStatus.ABORTED, "aborted by stop")]
+
+
+async def test_an_axis_on_its_switch_leaves_it_before_it_searches():
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=True, reverse_limit=False)
+        await bench.send(ONTO_SWITCH, "home")
+        motion, capture = loads(bench)[0]
+        assert (math.copysign(1, motion.target_counts), capture.stop) == (-1, StopMode.SMOOTH)
+
+        await bench.pass_s(0.5, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
+        assert bench.drive.calls == ["load", "start", "stop"]
+        assert bench.tracker.state is AxisState.HOMING
+        await bench.pass_s(0.1, **RESTING)
+        assert bench.drive.calls == ["load", "start", "stop", "load", "start"]
+        assert loads(bench)[1][0].target_counts > 0
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
+        assert bench.tracker.referenced
+
+
+async def test_an_axis_that_does_not_come_off_its_switch_gives_up():
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=True)
+        await bench.send(ONTO_SWITCH, "home")
+        await bench.pass_s(0.5, **SEARCHING)
+        await bench.pass_s(0.1, **CAPTURED)
+        await bench.pass_s(0.1, **RESTING)
+        await bench.settled()
+
+    assert status(bench, "home") == [(CommandStatus.FAILED, "the axis does not come off the forward_limit switch")]
+    assert bench.drive.calls == ["load", "start", "stop", "stop"]
+
+
+async def test_an_axis_that_does_not_come_to_rest_off_its_switch_gives_up():
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=True)
+        await bench.send(ONTO_SWITCH.model_copy(update={"timeout_s": 5.0}), "home")
+        await bench.pass_s(0.5, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
+        await bench.pass_s(5.1, **CAPTURED)
+        await bench.settled(homing=False)
+
+    assert status(bench, "home") == [(CommandStatus.FAILED, "not at rest off the switch within 5 s")]
+
+
+async def test_a_switch_is_found_fast_then_left_and_then_searched_slowly():
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=False)
+        await bench.send(ONTO_SWITCH.model_copy(update={"find_velocity": 15.0}), "home")
+        assert loads(bench)[0][0].velocity_counts_per_s == 15_000.0
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
+        assert not bench.tracker.referenced
+        await bench.pass_s(0.1, **RESTING)
+        assert [load[0].velocity_counts_per_s for load in loads(bench)] == [15_000.0, 5000.0]
+        assert loads(bench)[1][0].target_counts < 0
+        assert [load[1].stop for load in loads(bench)] == [StopMode.SMOOTH] * 2
+
+
+async def test_a_search_away_from_its_switch_looks_at_no_switch_and_finds_nothing_first():
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=True)
+        bench.bus.during = raising(AssertionError("read"))
+        away = Home(method=HomeMethod.FORWARD_LIMIT, velocity=-5.0, find_velocity=15.0)
+        await bench.send(away)
+
+        assert loads(bench)[0][0].velocity_counts_per_s == 5000.0
+        assert loads(bench)[0][0].target_counts < 0
+
+
+@pytest.mark.parametrize(("active", "level", "on"), [("high", True, True), ("low", True, False), ("low", False, True)])
+async def test_the_level_of_a_switch_is_the_configured_one(active, level, on):
+    home = {"method": "reverse_limit", "velocity": -5.0, "switch_active": active}
+    async with axis_bench(home=home) as bench:
+        await bench.settled(reverse_limit=level, forward_limit=not level)
+        await bench.send(Home())
+
+        assert (loads(bench)[0][0].target_counts > 0) is on
+
+
+async def test_after_a_search_the_axis_moves_on_once_it_rests():
+    async with axis_bench() as bench:
+        bench.drive.home_counts = 1000
+        await bench.send(INDEX.model_copy(update={"move_to": 90.0}), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, position_counts=1100, **CAPTURED)
+        assert bench.drive.calls.count("load") == 1
+        await bench.settled(position_counts=1200)
+        assert loads(bench)[1].target_counts == 1000 - 10_000
+        assert bench.drive.calls.count("start") == 2
+        assert status(bench, "home") == [(CommandStatus.DONE, None)]
+
+
+async def test_an_axis_that_does_not_rest_after_its_search_does_not_move_on():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"move_to": 90.0, "timeout_s": 2.0}), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, **CAPTURED)
+        await bench.pass_s(2.1, **CAPTURED)
+        await bench.settled(homing=False)
+
+    assert bench.drive.calls.count("start") == 1
+    assert status(bench, "home") == [(CommandStatus.FAILED, "not at rest within 2 s")]
+
+
+async def test_a_search_that_opens_the_loop_ends_with_the_loop_open():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"stop": HomeStop.OFF}), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, enabled=False, **CAPTURED)
+
+        assert ("stop", StopMode.OFF) in bench.drive.told
+        assert (bench.tracker.state, bench.tracker.referenced) == (AxisState.DISABLED, True)
+        assert status(bench, "home") == [(CommandStatus.DONE, None)]
+
+
+@pytest.mark.parametrize("stopped", ["", "reset", "power"])
+async def test_a_search_by_position_error_resets_the_drive_and_closes_the_loop_again(stopped):
+    async with axis_bench() as bench:
+        bench.drive.home_counts = 500
+        if stopped:
+            bench.drive.during[stopped] = bench.stop
+        await bench.send(Home(method=HomeMethod.POSITION_ERROR, velocity=5.0), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, enabled=False, **CAPTURED)
+
+        assert bench.drive.calls[2:4] == ["reset", "stop" if stopped == "reset" else "captured_home"]
+        assert ("power" in bench.drive.calls) is (stopped != "reset")
+        assert bench.tracker.referenced is not bool(stopped)
+
+
+async def test_the_preset_completes_a_request_and_the_request_outranks_it():
+    preset = {
+        "method": "forward_limit", "velocity": 5.0, "find_velocity": 10.0, "position": 7.0, "timeout_s": 3.0,
+        "distance": 4.0, "stop": "abrupt", "move_to": 1.0,
+    }  # fmt: skip
+    async with axis_bench(home=preset) as bench:
+        reply = await bench.send(Home())
+        assert reply.position == 7.0
+        assert loads(bench)[0][0] == Motion(4000, 10_000.0, 200_000.0)
+        await bench.stop()
+        await bench.settled()
+        bench.tracker.cleared(0.0)
+        await bench.settled()
+        bench.drive.told.clear()
+        await bench.send(Home(method=HomeMethod.INDEX, velocity=2.0, position=0.0, distance=8.0, stop=HomeStop.SMOOTH))
+
+        assert loads(bench) == [(Motion(8000, 2000.0, 200_000.0), HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH))]
+
+
+@pytest.mark.parametrize(
+    ("request_", "refusal"),
+    [
+        (Home(), MalformedRequest),
+        (Home(method=HomeMethod.INDEX), MalformedRequest),
+        (Home(velocity=1.0), MalformedRequest),
+        (Home(method=HomeMethod.CURRENT, velocity=1.0), NotSupported),
+        (Home(method=HomeMethod.INDEX, velocity=1.0, stop=HomeStop.OFF, move_to=1.0), MalformedRequest),
+        (Home(method=HomeMethod.INDEX, velocity=1.0, move_to=101.0), PositionLimit),
+        (Home(method=HomeMethod.INDEX, velocity=31.0), VelocityLimit),
+        (Home(method=HomeMethod.INDEX, velocity=8.0), VelocityLimit),
+    ],
+)
+async def test_a_search_that_cannot_be_is_refused_before_anything_is_sent(request_, refusal):
+    async with axis_bench(limits={"position_max": 100.0, "velocity": 30.0}) as bench:
+        bench.drive.home_methods = frozenset(HomeMethod) - {HomeMethod.CURRENT}
+        bench.drive.index_sample_s = 0.0001  # 7.5 mm/s with an index of one count
+
+        with pytest.raises(refusal):
+            await bench.send(request_)
+
+        assert bench.drive.calls == []
+        assert bench.tracker.referenced
+
+
+async def test_an_index_search_as_fast_as_the_drive_can_see_is_taken_and_other_captures_do_not_care():
+    async with axis_bench() as bench:
+        bench.drive.index_sample_s = 0.0001
+        with pytest.raises(VelocityLimit) as refusal:
+            await bench.send(INDEX.model_copy(update={"velocity": -8.0}))
+        assert refusal.value.nearest == -7.5
+        await bench.send(INDEX.model_copy(update={"velocity": -7.5}))
+        await bench.stop()
+        await bench.settled()
+        bench.tracker.cleared(0.0)
+        await bench.settled()
+        await bench.send(Home(method=HomeMethod.CURRENT, velocity=8.0))
+
+
+async def test_a_step_whose_packets_were_lost_is_taken_again():
+    async with axis_bench() as bench:
+        await bench.send(INDEX, "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        bench.drive.during["captured_home"] = raising(LOST)
+        await bench.pass_s(0.1, **CAPTURED)
+        assert not bench.tracker.referenced
+        await asyncio.sleep(0.19)
+        assert bench.drive.calls.count("captured_home") == 1
+        await asyncio.sleep(0.02)
+
+        assert bench.drive.calls.count("captured_home") == 2
+        assert bench.tracker.referenced
+
+
+async def test_a_step_of_a_drive_that_does_not_answer_is_taken_again_more_slowly():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"timeout_s": 1.0}), "home")
+        await bench.pass_s(0.5, **SEARCHING)
+        bench.axis.missed(LOST)
+        bench.drive.during["stop"] = raising(LOST)
+        await asyncio.sleep(0.6)
+        assert bench.drive.calls.count("stop") == 1
+        await asyncio.sleep(0.8)
+        assert bench.drive.calls.count("stop") == 1
+        await asyncio.sleep(0.2)
+        assert bench.drive.calls.count("stop") == 2
+
+
+async def test_a_leg_whose_sender_has_lost_the_axis_is_not_begun_and_the_axis_comes_to_rest():
+    lost = []
+
+    def holds() -> None:
+        if lost:
+            raise LeaseExpired("the lease has ended")
+
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=True)
+        await bench.send(ONTO_SWITCH, "home", Right(holds=holds))
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
+        lost.append(True)
+        await bench.pass_s(0.1, **RESTING)
+        assert bench.drive.calls == ["load", "start", "stop", "stop"]
+        await bench.settled()
+
+    assert status(bench, "home") == [(CommandStatus.FAILED, "the lease has ended")]
+
+
+async def test_a_fault_ends_a_search_and_no_step_follows():
+    async with axis_bench() as bench:
+        await bench.send(INDEX.model_copy(update={"timeout_s": 1.0}), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        bench.show(faults=(OVERHEAT,), enabled=False, **RESTING)
+        await asyncio.sleep(5.0)
+
+    assert bench.drive.calls == ["load", "start"]
+    assert status(bench, "home")[0][0] is CommandStatus.FAILED
+
+
+# -- jogs that change their velocity -----------------------------------------------------------------------------------
+
+
+async def jogging(bench: AxisBench, velocity: float = 10.0, **changes: object) -> None:
+    await bench.send(MoveVelocity(velocity=velocity), "jog")
+    await bench.pass_s(0.1, **(RUNNING | changes))
+    bench.drive.told.clear()
+
+
+async def test_a_jog_changes_its_velocity_in_velocity_mode_and_is_ended_before_the_limit():
+    async with axis_bench(limits={"position_max": 50.0}) as bench:
+        await jogging(bench)
+        reply = await bench.send(MoveVelocity(velocity=5.0), "slower")
+        assert bench.drive.told == [("load", Motion(None, 5000.0, 200_000.0)), ("start", None)]
+        assert (reply.velocity, reply.acceleration) == (5.0, 200.0)
+
+        # 10 mm/s before the change: 10 * 10 / (2 * 200) + 10 * 0.2
+        await bench.pass_s(0.1, position_counts=47_749)
+        assert bench.drive.calls == ["load", "start"]
+        await bench.pass_s(0.1, position_counts=47_751)
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        await bench.settled(position_counts=48_000)
+        assert status(bench, "slower") == [(CommandStatus.ABORTED, None)] or status(bench, "slower")
+
+
+async def test_a_jog_backwards_is_ended_before_the_lower_limit():
+    async with axis_bench(limits={"position_min": -50.0}) as bench:
+        await jogging(bench, -10.0, velocity_counts_per_s=-10_000.0)
+        await bench.send(MoveVelocity(velocity=-10.0))
+        await bench.pass_s(0.1, position_counts=-47_749, velocity_counts_per_s=-10_000.0)
+        assert "stop" not in bench.drive.calls
+        await bench.pass_s(0.1, position_counts=-47_751, velocity_counts_per_s=-10_000.0)
+
+    assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+
+
+async def test_a_jog_without_a_limit_ends_at_its_horizon():
+    async with axis_bench(jog_horizon_s=2.0) as bench:
+        await jogging(bench)
+        await bench.send(MoveVelocity(velocity=5.0))
+        await bench.pass_s(1.9, **RUNNING)
+        assert "stop" not in bench.drive.calls
+        await bench.pass_s(0.2, **RUNNING)
+
+    assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+
+
+async def test_a_jog_is_not_made_faster_where_the_limit_is_too_near():
+    async with axis_bench(limits={"position_max": 50.0}) as bench:
+        await jogging(bench, position_counts=47_800)
+        with pytest.raises(PositionLimit, match="too near"):
+            await bench.send(MoveVelocity(velocity=10.0))
+        assert bench.drive.calls == []
+
+        bench.tracker.referenced = False
+        await bench.send(MoveVelocity(velocity=10.0))
+
+
+async def test_a_jog_that_the_drive_cut_short_has_failed():
+    async with axis_bench() as bench:
+        await jogging(bench)
+        await bench.send(MoveVelocity(velocity=5.0), "slower")
+        await bench.pass_s(0.1, cut_short="the drive stopped at the forward limit switch", **RUNNING)
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        await bench.settled()
+
+    assert [reason for _, _, reason in bench.ended if reason and "switch" in reason]
+
+
+async def test_a_jog_that_was_lost_from_sight_is_stopped_until_it_is_seen_at_rest():
+    async with axis_bench() as bench:
+        await jogging(bench)
+        await bench.send(MoveVelocity(velocity=5.0))
+        bench.axis.disconnected()
+        await bench.pass_s(0.5, **RUNNING)
+
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+
+
+# -- raw duties --------------------------------------------------------------------------------------------------------
+
+PWM = {"duty": 0.5, "duration_s": 5.0}
+
+
+async def test_a_duty_is_ended_after_its_time():
+    async with axis_bench(pwm=PWM) as bench:
+        reply = await bench.send(SetPwm(duty=0.2, duration_s=2.0), "pwm")
+        assert bench.drive.told == [("load", PwmOutput(0.2, 200_000.0)), ("start", None)]
+        assert (reply.duty, reply.duration_s) == (0.2, 2.0)
+        await bench.pass_s(1.9, enabled=False, **RUNNING)
+        assert bench.tracker.state is AxisState.CONTINUOUS_MOTION  # an open loop is what was asked for
+        assert "stop" not in bench.drive.calls
+        await asyncio.sleep(0.2)
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        await bench.settled(enabled=True)
+
+    assert bench.tracker.state is AxisState.STANDSTILL
+
+
+async def test_a_duty_on_a_reversed_axis_goes_the_other_way():
+    async with axis_bench(pwm=PWM, direction="reverse") as bench:
+        await bench.send(SetPwm(duty=0.2, duration_s=2.0))
+
+    assert loads(bench)[0].duty == -0.2
+
+
+async def test_a_duty_may_replace_a_duty_but_not_while_it_is_being_stopped():
+    async with axis_bench(pwm=PWM) as bench:
+        await bench.send(SetPwm(duty=0.2, duration_s=2.0))
+        await bench.send(SetPwm(duty=-0.1, duration_s=1.0))
+        assert [load.duty for load in loads(bench)] == [0.2, -0.1]
+
+        await bench.stop()
+        with pytest.raises(StopLatched):
+            await bench.send(SetPwm(duty=0.1, duration_s=1.0))
+        assert len(loads(bench)) == 2
+
+
+@pytest.mark.parametrize(("duty", "duration_s", "nearest"), [(0.6, 1.0, 0.5), (-0.6, 1.0, -0.5), (0.1, 6.0, 5.0)])
+async def test_a_duty_beyond_its_bounds_is_refused(duty, duration_s, nearest):
+    async with axis_bench(pwm=PWM) as bench:
+        with pytest.raises(ValueOutOfRange) as refusal:
+            await bench.send(SetPwm(duty=duty, duration_s=duration_s))
+        await bench.send(SetPwm(duty=0.5, duration_s=5.0))
+
+    assert refusal.value.nearest == nearest
+    assert len(loads(bench)) == 1
+
+
+async def test_a_duty_needs_an_axis_that_stands_and_bounds():
+    async with axis_bench(pwm=PWM) as bench:
+        await bench.send(MoveAbsolute(position=10.0))
+        with pytest.raises(WrongState):
+            await bench.send(SetPwm(duty=0.1, duration_s=1.0))
+    async with axis_bench() as bench:
+        with pytest.raises(NotSupported):
+            await bench.send(SetPwm(duty=0.1, duration_s=1.0))
+        assert bench.drive.calls == []
+
+
+async def test_a_duty_that_was_lost_from_sight_is_switched_off():
+    async with axis_bench(pwm=PWM) as bench:
+        await bench.send(SetPwm(duty=0.2, duration_s=5.0))
+        bench.axis.disconnected()
+        await bench.pass_s(0.5, enabled=False, **RUNNING)
+
+    assert bench.drive.told[-1] == ("stop", StopMode.OFF)
+
+
+# -- streams of set-points ---------------------------------------------------------------------------------------------
+
+TRACKING = {"step": 0.5, "rate": 50.0}
+
+
+async def test_set_points_follow_each_other_within_their_step_and_rate():
+    async with axis_bench(tracking=TRACKING) as bench:
+        reply = await bench.send(Track(position=0.5), "one")
+        assert reply.position == 0.5
+        assert bench.tracker.state is AxisState.CONTINUOUS_MOTION
+        await asyncio.sleep(0.02)
+        await bench.send(Track(position=1.0), "two")  # from the set-point before, wherever the axis is
+        assert [what for name, what in bench.drive.told if name == "track"] == [500, 1000]
+        assert status(bench, "one") == [(CommandStatus.DONE, None)]
+
+        await asyncio.sleep(0.02)
+        with pytest.raises(ValueOutOfRange) as refusal:
+            await bench.send(Track(position=1.6))
+        assert refusal.value.nearest == pytest.approx(1.5)
+        with pytest.raises(ValueOutOfRange) as refusal:
+            await bench.send(Track(position=0.4))
+        assert refusal.value.nearest == pytest.approx(0.5)
+
+
+async def test_a_stream_is_over_when_nothing_comes_any_more():
+    async with axis_bench(tracking=TRACKING) as bench:
+        await bench.send(Track(position=0.1), "one")
+        await bench.pass_s(0.45)
+        assert bench.tracker.command
+        await bench.pass_s(0.1)
+
+        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
+        assert status(bench, "one") == [(CommandStatus.DONE, None)]
+        assert bench.drive.calls == ["track"]
+
+
+async def test_a_set_point_may_be_half_a_period_early_but_the_mean_rate_is_kept():
+    async with axis_bench(tracking=TRACKING) as bench:
+        await bench.send(Track(position=0.1))
+        await asyncio.sleep(0.011)
+        await bench.send(Track(position=0.2))
+        await asyncio.sleep(0.011)
+        with pytest.raises(TooManyRequests):
+            await bench.send(Track(position=0.3))
+        await asyncio.sleep(0.009)
+        await bench.send(Track(position=0.3))
+
+    assert bench.drive.calls == ["track"] * 3
+
+
+@pytest.mark.parametrize("state", ["disabled", "moving", "latched", "not referenced", "beyond", "unconfigured"])
+async def test_a_set_point_needs_a_closed_referenced_loop_at_rest_and_bounds(state):
+    expected = {"not referenced": NotReferenced, "beyond": PositionLimit, "latched": StopLatched}
+    tracking = {} if state == "unconfigured" else {"tracking": TRACKING}
+    async with axis_bench(limits={"position_max": 0.3}, **tracking) as bench:
+        if state == "disabled":
+            await bench.send(Power(on=False))
+        elif state == "moving":
+            await bench.send(MoveAbsolute(position=0.2))
+        elif state == "latched":
+            await bench.stop()
+            await bench.settled()
+        elif state == "not referenced":
+            bench.tracker.referenced = False
+        with pytest.raises(NotSupported if state == "unconfigured" else expected.get(state, WrongState)):
+            await bench.send(Track(position=0.4 if state == "beyond" else 0.1))
+
+    assert "track" not in bench.drive.calls
+
+
+async def test_a_stop_ends_a_stream_and_no_set_point_follows():
+    async with axis_bench(tracking=TRACKING) as bench:
+        await bench.send(Track(position=0.1))
+        await bench.stop()
+        await asyncio.sleep(0.02)
+        with pytest.raises(StopLatched):
+            await bench.send(Track(position=0.2))
+
+    assert bench.drive.calls == ["track", "stop"]
+
+
+async def test_a_set_point_with_an_unknown_outcome_counts_for_the_next_one_and_a_lost_one_ends_the_stream():
+    async with axis_bench(tracking=TRACKING) as bench:
+        bench.drive.during["track"] = raising(OutcomeUnknown("no reply"))
+        with pytest.raises(OutcomeUnknown):
+            await bench.send(Track(position=0.4), "one")
+        await asyncio.sleep(0.02)
+        await bench.send(Track(position=0.8), "two")
+        await asyncio.sleep(0.02)
+        bench.drive.during["track"] = raising(LOST)
+        with pytest.raises(ReplyTimeout):
+            await bench.send(Track(position=0.9), "three")
+
+        assert bench.tracker.command is None
+        assert status(bench, "three") == [(CommandStatus.FAILED, "no reply")]
+
+
+# -- analog moves ------------------------------------------------------------------------------------------------------
+
+
+async def test_an_analog_move_ends_when_the_drive_says_so():
+    async with axis_bench() as bench:
+        reply = await bench.send(MoveAnalog(target=500, velocity=5.0), "analog")
+        assert bench.drive.told == [("load", AnalogMotion(500, 5000.0, 200_000.0)), ("start", None)]
+        assert (reply.target, reply.velocity, reply.acceleration) == (500, 5.0, 200.0)
+        await bench.pass_s(0.1, **RUNNING)
+        await bench.pass_s(0.1, **STANDING)
+
+    assert status(bench, "analog") == [(CommandStatus.DONE, None)]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "counts", "failure"),
+    [
+        (0.5, 3100, "not there within 3 mm"),
+        (0.5, -3100, "not there within 3 mm"),
+        (2.5, 100, "not there within 2 s"),
+        (0.5, 2100, "stopped beyond a software limit"),
+        (0.5, -2100, "stopped beyond a software limit"),
+        (0.5, 1900, None),
+        (0.5, -1900, None),
+    ],
+)
+async def test_an_analog_move_is_stopped_at_each_of_its_bounds(seconds, counts, failure):
+    limits = {"position_min": -2.0, "position_max": 2.0}
+    async with axis_bench(analog={"timeout_s": 2.0, "distance": 3.0}, limits=limits) as bench:
+        bench.tracker.referenced = failure is None or "limit" in failure
+        await bench.send(MoveAnalog(target=500), "analog")
+        await bench.pass_s(seconds, position_counts=counts, **RUNNING)
+        assert ("stop" in bench.drive.calls) is (failure is not None)
+        if failure:
+            assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+            await bench.settled()
+            assert status(bench, "analog") == [(CommandStatus.FAILED, failure)]
+
+
+async def test_an_analog_move_without_a_distance_goes_as_far_as_its_velocity_in_its_time():
+    async with axis_bench() as bench:
+        await bench.send(MoveAnalog(target=500, velocity=5.0, timeout_s=2.0))
+        await bench.pass_s(0.1, position_counts=9_900, **RUNNING)
+        assert "stop" not in bench.drive.calls
+        await bench.pass_s(0.1, position_counts=10_100, **RUNNING)
+
+    assert "stop" in bench.drive.calls
+
+
+async def test_an_analog_target_above_full_scale_is_refused():
+    async with axis_bench() as bench:
+        with pytest.raises(ValueOutOfRange) as refusal:
+            await bench.send(MoveAnalog(target=1024))
+        await bench.send(MoveAnalog(target=1023))
+
+    assert refusal.value.nearest == 1023
+
+
+async def test_an_analog_move_needs_an_axis_that_stands():
+    async with axis_bench() as bench:
+        await bench.send(MoveAbsolute(position=1.0))
+        with pytest.raises(WrongState):
+            await bench.send(MoveAnalog(target=500))
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+async def test_an_analog_move_that_was_lost_from_sight_is_stopped_or_switched_off(enabled):
+    async with axis_bench() as bench:
+        await bench.send(MoveAnalog(target=500))
+        bench.axis.disconnected()
+        await bench.pass_s(0.5, enabled=enabled, **RUNNING)
+
+    assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH if enabled else StopMode.OFF)
+
+
+# -- group moves -------------------------------------------------------------------------------------------------------
+
+
+class FakeNetwork:
+    """A line that starts a group after `meanwhile` has happened."""
+
+    def __init__(self) -> None:
+        self.started: list[set[str]] = []
+        self.fails: Exception | None = None
+        self.meanwhile = lambda: None
+
+    async def start_group(self, motions, still_wanted):
+        await asyncio.sleep(0.01)
+        self.meanwhile()
+        still_wanted()
+        self.started.append(set(motions))
+        if self.fails:
+            raise self.fails
+
+
+async def joined(bench: AxisBench, meeting: Meeting, position: float = 10.0, command_id: str = "group"):
+    return await bench.send(GroupMoveRequest.of(MoveAbsolute(position=position), meeting), command_id)
+
+
+async def outcome(call):
+    try:
+        return await call
+    except LdcndError as error:
+        return error
+
+
+async def test_a_group_starts_once_all_its_members_have_their_turn():
+    network = FakeNetwork()
+    async with axis_bench() as one, axis_bench(name="y") as other, asyncio.TaskGroup() as group:
+        meeting = Meeting(network, frozenset({"x", "y"}))
+        first = group.create_task(joined(one, meeting), name="x")
+        await asyncio.sleep(0.5)
+        assert network.started == []
+        reply = await joined(other, meeting, 20.0)
+        await asyncio.sleep(0.01)
+
+        assert network.started == [{"x", "y"}]
+        assert (reply.position, first.result().position) == (20.0, 10.0)
+        assert one.tracker.state is other.tracker.state is AxisState.DISCRETE_MOTION
+
+
+async def test_a_member_whose_turn_does_not_come_keeps_all_from_moving():
+    network = FakeNetwork()
+    async with axis_bench() as one:
+        with pytest.raises(WrongState, match="y did not get their turn"):
+            await joined(one, Meeting(network, frozenset({"x", "y"})))
+
+        assert (network.started, one.tracker.command) == ([], None)
+
+
+async def test_a_member_that_cannot_move_keeps_all_from_moving_and_gives_the_cause():
+    network = FakeNetwork()
+    async with axis_bench() as one, axis_bench(name="y") as other, asyncio.TaskGroup() as group:
+        await other.send(Power(on=False))
+        meeting = Meeting(network, frozenset({"x", "y"}))
+        first = group.create_task(outcome(joined(one, meeting)), name="x")
+        await asyncio.sleep(0)
+        begun_s = asyncio.get_running_loop().time()
+        with pytest.raises(WrongState, match="disabled"):
+            await joined(other, meeting)
+        assert "disabled" in str(await first)  # the cause, at once, not that somebody was late
+        assert asyncio.get_running_loop().time() - begun_s < 0.1
+        assert "disabled" in str(meeting.failure)
+
+    assert network.started == []
+
+
+async def test_a_member_that_leaves_while_the_drives_are_loaded_keeps_all_from_moving():
+    network = FakeNetwork()
+    async with axis_bench() as one:
+        meeting = Meeting(network, frozenset({"x"}))
+        network.meanwhile = lambda: meeting.fail(LOST)
+        with pytest.raises(ReplyTimeout):
+            await joined(one, meeting)
+        await one.pass_s(0.1)
+
+        assert (network.started, one.tracker.command) == ([], None)
+
+
+async def test_a_stop_of_a_member_while_the_drives_are_loaded_keeps_all_from_moving():
+    network = FakeNetwork()
+    async with axis_bench() as one:
+        network.meanwhile = one.axis._gate.overtake
+        with pytest.raises(StopLatched):
+            await joined(one, Meeting(network, frozenset({"x"})))
+
+        assert (network.started, one.tracker.command) == ([], None)
+
+
+@pytest.mark.parametrize("error", [LOST, OutcomeUnknown("not all axes are known to have started")])
+async def test_a_group_that_failed_to_start_is_over_unless_it_may_have_started(error):
+    network = FakeNetwork()
+    network.fails = error
+    async with axis_bench() as one:
+        with pytest.raises(type(error)):
+            await joined(one, Meeting(network, frozenset({"x"})))
+
+        if isinstance(error, OutcomeUnknown):
+            assert one.tracker.command.command_id == "group"
+            await one.pass_s(0.1, **STANDING)  # readings tell how it went
+        assert one.tracker.command is None
+
+
+async def test_a_group_move_needs_a_reference():
+    network = FakeNetwork()
+    async with axis_bench() as one:
+        one.tracker.referenced = False
+        with pytest.raises(NotReferenced):
+            await joined(one, Meeting(network, frozenset({"x"})))
+
+
+async def test_a_relative_move_counts_from_the_target_of_a_group_move():
+    async with axis_bench() as one:
+        await joined(one, Meeting(FakeNetwork(), frozenset({"x"})))
+        await one.settled(position_counts=10_004)
+
+        assert one.axis._motion.target_counts == 10_000
+        assert replace(one.drive.shown).position_counts == 10_004
