@@ -75,6 +75,31 @@ class TelemetryConfig(Frozen):
     """json can be read by every Zenoh tool; msgpack is smaller."""
 
 
+class HeartbeatConfig(Frozen):
+    """A wire that changes its level while the daemon works, for a relay outside; exactly one of port, gpio and file."""
+
+    port: str | None = None
+    """A serial port that carries nothing else; best a name below /dev/serial/by-id."""
+    signal: Literal["rts", "dtr"] = "rts"
+    """Which output of the port."""
+    gpio: str | None = Field(default=None, pattern=r"^gpiochip[0-9]+:[0-9]+$")
+    """A line of a GPIO chip, as "gpiochip0:17"; needs the extra `gpio`."""
+    file: Path | None = None
+    """A file of the kernel that takes 0 and 1, such as the brightness of an LED that drives a pin."""
+    half_period_ms: float = Field(default=50.0, ge=5.0, le=1000.0)
+    """Time between two changes."""
+    silence_ms: float = Field(default=500.0, ge=50.0, le=60_000.0)
+    """A line without any reply for so long holds the level; more than the longest pause between two of its polls."""
+    lines: tuple[Name, ...] = ()
+    """The lines that must work; all if none is named."""
+
+    @model_validator(mode="after")
+    def _one_wire(self) -> Self:
+        if sum(each is not None for each in (self.port, self.gpio, self.file)) != 1:
+            raise ValueError("a heartbeat needs exactly one of port, gpio and file")
+        return self
+
+
 class RigConfig(Frozen):
     """A whole rig: what `ldcnd run` needs to know."""
 
@@ -92,6 +117,8 @@ class RigConfig(Frozen):
     """Where the daemon keeps what must outlive it, such as the wear of EEPROMs; without it EEPROM is not written."""
     captures: CapturesConfig = CapturesConfig()
     """Captures that the daemon writes by itself."""
+    heartbeat: HeartbeatConfig | None = None
+    """A wire that changes its level while the daemon works."""
     bus: tuple[BusConfig, ...] = Field(min_length=1)
     """The lines."""
     sim: tuple[SimulatedLineConfig, ...] = ()
@@ -109,6 +136,7 @@ class RigConfig(Frozen):
         refuse_duplicates("sim", [line.name for line in self.sim])
         ports = [bus.port for bus in self.bus]
         refuse_duplicates("port", ports)
+        self._check_heartbeat()
         lines = {line.name for line in self.sim}
         for port in ports:
             if port.startswith("sim:") and port.removeprefix("sim:") not in lines:
@@ -119,6 +147,17 @@ class RigConfig(Frozen):
             if bus.port.startswith("sim:") and (bus.family == "smartstep") is not (bus.port[4:] in units):
                 raise ValueError(f"bus {bus.name}: SmartSteps are simulated by units, other drives by modules")
         return self
+
+    def _check_heartbeat(self) -> None:
+        if self.heartbeat is None:
+            return
+        for bus in self.bus:
+            if bus.port == self.heartbeat.port:
+                raise ValueError(f"heartbeat.port is the port of bus {bus.name}; use one that carries nothing else")
+        known = [bus.name for bus in self.bus]
+        for name in self.heartbeat.lines:
+            if name not in known:
+                raise ValueError(f"heartbeat.lines: there is no bus {name!r}; there are: {', '.join(known)}")
 
 
 def single_line(rig: RigConfig, name: str) -> RigConfig:

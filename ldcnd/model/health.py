@@ -113,6 +113,17 @@ class BusHealth(Frozen):
     """The axes on the line."""
 
 
+class HeartbeatHealth(Frozen):
+    """The wire that changes its level while the daemon works."""
+
+    beating: bool
+    """Whether it changes now."""
+    why: str = ""
+    """Why it does not, for a person; empty while it does."""
+    changes: int = Field(ge=0)
+    """How often it has changed since the daemon started."""
+
+
 class DaemonHealth(Frozen):
     """The daemon's process: published each second on `meta/health`."""
 
@@ -130,6 +141,8 @@ class DaemonHealth(Frozen):
     """Queries that have no answer yet: questions, commands and stops."""
     dropped: int = Field(default=0, ge=0)
     """Queries that were refused for being too many, and news of clients that were lost, since the daemon started."""
+    heartbeat: HeartbeatHealth | None = None
+    """The heartbeat; None where none is configured."""
 
 
 class Verdict(StrEnum):

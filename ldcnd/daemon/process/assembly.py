@@ -23,6 +23,7 @@ from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.line.smartstep_line import build_line, open_ledger
 from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.daemon.process.heartbeat import Heartbeat
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisDriver
 from ldcnd.drivers.smartstep.ledger import EepromLedger
@@ -106,7 +107,10 @@ def build_daemon(
     def eeprom_writes(axis: AxisService) -> int | None:
         return eeprom.total(axis.config.name) if eeprom and axis.driver.parameters else None
 
-    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, eeprom_writes, stops=stops)
+    heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
+    return Daemon(
+        config, session, rig, dispatcher, publisher, clock, instance, eeprom_writes, stops=stops, heartbeat=heartbeat
+    )
 
 
 def _build_bus(

@@ -13,6 +13,7 @@ from ldcnd.daemon.command.dispatch import Dispatcher
 from ldcnd.daemon.command.loss import apply_policy
 from ldcnd.daemon.command.requests import EarlyStops, Requests
 from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.process.heartbeat import Heartbeat
 from ldcnd.daemon.publish.health import EepromWrites, HealthWatch
 from ldcnd.daemon.publish.meta import Describing
 from ldcnd.daemon.publish.publisher import Publisher
@@ -55,6 +56,7 @@ class Daemon:
         eeprom_writes: EepromWrites,
         *,
         stops: EarlyStops | None = None,
+        heartbeat: Heartbeat | None = None,
     ) -> None:
         self.rig = rig
         self._stops = stops
@@ -71,6 +73,9 @@ class Daemon:
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
         plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)
+        self._heartbeat = heartbeat
+        if heartbeat:
+            self._health.heartbeat = lambda: heartbeat.health
         self._describing = Describing(
             rig, self._keys, publisher, self._info, lambda: self._config, plan, self._health, clock
         )
@@ -138,6 +143,8 @@ class Daemon:
                 serving.append(group.create_task(self._watch_axes(), name="liveliness"))
                 serving.append(group.create_task(leases.run(), name="leases"))
                 serving.append(group.create_task(self._health.run(), name="health"))
+                if self._heartbeat:
+                    serving.append(group.create_task(self._heartbeat.run(), name="heartbeat"))
                 if self.captures:
                     serving.append(group.create_task(self.captures.run(), name="captures"))
                 self._serving.set()

@@ -11,7 +11,15 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Load
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, ItemHealth, LaneHealth, StopWaitHealth
+from ldcnd.model.health import (
+    AxisHealth,
+    BusHealth,
+    DaemonHealth,
+    HeartbeatHealth,
+    ItemHealth,
+    LaneHealth,
+    StopWaitHealth,
+)
 from ldcnd.model.samples import TelemetryItem
 
 EepromWrites = Callable[[AxisService], int | None]
@@ -70,6 +78,7 @@ class HealthWatch:
     Attributes:
         latest: the newest report of each key.
         stop_bounds_s: what the plan promises of stops, by line.
+        heartbeat: returns how the heartbeat is; None where none is configured.
     """
 
     def __init__(
@@ -89,6 +98,7 @@ class HealthWatch:
         self._clock = clock
         self._load = load
         self._eeprom_writes = eeprom_writes
+        self.heartbeat: Callable[[], HeartbeatHealth | None] = lambda: None
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
@@ -133,6 +143,7 @@ class HealthWatch:
                 missed_reports=self._missed,
                 waiting_queries=load.waiting,
                 dropped=load.lost,
+                heartbeat=self.heartbeat(),
             )
         }
         for bus in self._rig.buses:
