@@ -30,16 +30,6 @@ def pytest_asyncio_loop_factories(
     return {"jumping": JumpingLoop}
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give what runs on the wall clock a second chance: who else uses the processors is nothing that a test decides.
-
-    What needed it is listed as RERUN at the end, and is a defect all the same.
-    """
-    for item in items:
-        if item.get_closest_marker("real_time"):
-            item.add_marker(pytest.mark.flaky(reruns=1))
-
-
 @pytest.fixture(autouse=True)
 async def no_task_is_left() -> AsyncIterator[None]:
     """Fail the test that leaves a task running."""
