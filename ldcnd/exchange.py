@@ -4,12 +4,36 @@ A codec builds an `Exchange`; the bus runs it without knowing what the bytes mea
 state, can be prepared once and run any number of times.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeVar
 
 ReplyT = TypeVar("ReplyT")
+
+Condition = Callable[[], None]
+"""Raises what forbids a motion; returns when nothing does."""
+_condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
+
+
+@contextmanager
+def only_while(condition: Condition) -> Iterator[None]:
+    """Let what can move, when queued in this context, be sent only if the condition still holds when its turn comes.
+
+    A queue may be long: the condition is asked between it and the wire. Stops are not subject to any condition.
+    """
+    token = _condition.set(condition)
+    try:
+        yield
+    finally:
+        _condition.reset(token)
+
+
+def condition_in_force() -> Condition | None:
+    """Return the condition of the context in which this is called, if there is one."""
+    return _condition.get()
 
 
 class ReplyVerdict(Enum):
@@ -39,6 +63,7 @@ class Exchange(Generic[ReplyT]):
             exchange without a reply, the quiet time that the line needs after it.
         repeatable: may the bus send the request again after its reply was lost? Never true for what could move a
             drive twice.
+        moves: can make a motor move or change how it does; see `only_while`.
         total_bytes: for replies whose length depends on their content: given the bytes so far, the total length, or
             None when it cannot be told yet. When absent the length is `reply_bytes`.
     """
@@ -51,6 +76,7 @@ class Exchange(Generic[ReplyT]):
     response_s: float
     repeatable: bool
     total_bytes: Callable[[bytes], int | None] | None = None
+    moves: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Job, PollTurn, StopProbe, Turn
 from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
-from ldcnd.exchange import Exchange
+from ldcnd.exchange import Exchange, condition_in_force
 from ldcnd.log import get_logger
 from ldcnd.transport.adapter import LineErrors
 from ldcnd.transport.transport import Opener, Transport
@@ -115,6 +115,7 @@ class Bus:
         With `once` it is not sent again when the node says that our packet was damaged: the damage may be in what the
         node says, and then the packet was executed.
 
+        What can move is sent only if the condition of the caller's context (`only_while`) holds when its turn comes.
         Cancelling the caller never leaves half a packet on the wire; what was sent is completed and its reply dropped.
 
         Raises:
@@ -124,6 +125,7 @@ class Bus:
             OutcomeUnknown: the reply was lost and the exchange must not be repeated.
             PacketRejected: the node refused our packet as damaged at every attempt; it was not executed.
             BadReply: the reply was intact but makes no sense.
+            LdcndError: as the condition refused it; nothing was sent.
         """
         return await self._submit(exchange, lane, once=once)
 
@@ -276,7 +278,9 @@ class Bus:
         if self._line is None:
             raise self._down()
         future: asyncio.Future[ReplyT] = self._loop.create_future()
-        job = Job(exchange, lane, self._loop.time(), future, attempts=1 if once else self.settings.attempts)
+        condition = condition_in_force() if exchange.moves and lane is not Lane.STOP else None
+        attempts = 1 if once else self.settings.attempts
+        job = Job(exchange, lane, self._loop.time(), future, attempts=attempts, condition=condition)
         job.then_baud, job.at_baud = then_baud, at_baud
         self._queue.push(job, lane)
         self._kick()
@@ -335,6 +339,8 @@ class Bus:
     def take(self, now_s: float) -> Turn | None:
         """See `Users`."""
         job = self._queue.take_job(now_s)
+        while job and not job.may_go():
+            job = self._queue.take_job(now_s)
         if job is None:
             poller = self._queue.take_poll(now_s)
             if poller is None:

@@ -10,7 +10,7 @@ from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.queue import Lane
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
-from ldcnd.exchange import Exchange, Timing
+from ldcnd.exchange import Condition, Exchange, Timing
 from ldcnd.wirelog.recorder import AT_ONCE_REMARK
 
 LANES = tuple(lane.name.lower() for lane in Lane)
@@ -105,7 +105,7 @@ class PollTurn(Turn):
 class Job(Turn):
     """An exchange that a caller waits for; its future gets exactly one outcome."""
 
-    __slots__ = ("attempts", "attempts_left", "future")
+    __slots__ = ("attempts", "attempts_left", "condition", "future")
 
     def __init__(
         self,
@@ -115,8 +115,10 @@ class Job(Turn):
         future: "asyncio.Future[Any]",
         *,
         attempts: int,
+        condition: Condition | None = None,
     ) -> None:
         super().__init__(exchange, lane, wanted_at_s)
+        self.condition = condition
         self.future = future
         self.attempts = attempts
         self.attempts_left = attempts
@@ -125,6 +127,17 @@ class Job(Turn):
     def abandoned(self) -> bool:
         """Whether nobody waits any more."""
         return self.future.done()
+
+    def may_go(self) -> bool:
+        """Ask whether it may still be sent, now that its turn has come; otherwise the caller gets the reason."""
+        if self.condition is None:
+            return True
+        try:
+            self.condition()
+        except LdcndError as error:
+            self.fail(error)
+            return False
+        return True
 
     def fail(self, error: LdcndError) -> None:
         """Give the caller the error, unless it has gone."""

@@ -280,3 +280,57 @@ def test_nothing_in_the_daemon_but_a_permit_calls_what_can_move_a_drive():
             if owner.split(".")[-1] in {"driver", "_driver", "network", "_network", "drive", "_drive"}:
                 found.append(f"{path.name}: {ast.unparse(node.func)}")
     assert not found
+
+
+BUSY = 30
+"""Reads that are queued before a packet: on this line they take 50 ms or more."""
+
+
+def busy_line_before(rig: RunningRig, monkeypatch, call: str) -> asyncio.Event:
+    """Queue reads on the line of x directly before its driver queues a packet; the event says when they are there."""
+    axis, queued = rig.daemon.rig.axis("x"), asyncio.Event()
+    bus, original = rig.daemon.rig.buses[0].bus, getattr(axis.driver, call)
+
+    async def behind_reads(*args: object, **options: object) -> None:
+        reads = [asyncio.create_task(bus.execute(axis.driver.reading(frozenset()))) for _ in range(BUSY)]
+        await asyncio.sleep(0)
+        queued.set()
+        try:
+            await original(*args, **options)
+        finally:
+            await asyncio.wait(reads)
+
+    monkeypatch.setattr(axis.driver, call, behind_reads)
+    return queued
+
+
+@pytest.mark.parametrize("call", ["load", "start"])
+async def test_a_packet_that_waits_for_the_line_is_not_sent_once_its_lease_has_ended(call, monkeypatch):
+    async with running_rig(config(LossPolicy.RUN_TO_TARGET)) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x", lease_s=60.0) as held:
+            await held.command("x", Power(on=True))
+            queued = busy_line_before(rig, monkeypatch, call)
+            move = asyncio.create_task(held.command("x", MoveRelative(distance=5.0)), name="move")
+            await queued.wait()
+        with pytest.raises(LeaseExpired):
+            await move
+        await asyncio.sleep(1.0)
+        position, state = await rig.client.last("x", "position"), await rig.client.state("x")
+
+    assert position.value == pytest.approx(0.0, abs=0.05)
+    assert (state.state, state.moving) == (AxisState.STANDSTILL, "no")
+
+
+async def test_a_loop_that_waits_for_the_line_is_not_closed_once_its_lease_has_ended(monkeypatch):
+    async with running_rig(config(LossPolicy.RUN_TO_TARGET)) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        async with control(rig.client, "ann", "x", lease_s=60.0) as held:
+            queued = busy_line_before(rig, monkeypatch, "power")
+            power = asyncio.create_task(held.command("x", Power(on=True)), name="power")
+            await queued.wait()
+        with pytest.raises(LeaseExpired):
+            await power
+        state = await rig.until("x", lambda state: state.state is AxisState.DISABLED)
+
+    assert not state.enabled

@@ -1,5 +1,6 @@
 import asyncio
 from collections.abc import Coroutine
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,9 +8,11 @@ import pytest
 from ldcnd.bus.queue import LANE_LIMITS, Lane
 from ldcnd.errors import (
     BusBusy,
+    LdcndError,
     NotSupported,
     WrongState,
 )
+from ldcnd.exchange import only_while
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.toy_family import ToyPoller
@@ -38,6 +41,36 @@ async def test_stop_overtakes_queued_commands_and_polls():
         rig.bus.remove_poller(poller)
 
     assert rig.sent()[:2] == [1, 9]
+
+
+async def test_what_can_move_is_sent_only_if_its_condition_holds_when_its_turn_comes():
+    rig = Rig()
+    held = True
+
+    def condition() -> None:
+        if not held:
+            raise WrongState("not any more")
+
+    moving = replace(toy.exchange(2), moves=True)
+    async with running(rig) as callers:
+        callers.create_task(rig.bus.execute(toy.exchange(1)), name="first")
+        await asyncio.sleep(0)
+        with only_while(condition):
+            refused = callers.create_task(outcome_of(rig.bus.execute(moving)), name="moving")
+            callers.create_task(rig.bus.execute(toy.exchange(3)), name="harmless")
+            callers.create_task(rig.bus.execute(replace(moving, request=toy.exchange(9).request), Lane.STOP))
+        await asyncio.sleep(0)
+        held = False
+
+    assert isinstance(refused.result(), WrongState)
+    assert rig.sent() == [1, 9, 3]
+
+
+async def outcome_of(call: Coroutine[Any, Any, int]) -> int | LdcndError:
+    try:
+        return await call
+    except LdcndError as error:
+        return error
 
 
 async def test_background_gives_way_to_commands():

@@ -231,7 +231,7 @@ class AxisMotion:
         except OutcomeUnknown:
             self.tracker.started(self.clock.now_s())  # the next readings tell
             raise
-        except BusError as error:
+        except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             self.tracker.finished(error.message)
             self.publish_state()
             raise

@@ -2,11 +2,13 @@
 
 A `Permit` is made when a command is admitted and travels with it. The rest of the daemon holds a `QuietDrive`, which
 has no call that can move; those are methods of the permit, and each of them asks for permission directly before its
-first packet. So a move that waited - for its turn, for the motion ahead of it, for the other members of its group, for
-a step of a homing - finds what is true when it would start, not what was true when it came.
+first packet, and the bus asks once more when the turn of each such packet has come. So a move that waited - for its
+turn, for the motion ahead of it, for the other members of its group, for a step of a homing, for the line - finds what
+is true when it would start, not what was true when it came.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -23,13 +25,9 @@ from ldcnd.drivers.driver import (
     StopMode,
 )
 from ldcnd.drivers.network import Network
-from ldcnd.errors import LdcndError, ShuttingDown, StopLatched
-from ldcnd.exchange import Exchange
+from ldcnd.errors import RequestRefused, ShuttingDown, StopLatched
+from ldcnd.exchange import Condition, Exchange, only_while
 from ldcnd.model.commands import HomeMethod, PinMode
-
-Condition = Callable[[], None]
-"""Raises what forbids a motion; returns when nothing does."""
-
 
 def always() -> None:
     """Forbid nothing."""
@@ -108,9 +106,12 @@ class Permit:
             StopLatched, ShuttingDown: see `still_wanted`.
             RequestRefused: its sender has lost the right to it, or it comes too late.
         """
+        self._ask(begun=self._begun)
+
+    def _ask(self, *, begun: bool) -> None:
         self.still_wanted()
         self._right.holds()
-        if not self._begun:
+        if not begun:
             self._right.in_time()
 
     def ask_to_move(self) -> None:
@@ -119,43 +120,62 @@ class Permit:
         Raises:
             LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop.
         """
-        self.ask()
-        guards.check_may_power_on(self._gate.tracker.view())
+        self.to_move()()
+
+    def to_move(self) -> Condition:
+        """Return what `ask_to_move` asks now, to be asked again when a packet's turn has come."""
+        begun = self._begun
+
+        def condition() -> None:
+            self._ask(begun=begun)
+            guards.check_may_power_on(self._gate.tracker.view())
+
+        return condition
 
     # -- what can move -----------------------------------------------------------------------------------------------
 
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """Prepare a motion; see `AxisDriver.load`. Part of it may start the drive's profile generator."""
         self.ask_to_move()
-        await self._gate.driver.load(motion, home=home)
+        with only_while(self.to_move()):
+            await self._gate.driver.load(motion, home=home)
 
     async def start(self) -> None:
         """Start what was loaded; see `AxisDriver.start`."""
         self.ask_to_move()
-        self.begun()
-        await self._gate.driver.start()
+        with self._beginning():
+            await self._gate.driver.start()
 
     async def track(self, position_counts: int) -> None:
         """Go to a position at once; see `AxisDriver.track`."""
         self.ask_to_move()
-        self.begun()
-        await self._gate.driver.track(position_counts)
+        with self._beginning():
+            await self._gate.driver.track(position_counts)
 
     async def power_on(self) -> None:
         """Close the loop; see `AxisDriver.power`. It takes several packets: a stop among them leaves it open."""
         self.ask_to_move()
-        self.begun()
-        await self._gate.driver.power(on=True)
+        was_on = self._gate.tracker.enabled
         try:
+            with self._beginning():
+                await self._gate.driver.power(on=True)
             self.still_wanted()
-        except LdcndError:
-            await self._gate.driver.stop(StopMode.OFF)
+        except RequestRefused:
+            if not was_on:
+                await self._gate.driver.stop(StopMode.OFF)
             raise
 
     async def set_gains(self, gains: Gains) -> None:
         """Load the registers of the loop, which act at once; see `AxisDriver.set_gains`."""
         self.ask()
-        await self._gate.driver.set_gains(gains)
+        with only_while(self.ask):
+            await self._gate.driver.set_gains(gains)
+
+    def _beginning(self) -> AbstractContextManager[None]:
+        """Return the context of the packets that begin a motion; from now on the command is not late any more."""
+        condition = self.to_move()
+        self.begun()
+        return only_while(condition)
 
 
 class Gate:
@@ -215,12 +235,16 @@ async def start_together(
     """
 
     def about_to_start() -> None:
-        for permit in permits:
-            permit.ask_to_move()
+        ask_all()
         for permit in permits:
             permit.begun()
         announce()
 
-    for permit in permits:
-        permit.ask_to_move()
-    await network.start_group(motions, about_to_start)
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    conditions = [permit.to_move() for permit in permits]
+    ask_all()
+    with only_while(ask_all):
+        await network.start_group(motions, about_to_start)

@@ -10,7 +10,7 @@ data sheets.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Generic, TypeVar
 
@@ -186,6 +186,16 @@ COMMON_COMMANDS = frozenset(
     }
 )
 """What every module understands, servo or not."""
+MOVING_COMMANDS = frozenset(
+    {
+        Command.LOAD_TRAJECTORY,
+        Command.START_MOTION,
+        Command.STOP_MOTOR,
+        Command.SET_GAIN,
+        Command.ADD_PATH_POINTS,
+    }
+)
+"""What can make a motor move or change how it does; Stop Motor also closes the loop and leads along set-points."""
 
 
 def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
@@ -418,7 +428,8 @@ def _exchange(
 ) -> Exchange[ReplyT]:
     if to.profile and to.profile.support is Support.IDENTIFY and command not in COMMON_COMMANDS:
         raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
-    return to.exchange(encode_packet(Packet(to.address, command, data)), items, repeatable=repeatable)
+    exchange = to.exchange(encode_packet(Packet(to.address, command, data)), items, repeatable=repeatable)
+    return replace(exchange, moves=True) if command in MOVING_COMMANDS else exchange
 
 
 def _dialect(to: Destination[ReplyT]) -> Profile:

@@ -16,7 +16,16 @@ from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPla
 from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
-from ldcnd.errors import BusError, DriveFault, LdcndError, NotSupported, OutcomeUnknown, ReplyTimeout, WrongState
+from ldcnd.errors import (
+    BusError,
+    DriveFault,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    ReplyTimeout,
+    RequestRefused,
+    WrongState,
+)
 from ldcnd.log import get_logger
 
 log = get_logger("ldcn")
@@ -82,10 +91,14 @@ class Groups:
             before[name] = await self._ready(name)
             await self._drives[name].load(motion)
         still_wanted()
+        sent = False
         try:
             await self._start_motion(group)
+            sent = True
             stuck = [name for name, motion in motions.items() if not await self._started(name, motion, before[name])]
         except LdcndError as error:  # also a stop of one member that came between
+            if isinstance(error, RequestRefused) and not sent:
+                raise  # refused when its turn on the line came
             await self._stop_all(group)
             raise OutcomeUnknown(
                 f"group of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"

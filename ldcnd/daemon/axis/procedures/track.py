@@ -8,7 +8,14 @@ from ldcnd.daemon.axis.motion import AxisMotion
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading
-from ldcnd.errors import BusError, NotSupported, OutcomeUnknown, TooManyRequests, ValueOutOfRange
+from ldcnd.errors import (
+    BusError,
+    NotSupported,
+    OutcomeUnknown,
+    RequestRefused,
+    TooManyRequests,
+    ValueOutOfRange,
+)
 from ldcnd.model.commands import CommandReply, Track, Verb
 from ldcnd.model.samples import AxisState
 
@@ -59,7 +66,7 @@ class SetPoint(Procedure):
             motion.target_counts = target  # if it was not executed the next set-point is still near enough
             tracker.started(motion.clock.now_s())
             raise
-        except BusError as error:
+        except (BusError, RequestRefused) as error:
             tracker.finished(error.message)
             motion.publish_state()
             raise
