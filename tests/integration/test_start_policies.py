@@ -10,7 +10,7 @@ from ldcnd.drivers.ldcn.received import LoadTrajectory
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power
-from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 from tests.support.rig import running_rig
@@ -251,11 +251,15 @@ async def test_a_line_that_was_lost_while_its_rate_changed_is_brought_to_one_rat
     assert drive(chain, 2).loop.servo_on
 
 
-@pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9])
-async def test_a_drive_that_creeps_moves_and_is_not_at_standstill(counts_per_tick):
+@pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9, 3.0])
+async def test_a_motion_without_an_end_that_a_host_has_left_moves_until_it_was_ended(counts_per_tick):
     chain = chain_of()
     await left_creeping(chain, counts_per_tick)
-    seen = set()
+    false = set()
+
+    def look(sample: StateSample) -> None:
+        if sample.moving is Moving.NO and drive(chain, 1).loop.trajectory.velocity:
+            false.add((sample.t, sample.state))
 
     async with rig_on(chain, ADOPTING) as rig:
         first = await rig.until("x", lambda state: state.link is LinkState.UP)
@@ -264,12 +268,21 @@ async def test_a_drive_that_creeps_moves_and_is_not_at_standstill(counts_per_tic
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(5):
                     async for _, sample in states:
-                        seen.add((sample.state, sample.moving))
+                        look(sample)
         last = await rig.client.state("x")
+        before = drive(chain, 1).shaft.position_counts
+        await asyncio.sleep(1.0)
+        after = drive(chain, 1).shaft.position_counts
 
-    assert first.moving is Moving.UNKNOWN
-    assert (last.state, last.moving) == (AxisState.DISCRETE_MOTION, Moving.YES)
-    assert (AxisState.STANDSTILL, Moving.NO) not in seen
+    assert first.moving is not Moving.NO
+    assert not false
+    assert (last.state, last.moving, last.stop_pending, last.stop_latched) == (
+        AxisState.STANDSTILL,
+        Moving.NO,
+        False,
+        False,
+    )
+    assert abs(after - before) <= 2
 
 
 async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():

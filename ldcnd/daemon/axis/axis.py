@@ -206,6 +206,7 @@ class AxisService:
         self.returned: Callable[[], None] | None = None
         self._pending: StopMode | None = None
         self.line_up = False
+        self._inherited = False
         self._seen = False
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
@@ -284,6 +285,8 @@ class AxisService:
         self._commands.observed(reading, timing)
         if self._commands.step_due:
             self._turns.wake()
+        if self._inherited:
+            self._end_what_has_no_end(reading)
         t, t_error_ns = self._clock.stamp(timing)
         self.telemetry.reading(reading, asked, t, t_error_ns)
 
@@ -450,8 +453,27 @@ class AxisService:
             self._pending = StopMode.OFF
             self.tracker.stop_unconfirmed(self._clock.now_ns())
 
+    def taken_over(self) -> None:
+        """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
+        self._inherited = self.stoppable
+
+    def _end_what_has_no_end(self, reading: AxisReading) -> None:
+        """Have a motion stopped that an earlier host has left, if its profile is done and yet it goes on.
+
+        So does velocity mode as soon as its velocity is reached; a trapezoid is done when it stands.
+        """
+        tracker = self.tracker
+        if tracker.command is not None or tracker.at_rest:
+            self._inherited = False
+        elif reading.enabled and reading.profile_done and tracker.moving is Moving.YES:
+            self._inherited = False
+            log.warning("motion without an end found", axis=self.config.name)
+            self._pending = self._pending or StopMode.SMOOTH
+            self._not_confirmed()
+
     def cannot_move(self) -> None:
         """Its drive was reset or had no power: what it was told to stop has ended."""
+        self._inherited = False
         self._pending = None
         self.tracker.stop_confirmed()
 

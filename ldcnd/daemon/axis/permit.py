@@ -29,6 +29,7 @@ from ldcnd.errors import RequestRefused, ShuttingDown, StopLatched
 from ldcnd.exchange import Condition, Exchange, only_while
 from ldcnd.model.commands import HomeMethod, PinMode
 
+
 def always() -> None:
     """Forbid nothing."""
 

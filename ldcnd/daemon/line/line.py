@@ -133,6 +133,8 @@ class BusService:
                     axis.cannot_move()
                 elif axis.config.name in report.open_loops:
                     axis.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
+                else:
+                    axis.taken_over()
             await self._send_pending_stops()
             self.report, self._baud = report, report.baud
             self._connect(report)

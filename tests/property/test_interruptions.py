@@ -1,0 +1,379 @@
+"""Killed or suspended at any await of a scenario, a daemon moves nothing twice, unasked or with nobody in charge.
+
+The scenario has some forty commands: leases, buffered and aborting moves, a group, a homing, raw duties, a trace,
+set-points, stops. A killed daemon is followed by one that adopts the line, and old commands are sent again. A suspended
+one finds time gone by, its client dead or somebody else in control. Drives live on meanwhile.
+"""
+
+import asyncio
+import contextlib
+import random
+from collections.abc import AsyncIterator
+
+import pytest
+from structlog.testing import capture_logs
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.rig import RigConfig
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.errors import LdcndError, OutcomeUnknown
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.model.commands import (
+    AxisCommand,
+    BufferMode,
+    CommandReply,
+    Effect,
+    Halt,
+    Home,
+    HomeMethod,
+    MoveAbsolute,
+    MoveAnalog,
+    MoveRelative,
+    MoveVelocity,
+    PinMode,
+    Power,
+    QuickStop,
+    Reset,
+    SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
+    Track,
+)
+from ldcnd.model.rig_commands import Acquire, AxisMove, MoveTogether, Release, Renew
+from ldcnd.model.traces import TakeTrace
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.interruptions import InterruptedLoop, Interruptions, in_new_loop, run_interrupted
+from tests.support.witness import Witness
+
+LEASE_S = 1.0
+FREEZES_S = (0.4, 1.5, 6.0)
+LINE_S = 1.5
+"""From the end of a lease until an axis stands: one stop, and its deceleration."""
+PROFILE_S = 3.0
+"""The longest profile of the scenario: a drive whose host is dead ends it by itself."""
+GAINS = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000}
+INDEX_AT, INDEX_SPACING = 700, 2000
+
+
+def axis(name: str, address: int, model: str, **more: object) -> dict[str, object]:
+    return {
+        "name": name,
+        "address": address,
+        "model": model,
+        "unit": "mm",
+        "counts_per_unit": 1000.0,
+        "velocity": 20.0,
+        "acceleration": 500.0,
+        "reference": "at_reset",
+        "jog_horizon_s": 1.0,
+        "gains": GAINS,
+        "rates": {"position": 8, "velocity": 0, "adc": 0, "state": 8},
+        **more,
+    }
+
+
+def config(**bus: object) -> RigConfig:
+    tracking = {"step": 1.0, "rate": 20.0}
+    return RigConfig.model_validate(
+        {
+            "rig": "sim",
+            "authority": "leased",
+            "bus": [
+                {
+                    "name": "a",
+                    "port": "sim:a",
+                    "baud": 115_200,
+                    "margin_ms": 5,
+                    "axis": [
+                        axis("x", 1, "ls-182ap", tracking=tracking),
+                        axis("y", 2, "ls-182ap"),
+                        axis("z", 3, "pic-servo-v4", pwm={"duty": 0.1, "duration_s": 1.0}),
+                    ],
+                    "group": [{"name": "gantry", "axes": ["x", "y"]}],
+                    **bus,
+                }
+            ],
+            "sim": [{"name": "a", "module": [{"model": "ls182ap"}] * 2 + [{"model": "picservo-v4"}]}],
+        }
+    )
+
+
+FIRST = config()
+NEXT = config(start="adopt", adopt_fallback="reset")
+
+
+def now_ns() -> int:
+    return 10**18 + round(asyncio.get_running_loop().time() * 1e9)
+
+
+class Client:
+    """A client that sends each command under its own id, and again when it gets no answer.
+
+    Attributes:
+        sent: everything it has sent, by axis, as it was sent.
+        refused: how many commands failed.
+    """
+
+    def __init__(self, rig: RigClient, name: str) -> None:
+        self.rig = rig
+        self.name = name
+        self.sent: list[tuple[str, AxisCommand[CommandReply]]] = []
+        self.refused = 0
+        self.lease: str | None = None
+
+    async def acquire(self, *axes: str, force: bool = False) -> None:
+        with contextlib.suppress(LdcndError):
+            request = Acquire(client=self.name, axes=axes, lease_s=LEASE_S, force=force)
+            self.lease = (await self.rig.ask(request)).lease
+
+    async def keep(self) -> None:
+        while True:
+            await asyncio.sleep(LEASE_S / 4)
+            if self.lease:
+                with contextlib.suppress(LdcndError):
+                    await self.rig.ask(Renew(lease=self.lease), timeout_s=LEASE_S)
+
+    async def send(self, axis: str, command: AxisCommand[CommandReply]) -> str:
+        """Send a command; return its id."""
+        command_id = f"{self.name}{len(self.sent)}"
+        stamped = command.model_copy(update={"command_id": command_id, "lease": self.lease})
+        self.sent.append((axis, stamped))
+        for _ in range(2):
+            try:
+                await self.rig.command(axis, stamped, timeout_s=2.0)
+            except OutcomeUnknown:
+                continue
+            except LdcndError as error:
+                self.refused += 1
+                self.why = f"{axis} {command!r}: {error}"
+            break
+        return command_id
+
+    async def done(self, axis: str, command: AxisCommand[CommandReply]) -> None:
+        """Send a command, and wait until its axis stands."""
+        await self.send(axis, command)
+        await self.standing(axis)
+
+    async def standing(self, *axes: str) -> None:
+        for axis in axes:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(PROFILE_S):
+                    while not (state := await self.rig.state(axis)) or state.moving != "no":
+                        await asyncio.sleep(0.1)
+
+
+async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witness) -> None:
+    """Send the forty commands; what is refused is counted and passed over."""
+    while not (state := await ann.rig.state("z")) or state.link != "up":
+        await asyncio.sleep(0.05)
+    await ann.acquire()
+    for name in ("x", "y", "z"):
+        await ann.send(name, Power(on=True))
+    await ann.send("x", MoveAbsolute(position=3.0))
+    await ann.send("x", MoveRelative(distance=1.0, buffer_mode=BufferMode.BUFFERED))
+    await asyncio.sleep(0.1)
+    await ann.send("x", MoveRelative(distance=-1.0, buffer_mode=BufferMode.ABORTING))
+    await ann.standing("x")
+    position = await ann.rig.position("x")
+    places["x"] = witness.drive("x").shaft.position_counts
+    await ann.send("x", SetPosition(position=0.0))
+    assert position is not None
+    moves = (AxisMove(axis="x", position=2.0, lease=ann.lease), AxisMove(axis="y", position=2.0, lease=ann.lease))
+    try:
+        await ann.rig.ask(MoveTogether(moves=moves))
+    except LdcndError as error:
+        ann.refused += 1
+        ann.why = str(error)
+    await ann.standing("x", "y")
+    await ann.send("x", TakeTrace(channels=("position",), interval_s=0.02, samples=20))
+    await ann.send("y", MoveVelocity(velocity=8.0))
+    await asyncio.sleep(0.2)
+    await ann.send("y", MoveVelocity(velocity=-8.0))
+    await asyncio.sleep(0.2)
+    await ann.done("y", Halt())
+    await ann.send("z", SetPwm(duty=0.05, duration_s=0.2))
+    await asyncio.sleep(0.3)
+    await ann.standing("z")
+    places.pop("z", None)
+    await ann.done("z", Home(method=HomeMethod.INDEX, velocity=1.0, position=0.0, timeout_s=PROFILE_S))
+    for step in range(3):
+        await ann.send("x", Track(position=2.0 + 0.2 * step))
+        await asyncio.sleep(0.06)
+    await ann.standing("x")
+    await ann.send("x", SetGains(kp=351))
+    await ann.send("z", SetOutputs(limit1=PinMode.HIGH))
+    await ann.send("y", MoveAnalog(target=540, velocity=10.0, timeout_s=0.3))
+    await asyncio.sleep(0.4)
+    await ann.done("y", QuickStop())
+    await ann.send("y", Reset())
+    await ann.send("x", MoveRelative(distance=5.0))
+    await ann.send("z", MoveVelocity(velocity=5.0))
+    await asyncio.sleep(0.1)
+    with contextlib.suppress(LdcndError):
+        await ann.rig.stop()
+    await ann.standing("x", "y", "z")
+    for name in ("x", "y", "z"):
+        await ann.send(name, Reset())
+    await ann.send("z", Power(on=False))
+    await ann.send("x", MoveRelative(distance=1.0))
+    with contextlib.suppress(LdcndError):
+        await ann.rig.ask(Release(lease=ann.lease or "", leave_running=False))
+    await bob.acquire("x", "y")
+    await bob.standing("x")
+    await bob.send("x", MoveVelocity(velocity=6.0))
+    await asyncio.sleep(0.15)
+    await ann.acquire("x", "y", force=True)
+    await ann.standing("x")
+    await ann.done("x", MoveRelative(distance=-2.0))
+    await ann.send("y", Power(on=False))
+
+
+def check_homed(witness: Witness, daemon: Daemon) -> None:
+    """Hold what z says of its place against its index pulses, once it was homed."""
+    z = daemon.rig.axis("z")
+    if not z.tracker.referenced or z.telemetry.origin_counts == 0:
+        return
+    drive = witness.drive("z")
+    at_zero = drive.shaft.position_counts - (drive.loop.position - z.telemetry.origin_counts)
+    off = (at_zero - INDEX_AT + INDEX_SPACING / 2) % INDEX_SPACING - INDEX_SPACING / 2
+    if abs(off) > 20:
+        witness.wrong.append(f"z is referenced {off:g} counts beside an index pulse")
+
+
+@contextlib.asynccontextmanager
+async def life(settings: RigConfig, chain: Chain, instance: str) -> AsyncIterator[tuple[Daemon, MemoryBroker]]:
+    broker = MemoryBroker()
+    async with broker.session() as session, asyncio.TaskGroup() as group:
+        daemon = build_daemon(settings, session, now_ns, instance, {"a": chain})
+        running = group.create_task(daemon.run(), name="daemon")
+        yield daemon, broker
+        daemon.end()
+        await running
+
+
+class Run:
+    """One run of the scenario, with what is done to its copies."""
+
+    def __init__(self, seed: int, *, kill: bool) -> None:
+        self._dice = random.Random(seed)
+        self._kill = kill
+        specs = (ModuleSpec("ls182ap"), ModuleSpec("ls182ap"), ModuleSpec("picservo-v4"))
+        self.chain = build_chain(ChainSpec(specs, seed=seed))
+        self.witness = Witness(self.chain, {1: ("x",), 2: ("y",), 3: ("z",), 0x81: ("x", "y")})
+        self.places: dict[str, float] = {"x": 0.0, "y": 0.0, "z": 0.0}
+        self.refused = -1
+        self.why = ""
+        self.sent = 0
+
+    async def scenario(self) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, InterruptedLoop)
+        async with life(FIRST, self.chain, "first") as (daemon, broker), broker.session() as session:
+            self.witness.daemon = daemon
+            self._daemon, self._rig = daemon, RigClient(session, "sim")
+            self._ann, self._bob = ann, bob = Client(self._rig, "ann"), Client(self._rig, "bob")
+            async with asyncio.TaskGroup() as group:
+                self._group = group
+                self._playing = [group.create_task(each.keep(), name="renewals") for each in (ann, bob)]
+                player = group.create_task(play(ann, bob, self.places, self.witness), name="player")
+                self._playing.append(player)
+                loop.interrupt = self._interrupt
+                await asyncio.wait([player])
+                loop.interrupt = None
+                if loop.is_copy:
+                    await asyncio.Event().wait()  # until it was judged
+                for task in self._playing:
+                    task.cancel()
+            await asyncio.sleep(0.5)
+            await self.witness.look(daemon, self.places)
+            check_homed(self.witness, daemon)
+            self.refused, self.why = ann.refused + bob.refused, getattr(ann, "why", "")
+            self.sent = len(ann.sent) + len(bob.sent)
+
+    def _interrupt(self, step: int) -> list[str] | None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, InterruptedLoop)
+        if self._kill:
+            self.witness.daemon = None
+            return in_new_loop(self._next_life, loop.time())
+        self._dice.seed(step)
+        loop.hold_up(self._dice.choice(FREEZES_S))
+        self._group.create_task(self._after_freeze(loop), name="judge")
+        return None
+
+    async def _next_life(self) -> list[str]:
+        """Restart with adoption, send old commands again, and see what comes of it."""
+        witness, loop = self.witness, asyncio.get_running_loop()
+        killed_s = loop.time()
+        async with life(NEXT, self.chain, "second") as (daemon, broker), broker.session() as session:
+            rig = RigClient(session, "sim")
+            async with asyncio.timeout(30):
+                await daemon.wait_up()
+            for name, command in (*self._ann.sent[-4:], *self._bob.sent[-2:]):
+                if command.effect is not Effect.REST:
+                    with contextlib.suppress(LdcndError):
+                        await rig.command(name, command.model_copy(update={"instance": "first"}), timeout_s=1.0)
+                        witness.wrong.append(f"{command.verb} of {name} was accepted from an earlier life")
+            await asyncio.sleep(max(0.0, killed_s + PROFILE_S - loop.time()))
+            await witness.look(daemon, self.places)
+        return witness.wrong
+
+    async def _after_freeze(self, loop: InterruptedLoop) -> None:
+        """Let others act after a freeze, then lose all clients, and see what comes of it."""
+        try:
+            match self._dice.choice(("go on", "replay", "force", "stop")):
+                case "replay" if self._ann.sent:
+                    name, command = self._ann.sent[-1]
+                    if command.effect is not Effect.REST:
+                        with contextlib.suppress(LdcndError):
+                            await self._rig.command(name, command, timeout_s=1.0)
+                case "force":
+                    for task in self._playing:
+                        task.cancel()
+                    await self._bob.acquire(force=True)
+                case "stop":
+                    with contextlib.suppress(LdcndError):
+                        await self._rig.stop()
+            await asyncio.sleep(self._dice.uniform(0.0, 1.0))
+            for task in self._playing:
+                task.cancel()
+            await asyncio.sleep(LEASE_S + LINE_S)
+            await self._daemon.wait_up()
+            await self.witness.look(self._daemon, self.places)
+            check_homed(self.witness, self._daemon)
+        except BaseException as error:  # noqa: BLE001 - nothing of this process may be lost
+            self.witness.wrong.append(f"{type(error).__name__}: {error}")
+        loop.leave(self.witness.wrong)
+
+
+def interrupted(share: float, seed: int, *, kill: bool) -> Interruptions:
+    """Run the scenario once, interrupted at a share of its steps."""
+    dice = random.Random(seed)
+    run = Run(seed, kill=kill)
+    with capture_logs():
+        came = run_interrupted(run.scenario, lambda _: dice.random() < share)
+    what = "killed" if kill else "suspended"
+    print(f"seed {seed}: {what} at {came.visited} of {came.steps} steps of {run.sent} commands")
+    assert not run.refused, f"{run.refused} commands of the uninterrupted run were refused: {run.why}"
+    assert not run.witness.wrong
+    assert not came.wrong, f"seed {seed}, {len(came.wrong)} of {came.visited} points:\n" + "\n".join(came.wrong[:40])
+    return came
+
+
+@pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
+def test_a_daemon_may_be_interrupted_anywhere(kill):
+    came = interrupted(0.01, 1, kill=kill)
+
+    assert came.visited > 10
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600 * 6)
+@pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
+def test_a_daemon_may_be_interrupted_at_every_await(kill):
+    came = interrupted(1.0, 1, kill=kill)
+
+    assert came.visited == came.steps > 1000
