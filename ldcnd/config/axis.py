@@ -162,7 +162,8 @@ class AxisConfig(Frozen):
     gains: GainsConfig | None = None
     """Without gains the loop of this drive stays open."""
     reference: Literal["required", "at_reset"] = "required"
-    """Whether absolute moves need home or set_position first, or the position at the drive's reset counts as known."""
+    """Whether absolute moves need home or set_position first, or the place where the drive was powered on \
+counts as 0. The latter only for a line that no host has used since: after a restart with powered drives, home again."""
     home: HomeConfig | None = None
     """How `home` searches when the request does not say."""
     pwm: PwmConfig | None = None

@@ -21,6 +21,7 @@ class BringUpReport:
         identities: what was found, by axis name.
         reset: the drives were reset, so their positions count from 0.
         remarks: what differs from the configuration or deserves a look.
+        placed: axes whose drives were powered on where they stood at that reset, so that 0 is that place.
         open_loops: axes whose drives an earlier host has left with an open loop: nothing in them would end a raw duty.
         restarted: axes whose drives had lost power, on a line that was not reset.
     """
@@ -29,6 +30,7 @@ class BringUpReport:
     identities: Mapping[str, str]
     reset: bool
     remarks: tuple[str, ...] = ()
+    placed: frozenset[str] = frozenset()
     open_loops: frozenset[str] = frozenset()
     restarted: frozenset[str] = frozenset()
 

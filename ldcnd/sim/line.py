@@ -108,12 +108,17 @@ class SimulatedLine(Transport):
         self._arm()
 
 
-async def open_simulated_line(chain: Chain) -> SimulatedLine:
+async def open_simulated_line(chain: Chain, baud: int | None = None) -> SimulatedLine:
     """Open the line to a chain; nothing is reset, the modules are as they were left.
+
+    Args:
+        chain: the modules.
+        baud: the rate of the port; None for the one at which it was left.
 
     Raises:
         TransportLost: the simulated adapter is unplugged.
     """
     if not chain.plugged(asyncio.get_running_loop().time()):
         raise TransportLost("the simulated adapter is unplugged", remedy="plug it in again")
+    chain.baud = baud or chain.baud
     return SimulatedLine(chain)

@@ -8,11 +8,11 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.errors import LeaseHeld, LeaseRequired
-from ldcnd.model.commands import MoveVelocity, Power
+from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, StopLatched
+from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.rig_commands import Acquire, LeaseReply, Rehearsal, Rehearse
-from ldcnd.model.samples import AxisState
+from ldcnd.model.samples import AxisState, Moving
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 BOTH = ("x", "y")
@@ -143,3 +143,35 @@ async def test_a_loss_is_rehearsed_under_a_lease_that_covers_what_it_concerns(ki
             mine = Rehearse(kind=kind, axis="x", lease=whole.lease)
         await rig.client.ask(mine, timeout_s=30.0)
         assert not await jogs_on(rig, "x")
+
+
+ENDS = {
+    LossPolicy.HALT: (AxisState.STANDSTILL, True, 0.0),
+    LossPolicy.QUICK_STOP: (AxisState.STANDSTILL, True, 0.0),
+    LossPolicy.POWER_OFF: (AxisState.DISABLED, False, 0.0),
+    LossPolicy.RUN_TO_TARGET: (AxisState.STANDSTILL, True, 20.0),
+}
+FROZEN_S = 3.0
+
+
+@pytest.mark.parametrize("policy", list(LossPolicy))
+async def test_a_client_that_freezes_in_mid_motion_has_its_axis_do_what_the_policy_says(policy):
+    """What it sends when it goes on is refused, whatever the policy."""
+    state, enabled, target = ENDS[policy]
+    async with running_rig(config(policy)) as rig:
+        lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=1.0))
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Power(on=True, lease=lease.lease))
+        await rig.client.command("x", MoveAbsolute(position=20.0, velocity=5.0, lease=lease.lease))
+        waiting = MoveAbsolute(position=-20.0, lease=lease.lease, buffer_mode=BufferMode.BUFFERED)
+        buffered = asyncio.create_task(rig.client.command("x", waiting, timeout_s=60.0), name="buffered")
+        await asyncio.sleep(FROZEN_S)
+        with pytest.raises(LeaseExpired):
+            await rig.client.command("x", MoveVelocity(velocity=5.0, lease=lease.lease))
+        with pytest.raises((LeaseExpired, StopLatched)):
+            await buffered
+        await asyncio.sleep(3.0)
+        last, position = await rig.client.state("x"), await rig.client.position("x")
+
+    assert (last.state, last.enabled, last.moving) == (state, enabled, Moving.NO)
+    assert position.value == pytest.approx(target, abs=0.05) if target else 4.0 < position.value < 7.0

@@ -4,8 +4,9 @@ import asyncio
 
 import pytest
 
+from ldcnd.drivers.ldcn.received import AddPathPoints
 from ldcnd.model.commands import SetPwm
-from tests.support.dialect_rig import AXIS, LS_182AP, V4, DialectRig, adopting_rig, dialect_rig
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
 
 PWM = {"duty": 0.5, "duration_s": 60.0}
 RUN_ON = {"daemon": "run_to_target"}
@@ -42,3 +43,19 @@ async def test_a_closed_loop_is_left_closed_by_a_take_over():
     async with adopting_rig(V4, rig, loss=RUN_ON) as again:
         await asyncio.sleep(0.5)
         assert (await again.rig.client.state(AXIS)).enabled
+
+
+async def test_a_path_that_a_host_has_left_is_stopped():
+    async with dialect_rig(SC, loss=RUN_ON) as rig:
+        await rig.power_on()
+    slow = 400 << 3  # counts in 32 servo cycles: 24 mm/s; 126 points last for 2 s
+    for _ in range(18):
+        rig.drive.execute(AddPathPoints((slow,) * 7))
+    rig.drive.execute(AddPathPoints(()))
+
+    async with adopting_rig(SC, rig, loss=RUN_ON) as again:
+        assert again.drive.loop.trajectory.path.running
+        await asyncio.sleep(0.5)
+
+        assert not again.drive.loop.trajectory.path.running
+        assert abs(await true_speed(again)) < 0.1

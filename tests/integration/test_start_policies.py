@@ -353,3 +353,57 @@ async def test_the_simulated_rig_publishes_its_first_position_within_a_second_of
         took_s = asyncio.get_running_loop().time() - began_at_s
 
     assert took_s < 1.0
+
+
+async def referenced_after(chain, **bus):
+    async with rig_on(chain, simulated_config(**bus)) as rig:
+        await asyncio.sleep(1.0)
+        return {name: axis.tracker.referenced for name, axis in rig.daemon.rig.axes.items()}
+
+
+@pytest.mark.parametrize("baud", [9600, 19_200, 57_600, 115_200])
+async def test_a_reset_of_drives_that_an_earlier_host_has_used_gives_no_reference(baud):
+    chain = chain_of()
+    assert all((await referenced_after(chain, baud=baud)).values())
+    again = await referenced_after(chain)
+
+    assert not any(again.values())
+
+
+async def test_drives_that_were_powered_off_and_on_between_two_daemons_are_where_they_were_powered_on():
+    chain = chain_of()
+    await referenced_after(chain)
+    now_s = asyncio.get_running_loop().time()
+    for module in chain.modules:
+        module.power(on=False, at_s=now_s)
+        module.power(on=True, at_s=now_s)
+
+    assert all((await referenced_after(chain)).values())
+
+
+@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize("baud", [19_200, 115_200])
+async def test_one_drive_that_was_powered_on_does_not_stand_for_those_that_kept_their_power(place, baud):
+    chain = chain_of()
+    await referenced_after(chain, baud=baud)
+    now_s = asyncio.get_running_loop().time()
+    chain.modules[place].power(on=False, at_s=now_s)
+    chain.modules[place].power(on=True, at_s=now_s)
+
+    assert not any((await referenced_after(chain, baud=baud)).values())
+
+
+async def test_a_drive_whose_shaft_turns_while_it_is_reset_is_not_referenced():
+    chain = chain_of()
+    turning = asyncio.create_task(turn(chain, 2), name="turning")
+    referenced = await referenced_after(chain)
+    turning.cancel()
+
+    assert referenced == {"x": True, "y": False, "z": True, "c": True}
+
+
+async def turn(chain, address):
+    """Turn a shaft by hand."""
+    while True:
+        await asyncio.sleep(0.01)
+        drive(chain, address).shaft.position_counts += 5

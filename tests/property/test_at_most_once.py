@@ -24,8 +24,7 @@ from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 
-SCHEDULES_PER_TEST = 250
-BATCHES = 8
+SCHEDULES = 120
 FAULTS_FROM_S = 1.5
 ATTEMPTS = 6
 CONFIG = {
@@ -134,11 +133,9 @@ def schedule(seed: int) -> tuple[int, list[str]]:
         return runner.run(live(chain, dice))
 
 
-@pytest.mark.timeout(120)
-@pytest.mark.parametrize("batch", range(BATCHES))
-def test_one_command_id_makes_one_motion_at_most(batch):
+def campaign(seeds: range) -> None:
     accepted = moved = 0
-    for seed in range(batch * SCHEDULES_PER_TEST, (batch + 1) * SCHEDULES_PER_TEST):
+    for seed in seeds:
         motions, told = schedule(seed)
         assert motions <= 1, f"seed {seed}: {motions} motions; the client was told {told}"
         if "accepted" in told:
@@ -146,4 +143,15 @@ def test_one_command_id_makes_one_motion_at_most(batch):
         accepted += "accepted" in told
         moved += motions
 
-    assert SCHEDULES_PER_TEST / 3 < accepted <= moved < SCHEDULES_PER_TEST
+    assert len(seeds) / 3 < accepted <= moved < len(seeds)
+
+
+def test_one_command_id_makes_one_motion_at_most():
+    campaign(range(SCHEDULES))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("batch", range(20))
+def test_one_command_id_never_makes_two_motions(batch):
+    campaign(range(SCHEDULES * batch, SCHEDULES * (batch + 1)))

@@ -45,7 +45,7 @@ from ldcnd.model.rig_commands import Acquire, AxisMove, MoveTogether, Release, R
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.interruptions import InterruptedLoop, Interruptions, in_new_loop, run_interrupted
+from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, run_with_copies
 from tests.support.witness import Witness
 
 LEASE_S = 1.0
@@ -270,7 +270,7 @@ class Run:
 
     async def scenario(self) -> None:
         loop = asyncio.get_running_loop()
-        assert isinstance(loop, InterruptedLoop)
+        assert isinstance(loop, CopiedLoop)
         async with life(FIRST, self.chain, "first") as (daemon, broker), broker.session() as session:
             self.witness.daemon = daemon
             self._daemon, self._rig = daemon, RigClient(session, "sim")
@@ -295,7 +295,7 @@ class Run:
 
     def _interrupt(self, step: int) -> list[str] | None:
         loop = asyncio.get_running_loop()
-        assert isinstance(loop, InterruptedLoop)
+        assert isinstance(loop, CopiedLoop)
         if self._kill:
             self.witness.daemon = None
             return in_new_loop(self._next_life, loop.time())
@@ -321,7 +321,7 @@ class Run:
             await witness.look(daemon, self.places)
         return witness.wrong
 
-    async def _after_freeze(self, loop: InterruptedLoop) -> None:
+    async def _after_freeze(self, loop: CopiedLoop) -> None:
         """Let others act after a freeze, then lose all clients, and see what comes of it."""
         try:
             match self._dice.choice(("go on", "replay", "force", "stop")):
@@ -354,7 +354,7 @@ def interrupted(share: float, seed: int, *, kill: bool) -> Interruptions:
     dice = random.Random(seed)
     run = Run(seed, kill=kill)
     with capture_logs():
-        came = run_interrupted(run.scenario, lambda _: dice.random() < share)
+        came = run_with_copies(run.scenario, lambda _: dice.random() < share)
     what = "killed" if kill else "suspended"
     print(f"seed {seed}: {what} at {came.visited} of {came.steps} steps of {run.sent} commands")
     assert not run.refused, f"{run.refused} commands of the uninterrupted run were refused: {run.why}"

@@ -11,6 +11,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.drivers.ldcn.addressing import RESET_BAUD
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
@@ -88,7 +89,7 @@ async def rig_on(
 
     async with broker.session() as session, broker.session() as client_session:
         daemon = build_daemon(config, session, now_ns, "test")
-        daemon.rig.buses[0].bus._opener = opener or (lambda: open_simulated_line(chain))
+        daemon.rig.buses[0].bus._opener = opener or (lambda: open_simulated_line(chain, RESET_BAUD))
         async with asyncio.TaskGroup() as group:
             running = group.create_task(daemon.run(), name="daemon")
             rig = ChainRig(daemon, RigClient(client_session, config.rig), client_session, broker, running)

@@ -7,35 +7,37 @@ copy is made by fork, so each interruption costs only what comes after it.
 import asyncio
 import json
 import os
-import select
 import signal
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from typing_extensions import override
 
 from ldcnd.sim.jumping_loop import JumpingLoop
 
-LONGEST_LIFE_S = 60
-"""Processor seconds that a copy may take."""
+ResultT = TypeVar("ResultT")
+LONGEST_LIFE_S = 600
+"""A copy that takes longer has gone astray; a busy machine is slow."""
 Chosen = Callable[[int], bool]
 """Tells whether to interrupt before a step, by its number."""
 
 
 @dataclass
 class Interruptions:
-    """What came of the interruptions of one run.
+    """What came of the copies of one run.
 
     Attributes:
         steps: callbacks of the loop.
         visited: how many of them were interrupted.
+        counted: what the copies have counted, all together.
         wrong: what each copy complained about, with the number of its step.
     """
 
     steps: int = 0
     visited: int = 0
+    counted: int = 0
     wrong: list[str] = field(default_factory=list)
 
 
@@ -52,89 +54,94 @@ class _Steps(deque[Any]):
         return super().popleft()
 
 
-class InterruptedLoop(JumpingLoop):
-    """A loop in virtual time that stops before chosen steps.
+class CopiedLoop(JumpingLoop):
+    """A loop in virtual time whose process can be copied, before chosen steps or when a scenario asks for it.
 
     Attributes:
-        interruptions: what came of it.
+        came: what came of the copies.
         interrupt: what is done to a copy before a chosen step, with the number of the step: it returns what is wrong
             afterwards, or, to let the loop of the copy go on, None; then `leave` ends the copy. None before the first.
     """
 
-    def __init__(self, chosen: Chosen) -> None:
+    def __init__(self, chosen: Chosen = lambda _: False) -> None:
         super().__init__()
-        self.interruptions = Interruptions()
+        self.came = Interruptions()
         self.interrupt: Callable[[int], list[str] | None] | None = None
         self._chosen = chosen
         self._report: int | None = None  # of a copy: where it writes
         self._ready = _Steps(self._before_step)
 
-    def _before_step(self) -> None:
-        interrupt = self.interrupt
-        if interrupt is None or self._report is not None:
-            return
-        here = self.interruptions
-        here.steps += 1
-        if not self._chosen(here.steps):
-            return
-        here.visited += 1
+    def copy(self, name: str) -> bool:
+        """Go on as two processes; true in the copy, false in the original once the copy has left."""
         reading, writing = os.pipe()
         if pid := os.fork():
             os.close(writing)
-            here.wrong += [f"step {here.steps}: {each}" for each in _heard(reading, pid)]
-            return
-        asyncio._set_running_loop(self)
-        signal.alarm(LONGEST_LIFE_S * 10)  # a busy machine is slow
+            wrong, counted = _heard(reading, pid)
+            self.came.visited += 1
+            self.came.counted += counted
+            self.came.wrong += [f"{name}: {each}" for each in wrong]
+            return False
+        asyncio._set_running_loop(self)  # asyncio forgets it in a copy
+        signal.alarm(LONGEST_LIFE_S)
         self._report = writing
-        try:
-            wrong = interrupt(here.steps)
-        except BaseException as error:  # noqa: BLE001 - whatever went wrong, this process must not go on as a test
-            self.leave([f"{type(error).__name__}: {error}"])
-        if wrong is not None:
-            self.leave(wrong)
+        return True
 
-    def leave(self, wrong: list[str]) -> NoReturn:
-        """End a copy, and tell what was wrong."""
+    def leave(self, wrong: list[str], counted: int = 0) -> NoReturn:
+        """End a copy, and tell what was wrong and what it has counted."""
         assert self._report is not None
-        os.write(self._report, json.dumps(wrong).encode())
+        os.write(self._report, json.dumps((wrong, counted)).encode())
         os._exit(0)
 
     @property
     def is_copy(self) -> bool:
-        """Whether this process is a copy that goes on after its interruption."""
+        """Whether this process is a copy."""
         return self._report is not None
 
+    def _before_step(self) -> None:
+        interrupt = self.interrupt
+        if interrupt is None or self._report is not None:
+            return
+        self.came.steps += 1
+        step = self.came.steps
+        if self._chosen(step) and self.copy(f"step {step}"):
+            try:
+                wrong = interrupt(step)
+            except BaseException as error:  # noqa: BLE001 - whatever went wrong, this process must not go on as a test
+                self.leave([f"{type(error).__name__}: {error}"])
+            if wrong is not None:
+                self.leave(wrong)
 
-def _heard(reading: int, pid: int) -> list[str]:
+
+def _heard(reading: int, pid: int) -> tuple[list[str], int]:
     told = b""
-    while select.select([reading], [], [])[0] and (more := os.read(reading, 65_536)):
+    while more := os.read(reading, 65_536):
         told += more
     os.close(reading)
     _, status = os.waitpid(pid, 0)
     if status or not told:
-        return [f"the copy ended with {status} and said {told!r}"]
-    wrong: list[str] = json.loads(told)
-    return wrong
+        return [f"the copy ended with {status} and said {told!r}"], 0
+    wrong, counted = json.loads(told)
+    return wrong, counted
 
 
-def in_new_loop(scenario: Callable[[], Awaitable[list[str]]], now_s: float) -> list[str]:
+def in_new_loop(scenario: Callable[[], Awaitable[ResultT]], now_s: float) -> ResultT:
     """Leave the loop that runs here for good, as a killed process does, and run a scenario in a new one.
 
     Nothing of the old loop runs any more: no task is cancelled and nothing is closed.
     """
     asyncio._set_running_loop(None)
 
-    async def run() -> list[str]:
+    async def run() -> ResultT:
         return await scenario()
 
     with asyncio.Runner(loop_factory=lambda: JumpingLoop(now_s)) as runner:
         return runner.run(run())
 
 
-def run_interrupted(scenario: Callable[[], Awaitable[None]], chosen: Chosen) -> Interruptions:
-    """Run a scenario on an interrupted loop; return what came of it."""
+def run_with_copies(scenario: Callable[[], Awaitable[None]], chosen: Chosen = lambda _: False) -> Interruptions:
+    """Run a scenario on a loop that is copied; return what came of the copies."""
     origin = os.getpid()
-    loop = InterruptedLoop(chosen)
+    loop = CopiedLoop(chosen)
 
     async def run() -> None:
         await scenario()
@@ -145,4 +152,4 @@ def run_interrupted(scenario: Callable[[], Awaitable[None]], chosen: Chosen) -> 
     finally:
         if os.getpid() != origin:
             loop.leave(["the scenario of the copy ended before its judgement"])
-    return loop.interruptions
+    return loop.came

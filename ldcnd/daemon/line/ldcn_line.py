@@ -70,7 +70,7 @@ def _opener(config: RigConfig, settings: BusConfig, baud: int, chains: Mapping[s
         return port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.transmitter)
     name = settings.port.removeprefix(SIMULATED)
     chain = chains.get(name) or _chain(next(line for line in config.sim if line.name == name))
-    return lambda: open_simulated_line(chain)
+    return lambda: open_simulated_line(chain, baud)
 
 
 def _chain(line: SimulatedLineConfig) -> Chain:

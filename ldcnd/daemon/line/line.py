@@ -221,7 +221,7 @@ class BusService:
         axis.tracker.finished()
 
     def _connect(self, report: BringUpReport) -> None:
-        """Start polling. Only the very first reset can be a reference: later ones follow a gap in knowledge."""
+        """Start polling. Only the very first reset can be a reference, and only where its place is proven."""
         log.info(
             "line up",
             bus=self.bus.settings.name,
@@ -231,7 +231,7 @@ class BusService:
         )
         now_s = asyncio.get_running_loop().time()
         for axis in self.axes:
-            trusted = axis.config.reference == "at_reset" and report.reset and not self._was_up
+            trusted = axis.config.reference == "at_reset" and axis.config.name in report.placed and not self._was_up
             axis.connected(referenced=trusted)
             self._poll(axis, now_s)
         for watch in self.network.watches:

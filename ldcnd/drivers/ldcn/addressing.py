@@ -278,9 +278,14 @@ DRAIN_S = 0.05
 
 
 class Addressing:
-    """Gives modules their addresses; neither of the procedures moves a motor."""
+    """Gives modules their addresses; neither of the procedures moves a motor.
+
+    Attributes:
+        had_address: addresses of modules that may have had theirs already, as they did not acknowledge getting it.
+    """
 
     def __init__(self, bus: Bus, rate: LineRate, plan: GroupPlan) -> None:
+        self.had_address: set[int] = set()
         self._bus = bus
         self._rate = rate
         self._plan = plan
@@ -327,6 +332,15 @@ class Addressing:
             modules[address] = identity
         return modules
 
+    async def let_all_hear(self, expected: int) -> None:
+        """Give away so many addresses, whoever takes them, so that the next reset reaches every module.
+
+        Behind a module that waits for its address one with an address is deaf, and lets those behind it hear: a reset
+        then leaves it as it is, and two modules of the chain at address 0.
+        """
+        for address in range(1, expected + 1):
+            await self._set_address(UNADDRESSED, address)
+
     async def address_next(self, address: int) -> bool:
         """Address the module that is at 0 now, as a member of its group; tell whether there was one.
 
@@ -336,6 +350,7 @@ class Addressing:
             if await self._set_address(UNADDRESSED, address):
                 return True
             if await self._rate.who_is(address, patient=True):
+                self.had_address.add(address)
                 return True
         return False
 

@@ -30,13 +30,13 @@ from ldcnd.drivers.ldcn.addressing import (
     differences,
     read_identity,
 )
-from ldcnd.drivers.ldcn.adoption import Adopted, Adoption, Found, Rejoin
+from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found, Rejoin
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status
+from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import BusError, NetworkMismatch
@@ -80,6 +80,7 @@ log = get_logger("ldcn")
 __all__ = ["RESET_BAUD", "LdcnNetwork"]
 
 MISSES_UNTIL_MUTE = 3
+PLACE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY
 RATE_ATTEMPTS = 2
 """Set Baud to everybody is not answered: one packet that was lost must not decide on the rate for good."""
 
@@ -98,6 +99,8 @@ class LdcnNetwork(Network):
         self._watches: dict[int, ModuleWatch] = {}
         self._was_up = False
         self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
+        self._disturbed = False  # an attempt to reset the line has failed on the way
+        self._placed: set[int] = set()
         self._expected = _expected(specs, line)
         plan = GroupPlan(line.groups, self._names)
         self._rate = LineRate(
@@ -185,6 +188,7 @@ class LdcnNetwork(Network):
             identities={self._names[address]: str(modules[address]) for address in self._drives},
             reset=reset,
             remarks=remarks,
+            placed=frozenset(self._names[address] for address in self._placed if address in self._names),
         )
 
     def _take_over(self, adopted: Adopted) -> tuple[str, ...]:
@@ -225,6 +229,19 @@ class LdcnNetwork(Network):
                 f" would restart at {RESET_BAUD}",
                 remedy=f'set the far end to {RESET_BAUD} baud, or use start = "adopt"',
             )
+        heard = self._bus.statistics.bytes_in
+        places_known = not (self._was_up or self._disturbed) and await self._all_wait()
+        try:
+            if self._disturbed:
+                await self._addressing.reset_all()
+                await self._addressing.let_all_hear(len(self._expected))
+            modules, remarks = await self._reset_and_address()
+        finally:
+            self._disturbed = self._disturbed or self._bus.statistics.bytes_in > heard  # a line without power is not
+        self._placed = await self._places() if places_known else set()
+        return modules, remarks
+
+    async def _reset_and_address(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
         for _ in range(RATE_ATTEMPTS):
             modules, remarks = await self._address_afresh()
             deaf = await self._change_rate(modules)
@@ -246,6 +263,31 @@ class LdcnNetwork(Network):
         await self._addressing.reset_all()
         modules = await self._addressing.address_all(len(self._expected))
         return modules, self._compare(modules)
+
+    async def _all_wait(self) -> bool:
+        """Tell, before a reset, whether all modules wait for an address, and so stand where they were powered on.
+
+        What has an address of an earlier host may have been moved by it. The first module tells: while it waits it
+        keeps the next one from hearing. If only some wait, modules meet at one address, the attempt fails, and the next
+        one is not the first at which something was heard.
+        """
+        if not await self._rate.host_to(RESET_BAUD) or await self._rate.who_is(UNADDRESSED, patient=True) is None:
+            return False
+        for baud in self._rate.candidates if self._rate.changeable else (RESET_BAUD,):
+            if await self._rate.who_is_at(baud, self._expected[0].address):
+                return False
+        return True
+
+    async def _places(self) -> set[int]:
+        """Return which modules stand at 0 after a reset that found them where they were powered on."""
+        placed = set()
+        for each in self._expected:
+            if each.address not in self._drives or each.address in self._addressing.had_address:
+                continue
+            status = await self._bus.execute(commands.read_status(Node(each.address, each.profile), PLACE_ITEMS))
+            if status.position is not None and abs(status.position) <= STILL_COUNTS and not status.velocity:
+                placed.add(each.address)
+        return placed
 
     async def _change_rate(self, modules: Mapping[int, Identity]) -> int | None:
         """Move everybody to the working rate; return the first module that did not follow, None if all did."""
