@@ -184,6 +184,11 @@ class Bus:
         if self._line:
             self._line.close(reason)
 
+    def distrust(self) -> None:
+        """Have the line prove that it is in step: a reply was not what its node can have said."""
+        if self._line:
+            self._line.distrust()
+
     def withdraw(self, node: int, error: LdcndError) -> None:
         """Fail every command that still waits for this node; what is on the wire runs on. Stops are not touched."""
         for job in self._queue.waiting(Lane.COMMAND):

@@ -114,6 +114,7 @@ class Line:
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
         self._turn: Turn | None = None
+        self._distrusted = False
         self._sent_at_s = 0.0
         self._pieces = Pieces()
         self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain turn
@@ -133,6 +134,18 @@ class Line:
             self._next()
         elif self.phase is Phase.FENCE and self._users.stop_waits():
             self._watchdog.set(self._loop.time())
+
+    def distrust(self) -> None:
+        """Prove that the line is in step before anything more is believed: a reply may have been to something older.
+
+        Every later reply then is the one to the request before; so what is on the wire is not believed either, unless
+        it must not be repeated.
+        """
+        if self.phase is Phase.IDLE:
+            self._fence.doubt()
+            self._raise_fence(self._loop.time())
+        elif self.phase is Phase.REPLY and self._turn and self._turn.exchange.repeatable:
+            self._distrusted, self._missing = True, NOT_PLAIN
 
     def close(self, reason: str) -> None:
         """Leave the line; the turn on the wire, if any, is lost. Safe to call twice."""
@@ -201,7 +214,9 @@ class Line:
         flaw = "came too early" if whole.early else _FLAWS.get(verdict, "")
         why = "came with surplus bytes" if whole.surplus else flaw
         self.wire.note(WireEvent.RECEIVED, now_s, arrived, why)
-        if whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
+        if self._distrusted:
+            self._distrust(turn, whole.reply, "may be to something older", now_s)
+        elif whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
             self._distrust(turn, whole.reply + whole.surplus, why, now_s)
         elif not turn.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
             # not believed before no other reply can come
@@ -316,6 +331,7 @@ class Line:
     def _raise_fence(self, now_s: float) -> None:
         if self.phase is Phase.CLOSED:
             return
+        self._distrusted = False
         self._statistics.resynchronisations += 1
         self.wire.note(WireEvent.RESYNC, now_s)
         self.phase = Phase.FENCE

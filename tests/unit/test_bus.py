@@ -66,6 +66,19 @@ async def test_what_can_move_is_sent_only_if_its_condition_holds_when_its_turn_c
     assert rig.sent() == [1, 9, 3]
 
 
+async def test_a_line_that_is_distrusted_proves_that_it_is_in_step_before_it_believes_another_reply():
+    rig = Rig()
+
+    async with running(rig) as callers:
+        on_its_way = callers.create_task(rig.bus.execute(toy.exchange(1)), name="on its way")
+        await asyncio.sleep(0)
+        rig.bus.distrust()
+
+    assert on_its_way.result() == 1
+    assert rig.sent() == [1, 1]
+    assert rig.bus.statistics.resynchronisations == 1
+
+
 async def outcome_of(call: Coroutine[Any, Any, int]) -> int | LdcndError:
     try:
         return await call

@@ -267,6 +267,8 @@ class AxisService:
             self.observed(reading, asked, timing)
         elif verdict is Verdict.LOST:
             self.missed(BadReply(f"axis {self.config.name}: its readings contradict each other", axis=self.config.name))
+        if gate.foreign:
+            self._bus.distrust()  # another drive's reply that came late would be followed by others
         return verdict is Verdict.ASK_AGAIN
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:

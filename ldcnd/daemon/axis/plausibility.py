@@ -52,12 +52,15 @@ class PlausibilityGate:
 
     Attributes:
         jumped: the reading that was believed last is where no motion can have led since the one before.
+        foreign: the reading that was judged last, and not believed, is where no motion can have led: it may be another
+            drive's.
         confirmed: the reading that the one that was believed last has confirmed, and when; None if it needed no other.
         withheld: readings that were not believed, so far.
     """
 
     def __init__(self, config: AxisConfig, scale: Scale) -> None:
         self.jumped = False
+        self.foreign = False
         self.confirmed: tuple[AxisReading, Timing] | None = None
         self.withheld = 0
         self._known: _Seen | None = None
@@ -87,7 +90,7 @@ class PlausibilityGate:
             standing: the axis was at rest, and nothing was commanded since.
         """
         known = self._known
-        self.jumped, self.confirmed = False, None
+        self.jumped, self.confirmed, self.foreign = False, None, False
         if known is None:
             return self._believe(reading, timing)
         if self._follows(known, reading, timing, NOISE_COUNTS if standing else None):
@@ -102,6 +105,7 @@ class PlausibilityGate:
             return self._believe(reading, timing)
         self._doubtful = _Seen(reading, timing)
         self._rounds += 1
+        self.foreign = self._is_jump(known, reading, timing)
         if self._rounds < ROUNDS:
             return Verdict.ASK_AGAIN
         self.withheld += self._rounds
