@@ -10,14 +10,26 @@ from collections.abc import Sequence
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
+from typing import Protocol
 
 from tests.mutants.changes import Mutant
 
 MUTANT = "LDCND_MUTANT"
 
 
+class Change(Protocol):
+    """A module that is not as it stands in its file."""
+
+    @property
+    def path(self) -> str:
+        """Of the module, below the root."""
+
+    def module(self, root: Path) -> CodeType:
+        """Return the changed module."""
+
+
 class _ChangedLoader(SourceFileLoader):
-    def __init__(self, name: str, mutant: Mutant, root: Path) -> None:
+    def __init__(self, name: str, mutant: Change, root: Path) -> None:
         super().__init__(name, str(root / mutant.path))
         self._mutant = mutant
         self._root = root
@@ -26,10 +38,10 @@ class _ChangedLoader(SourceFileLoader):
         return self._mutant.module(self._root)
 
 
-class _ChangedFinder(PathFinder):
-    """Finds one module, as a mutant."""
+class ChangedFinder(PathFinder):
+    """Finds one module, changed."""
 
-    def __init__(self, mutant: Mutant, root: Path) -> None:
+    def __init__(self, mutant: Change, root: Path) -> None:
         self._mutant = mutant
         self._root = root
 
@@ -48,4 +60,4 @@ def pytest_configure() -> None:
     """Put the mutant before the module; conftest has imported none of the modules that are changed."""
     path, node, kind = json.loads(os.environ[MUTANT])
     mutant = Mutant(path, "", "", (0, 0), node, kind, "")
-    sys.meta_path.insert(0, _ChangedFinder(mutant, Path(__file__).parents[2]))
+    sys.meta_path.insert(0, ChangedFinder(mutant, Path(__file__).parents[2]))
