@@ -4,8 +4,7 @@ A codec builds an `Exchange`; the bus runs it without knowing what the bytes mea
 state, can be prepared once and run any number of times.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import Enum
@@ -18,17 +17,22 @@ Condition = Callable[[], None]
 _condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
 
 
-@contextmanager
-def only_while(condition: Condition) -> Iterator[None]:
+class only_while:  # noqa: N801 - read as a statement
     """Let what can move, when queued in this context, be sent only if the condition still holds when its turn comes.
 
     A queue may be long: the condition is asked between it and the wire. Stops are not subject to any condition.
     """
-    token = _condition.set(condition)
-    try:
-        yield
-    finally:
-        _condition.reset(token)
+
+    __slots__ = ("_own", "_token")
+
+    def __init__(self, condition: Condition) -> None:
+        self._own = condition
+
+    def __enter__(self) -> None:
+        self._token = _condition.set(self._own)
+
+    def __exit__(self, *_raised: object) -> None:
+        _condition.reset(self._token)
 
 
 def condition_in_force() -> Condition | None:

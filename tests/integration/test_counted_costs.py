@@ -35,8 +35,9 @@ class Bound:
 
 POLL = Bound(calls=130, turns=3.5, bytecodes=3650)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
-COMMAND = Bound(calls=1500, turns=78)
-"""A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started."""
+COMMAND = Bound(calls=1540, turns=78)
+"""A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;
+permission is asked again as the turn of each packet comes."""
 STOP = Bound(calls=275, turns=10.5)
 SAMPLE = Bound(calls=15.5, turns=2.0)
 """From what a session delivers to what a program's loop over samples has in its hands."""

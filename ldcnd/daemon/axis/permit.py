@@ -8,7 +8,6 @@ is true when it would start, not what was true when it came.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -143,13 +142,11 @@ class Permit:
 
     async def start(self) -> None:
         """Start what was loaded; see `AxisDriver.start`."""
-        self.ask_to_move()
         with self._beginning():
             await self._gate.driver.start()
 
     async def track(self, position_counts: int) -> None:
         """Go to a position at once; see `AxisDriver.track`."""
-        self.ask_to_move()
         with self._beginning():
             await self._gate.driver.track(position_counts)
 
@@ -172,7 +169,7 @@ class Permit:
         with only_while(self.ask):
             await self._gate.driver.set_gains(gains)
 
-    def _beginning(self) -> AbstractContextManager[None]:
+    def _beginning(self) -> only_while:
         """Return the context of the packets that begin a motion; from now on the command is not late any more."""
         condition = self.to_move()
         self.begun()

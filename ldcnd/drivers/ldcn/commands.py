@@ -10,7 +10,7 @@ data sheets.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
@@ -61,7 +61,9 @@ class Destination(ABC, Generic[ReplyT]):
     profile: Profile | None
 
     @abstractmethod
-    def exchange(self, request: bytes, items: StatusItem | None, *, repeatable: bool) -> Exchange[ReplyT]:
+    def exchange(
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, moves: bool = False
+    ) -> Exchange[ReplyT]:
         """Pair a request with its reply: these status items, or those sent by default when None."""
 
 
@@ -86,7 +88,9 @@ class Node(Destination[Status]):
                 f"node address {self.address} is outside 0 to {MOST_ADDRESS}", value=self.address, limit=MOST_ADDRESS
             )
 
-    def exchange(self, request: bytes, items: StatusItem | None, *, repeatable: bool) -> Exchange[Status]:
+    def exchange(
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, moves: bool = False
+    ) -> Exchange[Status]:
         """See `Destination`.
 
         Raises:
@@ -106,6 +110,7 @@ class Node(Destination[Status]):
             response_s=SERVO_CYCLE_S,
             repeatable=repeatable,
             total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),
+            moves=moves,
         )
 
 
@@ -125,9 +130,16 @@ class Group(Destination[None]):
         """Refuse what is not a group address."""
         GROUP_ADDRESS.check(self.address)
 
-    def exchange(self, request: bytes, items: StatusItem | None, *, repeatable: bool) -> Exchange[None]:  # noqa: ARG002
+    def exchange(
+        self,
+        request: bytes,
+        items: StatusItem | None,  # noqa: ARG002 - nobody answers
+        *,
+        repeatable: bool,
+        moves: bool = False,
+    ) -> Exchange[None]:
         """See `Destination`; the manuals ask for 0.51 ms of quiet."""
-        return unanswered(self.address, request, GROUP_QUIET_S, repeatable=repeatable)
+        return unanswered(self.address, request, GROUP_QUIET_S, repeatable=repeatable, moves=moves)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
@@ -135,7 +147,9 @@ def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
     return rejected_bytes if data[0] & 0x02 else reply_bytes  # StatusFlag.CHECKSUM_ERROR
 
 
-def unanswered(address: int, request: bytes, quiet_s: float, *, repeatable: bool) -> Exchange[None]:
+def unanswered(
+    address: int, request: bytes, quiet_s: float, *, repeatable: bool, moves: bool = False
+) -> Exchange[None]:
     """Return an exchange that draws no reply and keeps the line quiet for a while."""
     return Exchange(
         node=address,
@@ -145,6 +159,7 @@ def unanswered(address: int, request: bytes, quiet_s: float, *, repeatable: bool
         decode=_nothing,
         response_s=quiet_s,
         repeatable=repeatable,
+        moves=moves,
     )
 
 
@@ -428,8 +443,8 @@ def _exchange(
 ) -> Exchange[ReplyT]:
     if to.profile and to.profile.support is Support.IDENTIFY and command not in COMMON_COMMANDS:
         raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
-    exchange = to.exchange(encode_packet(Packet(to.address, command, data)), items, repeatable=repeatable)
-    return replace(exchange, moves=True) if command in MOVING_COMMANDS else exchange
+    request = encode_packet(Packet(to.address, command, data))
+    return to.exchange(request, items, repeatable=repeatable, moves=command in MOVING_COMMANDS)
 
 
 def _dialect(to: Destination[ReplyT]) -> Profile:

@@ -277,7 +277,9 @@ class IoNode(Destination[IoStatus]):
             )
 
     @override
-    def exchange(self, request: bytes, items: int | None, *, repeatable: bool) -> Exchange[IoStatus]:
+    def exchange(
+        self, request: bytes, items: int | None, *, repeatable: bool, moves: bool = False
+    ) -> Exchange[IoStatus]:
         asked = self.items if items is None else IoItem(items)
         reply_bytes, rejected_bytes = io_status_bytes(asked), io_status_bytes(self.items)
         return Exchange(
@@ -289,6 +291,7 @@ class IoNode(Destination[IoStatus]):
             response_s=SERVO_CYCLE_S,
             repeatable=repeatable,
             total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),
+            moves=moves,
         )
 
 
