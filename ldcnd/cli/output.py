@@ -19,6 +19,7 @@ _TERMS = (
     (r"send halt", "ldcnd axis halt {axis}"),
     (r"send trace_abort", "ldcnd trace abort {axis}"),
     (r"send clear_counter", "ldcnd axis clear-counter {axis}"),
+    (r"send restart_eeprom_count", "ldcnd params restart-count {axis}"),
     (r"send list_parameters", "ldcnd params list {axis}"),
     (r"or acquire it with force", "or take it with ldcnd lease hold --axis {axis} --force -- COMMAND"),
     (r"acquire (?:a new one|one first|it again|that axis, too)", "ldcnd lease hold --axis {axis} -- COMMAND"),

@@ -19,6 +19,7 @@ from ldcnd.model.parameters import (
     PlannedParameters,
     PlannedWrite,
     ReadParameter,
+    RestartEepromCount,
     WriteParameter,
 )
 
@@ -173,6 +174,21 @@ def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
     reply = target.run(lambda client: read_dump(client, axis))
     values = {value.parameter: value.active for value in reply.values if value.differs}
     _transfer(target, axis, values, None, memory=Memory.EEPROM, dry_run=dry_run, any_type=True, yes=yes)
+
+
+@command.command("restart-count")
+@click.argument("axis")
+@click.option(
+    "--writes", type=click.IntRange(0, 10_000), default=0, help="Writes that the new drive has taken already."
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@with_target
+def restart_count(target: Target, axis: str, writes: int, *, yes: bool) -> None:
+    """Count EEPROM writes of AXIS anew, because its drive was replaced; nothing is sent to the drive."""
+    if not yes and not click.confirm(f"Was the drive of {axis} replaced?", err=True):
+        raise click.Abort
+    reply = target.run(lambda client: client.command(axis, RestartEepromCount(writes=writes)))
+    target.show(reply, f"{axis}: {reply.total} EEPROM writes; the drive before it had {reply.previous}")
 
 
 # -- transfer --------------------------------------------------------------------------------------------------------

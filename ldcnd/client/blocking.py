@@ -141,6 +141,7 @@ class Axis(Facade[asynchronous.Axis]):
     read_all_parameters = _waiting(asynchronous.Axis.read_all_parameters)
     write_parameter = _waiting(asynchronous.Axis.write_parameter)
     clear_counter = _waiting(asynchronous.Axis.clear_counter)
+    restart_eeprom_count = _waiting(asynchronous.Axis.restart_eeprom_count)
     read_alarms = _waiting(asynchronous.Axis.read_alarms)
     read_profile = _waiting(asynchronous.Axis.read_profile)
     read_monitors = _waiting(asynchronous.Axis.read_monitors)

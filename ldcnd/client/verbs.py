@@ -39,6 +39,7 @@ from ldcnd.model.parameters import (
     CounterName,
     CounterReply,
     DriveProfile,
+    EepromCount,
     ListParameters,
     Memory,
     MonitorReport,
@@ -52,6 +53,7 @@ from ldcnd.model.parameters import (
     ReadMonitors,
     ReadParameter,
     ReadProfile,
+    RestartEepromCount,
     WriteParameter,
 )
 from ldcnd.model.samples import MonitorName
@@ -286,6 +288,14 @@ class AxisVerbs(ABC):
             counter: Which counter.
         """
         return await self._send(lambda: ClearCounter(counter=counter))
+
+    async def restart_eeprom_count(self, *, writes: int = 0) -> EepromCount:
+        """Count EEPROM writes anew, because the drive was replaced; nothing is sent to it.
+
+        Args:
+            writes: Writes that the drive which is there now has taken already; 0 for a new one.
+        """
+        return await self._send(lambda: RestartEepromCount(writes=writes))
 
     async def read_alarms(self) -> AlarmReport:
         """Read the present alarm and the alarm history."""

@@ -97,6 +97,14 @@ class ParameterAccess(ABC):
         """
 
     @abstractmethod
+    async def restart_eeprom_count(self, writes: int) -> int:
+        """Count EEPROM writes of a replaced drive from here on; return what was counted for the one before.
+
+        Raises:
+            NotSupported: no count is kept.
+        """
+
+    @abstractmethod
     async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
         """Read the present alarm and the history."""
 

@@ -45,6 +45,7 @@ class Verb(StrEnum):
     READ_ALL_PARAMETERS = "read_all_parameters"
     WRITE_PARAMETER = "write_parameter"
     CLEAR_COUNTER = "clear_counter"
+    RESTART_EEPROM_COUNT = "restart_eeprom_count"
     READ_ALARMS = "read_alarms"
     READ_PROFILE = "read_profile"
     READ_MONITORS = "read_monitors"

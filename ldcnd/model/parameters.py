@@ -182,6 +182,15 @@ class CounterReply(CommandReply):
     """What deserves attention."""
 
 
+class EepromCount(CommandReply):
+    """The count of a drive's EEPROM writes after it was begun anew."""
+
+    previous: int
+    """Writes counted for the drive that was there before, all parameters together."""
+    total: int
+    """Writes counted for the drive that is there now."""
+
+
 class AlarmEntry(Frozen):
     """One alarm code."""
 
@@ -338,6 +347,16 @@ class ClearCounter(AxisCommand[CounterReply]):
     """Which counter."""
 
 
+class RestartEepromCount(AxisCommand[EepromCount]):
+    """Count EEPROM writes anew, because the drive was replaced; nothing is sent to it."""
+
+    verb = Verb.RESTART_EEPROM_COUNT
+    capability = Capability.PARAMETERS
+
+    writes: int = Field(default=0, ge=0, le=10_000)
+    """Writes that the drive which is there now has taken already; 0 for a new one."""
+
+
 class ReadAlarms(AxisCommand[AlarmReport]):
     """Read the present alarm and the alarm history."""
 
@@ -377,6 +396,7 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     PlanParameters,
     WriteParameter,
     ClearCounter,
+    RestartEepromCount,
     ReadAlarms,
     ReadProfile,
     ReadMonitors,

@@ -1,11 +1,17 @@
 """`ldcnd params` in front of a daemon, on the jumping clock."""
 
+import asyncio
+import json
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from ldcnd.cli.parameter_file import load_parameters
 from ldcnd.config.rig import load_config
+from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000
+from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.command_line import virtual_rig
 from tests.support.process import ROOT
 
@@ -34,3 +40,47 @@ def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path, monkeypa
     assert (refused.code, "[data_error]" in refused.errors) == (1, True)
     assert (restored.code, "read back: the drive holds the values" in restored.printed) == (0, True)
     assert '"Pn102": 2' in (tmp_path / "eeprom-writes.json").read_text()
+
+
+CHANGED = {each: each.limits.value.lowest + 7 if each.limits else 0x0011 for each in PARAMETERS if each is not PN000}
+"""Twenty-one parameters as no factory sets them."""
+
+
+def test_a_factory_new_drive_is_made_the_one_that_it_replaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = SimulatedUnit(None, {**CHANGED, PN000: 0x0101})
+    new = SimulatedUnit(None, {PN000: 0x0200})
+    (tmp_path / "eeprom-writes.json").write_text(json.dumps({"spool": {"Pn100": 8990}}))
+    config = load_config(ROOT / "config" / "mixed.toml").model_copy(update={"state_dir": tmp_path})
+
+    async def power_cycle() -> None:
+        now_s = asyncio.get_running_loop().time()
+        new.power_off(now_s)
+        new.power_on(now_s)
+
+    with virtual_rig(monkeypatch, config, {"steps": smartstep_chain([old, new])}) as rig:
+        failed = rig.run("params clone feed spool", typed="y\n")
+        refused = rig.run("params restart-count spool", typed="n\n")
+        restarted = rig.run("params restart-count spool --yes")
+        completed = rig.run("params clone feed spool --yes")
+        rig.wait(power_cycle())
+        again = rig.run("params clone feed spool --yes")
+        for axis in ("feed", "spool"):
+            assert rig.run(f"params dump {axis} {tmp_path / axis}.toml").code == 0
+
+    not_tried = [line for line in failed.printed.splitlines() if line.startswith("not tried: ")]
+    assert failed.code == 1
+    assert failed.errors.count("[y/N]") == 1
+    assert "1 of " in failed.errors  # progress, write by write
+    assert "[eeprom_budget]" in failed.printed
+    assert len(not_tried) > 10
+    assert "still differ; the same command again completes it" in failed.printed
+    assert refused.code == 130
+    assert restarted.printed == "spool: 0 EEPROM writes; the drive before it had 9000\n"
+    assert (completed.code, "read back: the drive holds the values" in completed.printed) == (0, True)
+    assert (again.code, again.printed) == (0, "spool holds these values already\n")
+    first, second = (tomllib.loads((tmp_path / f"{name}.toml").read_text()) for name in ("feed", "spool"))
+    for memory in ("parameters", "in_use"):
+        assert len(first[memory]) == len(PARAMETERS)
+        assert (first[memory].pop("Pn000"), second[memory].pop("Pn000")) == (0x0101, 0x0201)
+    assert {key for key in first if first[key] != second[key]} == {"axis", "read_at", "unit"}
+    assert (first["unit"], second["unit"]) == (1, 2)

@@ -8,9 +8,10 @@ import shlex
 import signal
 import sys
 from asyncio.subprocess import PIPE
-from collections.abc import AsyncIterator, Coroutine, Iterator
+from collections.abc import AsyncIterator, Coroutine, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import pytest
@@ -21,6 +22,7 @@ from ldcnd.client import connecting
 from ldcnd.config.rig import RigConfig
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 
@@ -82,9 +84,9 @@ class VirtualRig:
         self.rig = rig
         self._loop = loop
 
-    def run(self, line: str) -> Ran:
-        """Run a command line such as `axis list --json`."""
-        return run_here(*shlex.split(line))
+    def run(self, line: str, typed: str = "") -> Ran:
+        """Run a command line such as `axis list --json`; it finds on its standard input what is typed."""
+        return run_here(*shlex.split(line), typed=typed)
 
     def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:
         """Let something happen."""
@@ -92,14 +94,22 @@ class VirtualRig:
 
 
 @contextlib.contextmanager
-def virtual_rig(patch: pytest.MonkeyPatch, config: RigConfig | None = None) -> Iterator[VirtualRig]:
-    """Run a daemon, and let commands find it, until the context ends; only for tests that are no coroutines."""
+def virtual_rig(
+    patch: pytest.MonkeyPatch, config: RigConfig | None = None, chains: Mapping[str, Chain] = MappingProxyType({})
+) -> Iterator[VirtualRig]:
+    """Run a daemon, and let commands find it, until the context ends; only for tests that are no coroutines.
+
+    Args:
+        patch: lets commands find the daemon.
+        config: the rig.
+        chains: simulated lines that exist already, by name.
+    """
     loop = JumpingLoop()
     running: asyncio.Future[RunningRig] = loop.create_future()
     over = asyncio.Event()
 
     async def serve() -> None:
-        async with running_rig(config) as rig:
+        async with running_rig(config, chains) as rig:
             running.set_result(rig)
             await over.wait()
 
@@ -123,13 +133,13 @@ def virtual_rig(patch: pytest.MonkeyPatch, config: RigConfig | None = None) -> I
         loop.close()
 
 
-def run_here(*words: str) -> Ran:
+def run_here(*words: str, typed: str = "") -> Ran:
     """Run one command line in this process."""
     printed, errors = io.StringIO(), io.StringIO()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
         patch.setattr(sys, "argv", ["ldcnd", *words])
-        patch.setattr(sys, "stdin", io.StringIO())
+        patch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(SystemExit) as end:
             main()
     for number, handler in handlers.items():

@@ -68,3 +68,16 @@ async def test_the_file_is_for_people_too(tmp_path):
 
     assert json.loads((tmp_path / "ledger.json").read_text()) == {"feed": {"Pn100": 1}}
     assert list(tmp_path.iterdir()) == [tmp_path / "ledger.json"]
+
+
+@pytest.mark.parametrize("taken", [0, 40])
+async def test_the_count_of_a_replaced_drive_begins_with_what_it_has_taken_already(tmp_path, taken):
+    ledger = EepromLedger(tmp_path / "ledger.json")
+    for parameter in ("Pn100", "Pn102"):
+        await ledger.enter("feed", parameter, budget=10)
+    await ledger.enter("spool", "Pn100", budget=10)
+
+    previous = await ledger.restart("feed", taken)
+
+    again = EepromLedger(tmp_path / "ledger.json")
+    assert (previous, again.total("feed"), again.writes("feed", "Pn100"), again.total("spool")) == (2, taken, 0, 1)

@@ -9,6 +9,7 @@ from ldcnd.model.parameters import (
     ClearCounter,
     CounterReply,
     DriveProfile,
+    EepromCount,
     ListParameters,
     MonitorReading,
     MonitorReport,
@@ -22,6 +23,7 @@ from ldcnd.model.parameters import (
     ReadMonitors,
     ReadParameter,
     ReadProfile,
+    RestartEepromCount,
     WriteParameter,
 )
 
@@ -87,6 +89,9 @@ class Parameters:
                     value=cleared.value,
                     remarks=cleared.remarks,
                 )
+            case RestartEepromCount(writes=writes):
+                previous = await access.restart_eeprom_count(writes)
+                return EepromCount(command_id=command_id, axis=axis, verb=verb, previous=previous, total=writes)
             case ReadAlarms():
                 present, history = await access.alarms()
                 return AlarmReport(command_id=command_id, axis=axis, verb=verb, present=present, history=history)

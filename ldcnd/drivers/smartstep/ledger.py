@@ -17,6 +17,8 @@ from ldcnd.errors import ConfigError, EepromBudgetSpent
 EEPROM_LIFE = 10_000
 WARNING_WRITES = 1000
 """From so many writes on, every further one is remarked upon."""
+EARLIER = "earlier"
+"""Stands for the parameters of writes that a replaced drive had taken before it was counted here."""
 
 
 class EepromLedger:
@@ -56,7 +58,8 @@ class EepromLedger:
                 axis=axis,
                 value=total,
                 limit=budget,
-                remedy=f"write RAM, or raise eeprom_budget (the memory endures {EEPROM_LIFE} writes)",
+                remedy=f"write RAM, raise eeprom_budget (the memory endures {EEPROM_LIFE} writes), or, if the drive was"
+                " replaced, send restart_eeprom_count",
             )
         await self._set(axis, parameter, self.writes(axis, parameter) + 1)
 
@@ -64,15 +67,32 @@ class EepromLedger:
         """Forget a write that the drive has not carried out."""
         await self._set(axis, parameter, max(0, self.writes(axis, parameter) - 1))
 
+    async def restart(self, axis: str, writes: int) -> int:
+        """Begin the count of an axis anew, because its drive was replaced; return what the old drive had taken.
+
+        Args:
+            axis: whose drive.
+            writes: what the drive that is there now has taken already.
+
+        Raises:
+            ConfigError: the file cannot be written; the old count stands.
+        """
+        previous = self.total(axis)
+        await self._replace(axis, {EARLIER: writes} if writes else {})
+        return previous
+
     async def _set(self, axis: str, parameter: str, writes: int) -> None:
-        before = self.writes(axis, parameter)
-        self._counts.setdefault(axis, {})[parameter] = writes
+        await self._replace(axis, {**self._counts.get(axis, {}), parameter: writes})
+
+    async def _replace(self, axis: str, counts: dict[str, int]) -> None:
+        before = self._counts.get(axis, {})
+        self._counts[axis] = counts
         text = json.dumps(self._counts, indent=1, sort_keys=True)
         loop = asyncio.get_running_loop()
         try:
-            await loop.run_in_executor(self._worker, _replace, self._path, text)
+            await loop.run_in_executor(self._worker, _replace_file, self._path, text)
         except OSError as error:
-            self._counts[axis][parameter] = before
+            self._counts[axis] = before
             raise ConfigError(
                 f"{self._path}: the EEPROM ledger cannot be written: {error.strerror}",
                 axis=axis,
@@ -101,7 +121,7 @@ def _counts(document: Mapping[str, object]) -> dict[str, int]:
     return counts
 
 
-def _replace(path: Path, text: str) -> None:
+def _replace_file(path: Path, text: str) -> None:
     """Replace the file whole, and only once the new one is on the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".new")

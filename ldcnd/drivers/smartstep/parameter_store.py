@@ -205,6 +205,12 @@ class ParameterStore:
             return held != old
         return True
 
+    async def restart_count(self, writes: int) -> int:
+        """Count writes of a replaced drive; see `ParameterAccess`."""
+        previous = await self._ledger().restart(self._axis, writes)
+        log.warning("EEPROM count begun anew", axis=self._axis, previous=previous, total=writes)
+        return previous
+
     def _ledger(self) -> EepromLedger:
         if self._rules.ledger is None:
             raise NotSupported(
@@ -382,6 +388,10 @@ class UnitParameters(ParameterAccess):
         cleared = await clear_counter(self._words, COUNTERS[counter])
         self._cleared()
         return ClearedCounter(cleared.value, cleared.remarks)
+
+    @override
+    async def restart_eeprom_count(self, writes: int) -> int:
+        return await self._store.restart_count(writes)
 
     @override
     async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:

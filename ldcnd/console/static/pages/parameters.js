@@ -14,6 +14,7 @@ import { AxisChoice } from "./trace.js";
 
 /** All parameters of a slow drive on a bad line. */
 const PATIENCE_MS = 65_000;
+const LARGEST = 0xffff;
 
 export function ParametersPage({ at }) {
   const axes = [...useRigs().values()]
@@ -45,6 +46,11 @@ function Memories({ axis }) {
       ...last,
       values: last.values.map((each) => (each.parameter === value.parameter ? value : each)),
     }));
+  const recount = (total) =>
+    setDump((last) => ({
+      ...last,
+      values: last.values.map((each) => ({ ...each, eeprom_total: total, eeprom_writes: 0 })),
+    }));
   const readAll = () => command(axis, "read_all_parameters", {}, PATIENCE_MS);
   const rows = merged(listed, values, file).filter((row) => matches(row, only));
 
@@ -69,6 +75,7 @@ function Memories({ axis }) {
         rows=${rows.map((row) => html`<${Row} key=${row.parameter} row=${row} />`)} />
     <//>
     ${values && html`<${Change} axis=${axis} values=${values} listed=${listed} onWritten=${renew} />`}
+    ${values && html`<${Wear} axis=${axis} values=${values} onCounted=${recount} />`}
     ${values && file && html`<${Restore} axis=${axis} file=${file} onWritten=${renew} />`}
     <${AuthorityPanel} axis=${axis} />
     <${AlarmPanel} axis=${axis} />`;
@@ -147,40 +154,77 @@ function Change({ axis, values, listed, onWritten }) {
   const [set, setSet] = useState({ parameter: values[0].parameter, memory: "ram" });
   const [remarks, setRemarks] = useState([]);
   const info = listed.find((each) => each.parameter === set.parameter);
+  const held = values.find((each) => each.parameter === set.parameter);
+  const word = set.text === undefined ? undefined : wordOf(set.text);
   const way =
-    obstacle(axis, "write_parameter") ?? (set.value === null || set.value === undefined ? "A value is missing." : null);
+    obstacle(axis, "write_parameter") ?? (word === undefined ? "A value from 0 to 65535 is missing." : null);
+  const write = () => {
+    const { parameter, memory, confirm_unit } = set;
+    return command(axis, "write_parameter", { parameter, memory, confirm_unit, value: word });
+  };
+  const select = (parameter) => setSet({ parameter, memory: set.memory });
   return html`<${Panel} title="Change one">
     <div class="fields">
       <${Choice} label="Parameter" options=${values.map((each) => [each.parameter, `${each.parameter} ${each.name}`])}
-        value=${set.parameter} onChange=${(parameter) => setSet({ ...set, parameter })} />
-      <${Field} label="New value" unit=${info?.unit ?? ""} value=${set.value} min="0" max="65535" step="1"
-        onChange=${(value) => setSet({ ...set, value })}
-        hint=${info?.digits ? `as a number; it is shown by digits: ${shown(set.value, info)}` : null} />
+        value=${set.parameter} onChange=${select} />
+      <${Field} label="New value" type="text" unit=${info?.unit ?? ""} value=${set.text}
+        onChange=${(text) => setSet({ ...set, text: text ?? undefined })}
+        hint=${word === undefined ? "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} />
       <${Choice} label="Memory" options=${MEMORIES} value=${set.memory}
         onChange=${(memory) => setSet({ ...set, memory })} />
       ${
-        info?.digits &&
+        set.parameter === "Pn000" &&
         html`<${Field} label="New unit number, if it changes" value=${set.confirm_unit} min="0" max="15" step="1"
         onChange=${(unit) => setSet({ ...set, confirm_unit: unit ?? null })} />`
       }
     </div>
-    ${info?.digits && html`<${Digits} info=${info} value=${set.value} />`}
-    <p class="row"><${Action} act=${() => command(axis, "write_parameter", set)}
+    ${
+      info?.digits &&
+      html`<${Digits} info=${info} word=${word ?? held.stored} onWord=${(next) => setSet({ ...set, text: hex(next) })} />`
+    }
+    <p class="row"><${Action} act=${write}
       onDone=${(reply) => (onWritten(reply.value), setRemarks(reply.remarks))} obstacle=${way}
       kind="main">Write ${set.parameter}<//></p>
     <div role="status">${remarks.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
 }
 
-/** What the digits of a parameter set, from the right. */
-function Digits({ info, value }) {
-  if (!info.digit_meanings?.length) return null;
-  return html`<ul aria-label="Digits">${info.digit_meanings.map((digit) => {
-    const own = value == null ? null : ((value >> (4 * digit.digit)) & 0xf).toString(16).toUpperCase();
-    return html`<li>${info.parameter}.${digit.digit}${own === null ? "" : ` = ${own}`}: ${digit.title}${
-      own !== null && digit.values[own] ? `, ${digit.values[own]}` : ""
-    } <small>[${digit.confidence}]</small></li>`;
-  })}</ul>`;
+/** Return the word that a text stands for, decimal or hexadecimal; undefined for none. */
+export function wordOf(text) {
+  const written = text.trim();
+  const digits = /^(?:0x([0-9a-f]{1,4})|([0-9a-f]{1,4})h)$/i.exec(written);
+  const word = digits ? Number.parseInt(digits[1] ?? digits[2], 16) : /^\d{1,5}$/.test(written) ? Number(written) : Number.NaN;
+  return word <= LARGEST ? word : undefined;
+}
+
+/** The four digits of a parameter, each with what its values mean as far as that is known; .0 is the rightmost. */
+function Digits({ info, word, onWord }) {
+  const known = new Map(info.digit_meanings.map((digit) => [digit.digit, digit]));
+  return html`<div class="fields" role="group" aria-label="Digits">${[3, 2, 1, 0].map((place) => {
+    const digit = known.get(place);
+    const options = [...Array(16).keys()].map((value) => {
+      const own = value.toString(16).toUpperCase();
+      return [own, digit?.values[own] ? `${own}: ${digit.values[own]}` : own];
+    });
+    const own = ((word >> (4 * place)) & 0xf).toString(16).toUpperCase();
+    const replaced = (value) => (word & ~(0xf << (4 * place))) | (Number.parseInt(value, 16) << (4 * place));
+    return html`<${Choice} label=${`${info.parameter}.${place}`} options=${options} value=${own}
+      hint=${digit ? `${digit.title} [${digit.confidence}]` : "not described"} onChange=${(value) => onWord(replaced(value))} />`;
+  })}</div>`;
+}
+
+/** Writes are counted for a drive; another drive in its place has taken none of them. */
+function Wear({ axis, values, onCounted }) {
+  const [replaced, setReplaced] = useState(false);
+  const total = values[0]?.eeprom_total;
+  if (total == null) return null;
+  const way = obstacle(axis, "write_parameter") ?? (replaced ? null : "Only for a drive that was replaced.");
+  return html`<${Panel} title="EEPROM writes" note="All parameters together; the memory endures 10,000.">
+    <p>${total} writes counted for this drive.</p>
+    <${Tick} label="The drive was replaced by a new one" checked=${replaced} onChange=${setReplaced} />
+    <p class="row"><${Action} act=${() => command(axis, "restart_eeprom_count")} obstacle=${way}
+      onDone=${({ total }) => (setReplaced(false), onCounted(total))}>Count anew<//></p>
+  <//>`;
 }
 
 /** The daemon plans; this page shows the plan, sends its writes one by one, and plans again to prove them. */

@@ -8,6 +8,7 @@ const TERMS = [
   [/send set_gains|send at least kp and el/g, "write gains, at least kp and el"],
   [/send trace_abort/g, "press Abort on the trace page"],
   [/send clear_counter/g, "clear the counter"],
+  [/send restart_eeprom_count/g, "press Count anew on the parameters page"],
   [/or acquire it with force/g, "or take it from there by the tick"],
   [/acquire (a new one|one first|it again|that axis, too)/g, "press Take control"],
 ];
