@@ -8,7 +8,7 @@ from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.events import CommandEvent
+from ldcnd.model.events import ALARM_HISTORY, CommandEvent
 
 
 @click.command()
@@ -37,6 +37,9 @@ def command(target: Target, axis: str | None, count: int, *, follow: bool) -> No
 
 def _show(target: Target, event: CommandEvent) -> None:
     at = datetime.fromtimestamp(event.t / 1e9, UTC).isoformat(timespec="milliseconds")
+    if event.verb == ALARM_HISTORY:
+        target.show(event, f"{at} {event.axis:8} {event.verb:14} {event.code}: {event.reason}")
+        return
     who = f"{event.client or 'unnamed'} ({f'login {event.login}' if event.login else 'not authenticated'})"
     why = f": {event.reason}" if event.reason else ""
     target.show(event, f"{at} {event.axis:8} {event.verb:14} {event.status:10} by {who} ({event.command_id}){why}")

@@ -191,11 +191,13 @@ class ReadingListeners:
         observed: of a reading and the items that are new in it.
         monitored: of a monitor.
         missed: of a poll that brought nothing.
+        alarmed: of an alarm that the drive has entered in its own history since that was last read.
     """
 
     observed: Callable[[AxisReading, frozenset[TelemetryItem], Timing], None]
     monitored: Callable[[MonitorValue, Timing], None]
     missed: Callable[[BusError], None]
+    alarmed: Callable[[Fault], None]
 
 
 class AxisDriver(ABC):

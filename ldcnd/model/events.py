@@ -7,6 +7,9 @@ from pydantic import Field
 from ldcnd.model.commands import About, Command, Effect
 from ldcnd.model.frozen import Frozen
 
+ALARM_HISTORY = "alarm_history"
+"""The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
+
 
 class CommandStatus(StrEnum):
     """How far a command has got; the last five are final."""
@@ -54,7 +57,8 @@ class CommandEvent(Frozen):
     command_id: str
     """Which command."""
     verb: str
-    """What was asked."""
+    """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, which nobody asked
+    for."""
     client: str | None
     """By whom, as it calls itself; nobody has checked that."""
     login: str | None = None

@@ -11,6 +11,9 @@ from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.planning.cost import Cost, LineTiming, cost_of
 from ldcnd.planning.line_plan import Poll, Urgent
 
+ALARM_HISTORY_HZ = 1 / 60
+"""An alarm that came and went between two readings of the state is found within a minute."""
+
 
 def rates_hz(axis: AxisConfig) -> Mapping[Item, float]:
     """Return what is read of a unit and how often."""
@@ -20,6 +23,7 @@ def rates_hz(axis: AxisConfig) -> Mapping[Item, float]:
         Basic.VELOCITY: rates.velocity or rates.state,  # whether it moves is part of the state
         Basic.POSITION: rates.position or rates.state / 10,
     }
+    wanted[Basic.ALARM_HISTORY] = ALARM_HISTORY_HZ
     wanted.update(axis.smartstep.monitors.items())
     return wanted
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.bus.queue import Lane
+from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
@@ -206,6 +207,22 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
     assert isinstance(reply, CounterReply)
     assert reply.value == 0
     assert position.counts == 0
+
+
+async def test_an_alarm_that_came_and_went_between_two_readings_is_an_event(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        await rig.until("feed", lambda state: state.enabled)
+        await asyncio.sleep(70.0)  # its history was read: what stands there is no news
+        now_s = asyncio.get_running_loop().time()
+        units[0].drive.provoke(0x0051, now_s)
+        units[0].drive.press_reset(now_s)
+        await asyncio.sleep(70.0)
+        events = await latest_events(rig.client, 100, "feed")
+
+    (alarm,) = [event for event in events if event.verb == "alarm_history"]
+    assert (alarm.code, alarm.status, alarm.client) == ("alarm_0051", "failed", None)
+    assert alarm.reason == "A.51: Overspeed: new in the alarm history of the drive"
 
 
 async def test_the_profile_lists_its_assumptions(tmp_path):

@@ -69,7 +69,9 @@ async def read_at_s(rates: Rates, starts_s: dict[int, float]) -> dict[tuple[int,
     heard: dict[tuple[int, int], list[float]] = defaultdict(list)
     async with smartstep_line(drives) as line:
         for unit, items in rates.items():
-            deaf = Listeners(lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None, lambda: None)
+            deaf = Listeners(
+                lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None, lambda: None, lambda _: False
+            )
             line.bus.add_poller(UnitPoller(line.bus, unit, SMARTSTEP, items, starts_s[unit], deaf))
         await asyncio.sleep(SECONDS)
         for request, reply in pairwise(line.bus.wire_log.records()):

@@ -7,9 +7,11 @@ from ldcnd.drivers.smartstep.monitors import (
     ALARMS,
     ELECTRICAL_ANGLE,
     GUARD_READS,
+    HISTORY_LENGTH,
     MONITORS,
     NO_ALARM,
     POSITION_DEVIATION,
+    AlarmHistory,
     AlarmKind,
     Counter,
     CounterQuality,
@@ -243,3 +245,50 @@ def test_trembling_where_it_stood_is_never_off_by_65536():
         uncertain += value.quality is CounterQuality.RESOLVED
 
     assert uncertain <= 10
+
+
+NONE = NO_ALARM
+
+
+def history(*codes: int) -> tuple[int, ...]:
+    return (*codes, *[NONE] * (HISTORY_LENGTH - len(codes)))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "added"),
+    [
+        (history(), history(), ()),
+        (history(), history(0x10), (0x10,)),
+        (history(0x10), history(0x70, 0x51, 0x10), (0x51, 0x70)),
+        (history(0x10, 0x51), history(0x10, 0x10, 0x51), (0x10,)),
+        (tuple(range(1, 11)), (0x70, *range(1, 10)), (0x70,)),
+        (tuple(range(1, 11)), (*range(2, 11), 0x70), (0x70,)),
+    ],
+    ids=["as before", "first", "two, oldest first", "the same again", "full", "newest last"],
+)
+def test_what_the_alarm_history_has_gained_is_told_oldest_first(before, now, added):
+    grown = AlarmHistory()
+
+    assert grown.take(before) == ()
+    assert grown.take(now) == added
+    assert grown.take(now) == ()
+
+
+def test_a_history_that_was_torn_by_an_alarm_is_read_again():
+    before = tuple(range(1, 11))
+    torn, whole = (*before[:4], *before[3:9]), (0x70, *before[:9])
+    grown = AlarmHistory()
+    grown.take(before)
+
+    assert grown.take(torn) is None
+    assert grown.take(whole) == (0x70,)
+
+
+def test_the_history_of_another_drive_is_no_news():
+    other = tuple(range(0x31, 0x3B))
+    grown = AlarmHistory()
+    grown.take(tuple(range(1, 11)))
+
+    assert grown.take(other) is None
+    assert grown.take(other) == ()
+    assert grown.take((0x70, *other[:9])) == (0x70,)

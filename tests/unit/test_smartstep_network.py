@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from ldcnd.drivers.driver import AxisReading, ReadingListeners
+from ldcnd.drivers.driver import AxisReading, Fault, ReadingListeners
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import reference
@@ -46,6 +46,7 @@ class Heard:
     def __init__(self) -> None:
         self.readings: list[tuple[AxisReading, TelemetryItem, Timing]] = []
         self.monitors: list[MonitorValue] = []
+        self.alarms: list[Fault] = []
         self.missed = 0
 
     def listen(self, line: SmartStepLine, name: str) -> None:
@@ -57,7 +58,7 @@ class Heard:
             self.missed += 1
 
         now_s = asyncio.get_running_loop().time()
-        listeners = ReadingListeners(observed, lambda value, _: self.monitors.append(value), miss)
+        listeners = ReadingListeners(observed, lambda value, _: self.monitors.append(value), miss, self.alarms.append)
         line.bus.add_poller(line.axis(name).own_poller(now_s, listeners))
 
     def last(self) -> AxisReading:
@@ -212,7 +213,12 @@ async def test_monitors_come_at_their_rates():
             MonitorName.INPUT_SIGNALS: 0.1,
         }
         listeners = Listeners(
-            lambda *_: None, lambda value, _: told.append(value), lambda *_: None, lambda _: None, lambda: None
+            lambda *_: None,
+            lambda value, _: told.append(value),
+            lambda *_: None,
+            lambda _: None,
+            lambda: None,
+            lambda _: False,
         )
         line.bus.add_poller(UnitPoller(line.bus, 1, axis.profile, rates, 0.0, listeners))
         await asyncio.sleep(20.0)
@@ -250,7 +256,7 @@ async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_on
     async with smartstep_line([simulated(1), drive]) as line:
         await line.network.bring_up()
         axis = line.axis("u2")
-        ignore = ReadingListeners(lambda *_: None, lambda *_: None, lambda *_: None)
+        ignore = ReadingListeners(lambda *_: None, lambda *_: None, lambda *_: None, lambda _: None)
         line.bus.add_poller(axis.own_poller(asyncio.get_running_loop().time(), ignore))
         await asyncio.sleep(20.0)
         now_s = asyncio.get_running_loop().time()

@@ -27,7 +27,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
 from ldcnd.daemon.trace.recorder import TraceRecorder
-from ldcnd.drivers.driver import AxisDriver, AxisReading, StopMode
+from ldcnd.drivers.driver import AxisDriver, AxisReading, Fault, StopMode
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, TooManyRequests
@@ -45,7 +45,7 @@ from ldcnd.model.commands import (
     Stop,
     Verb,
 )
-from ldcnd.model.events import CommandStatus
+from ldcnd.model.events import ALARM_HISTORY, CommandStatus
 from ldcnd.model.samples import LinkState, Moving, TelemetryItem
 
 log = get_logger("axis")
@@ -144,11 +144,11 @@ class AxisTurns:
                 await self._woken.wait()
 
 
-Note = Callable[[str, str, CommandStatus, str], None]
-"""Takes what happened to an axis outside any command, for the events: axis, verb, status, reason."""
+Note = Callable[[str, str, CommandStatus, str, str | None], None]
+"""Takes what happened to an axis outside any command, for the events: axis, verb, status, reason, error code."""
 
 
-def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str) -> None:
+def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str, _code: str | None) -> None:
     pass
 
 
@@ -307,6 +307,11 @@ class AxisService:
         t, t_error_ns = self._clock.stamp(timing)
         self.telemetry.monitor(value, t, t_error_ns)
 
+    def alarmed(self, alarm: Fault) -> None:
+        """Take an alarm that the drive has entered in its own history."""
+        reason = f"{alarm.text}: new in the alarm history of the drive"
+        self._note(self.config.name, ALARM_HISTORY, CommandStatus.FAILED, reason, alarm.code)
+
     @property
     def at_work(self) -> bool:
         """Whether it carries out a command, moves, or may move for all that is known."""
@@ -442,7 +447,9 @@ class AxisService:
             return  # such a stop was confirmed while the axis was read
         if await self._confirmed_stop(mode, Verb.STOP, rounds=1):
             log.warning("stop confirmed late", axis=self.config.name)
-            self._note(self.config.name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")
+            self._note(
+                self.config.name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again", None
+            )
         self.telemetry.state(self._clock.now_ns())
 
     def _unconfirmed(self) -> StopMode | None:

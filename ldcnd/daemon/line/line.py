@@ -244,7 +244,7 @@ class BusService:
         """Ask the axis from now on; a poller that it had is replaced."""
         if previous := self._pollers.get(axis.config.name):
             self.bus.remove_poller(previous)
-        own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed))
+        own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed, axis.alarmed))
         rates_hz = wanted_rates_hz(axis.config.rates, adc=bool(axis.driver.adc_full_scale))
         poller = own or AxisPoller(axis.driver, rates_hz, now_s, axis.judged, axis.missed, self.bus.add_poller)
         poller.priority = Priority[axis.config.priority.upper()]

@@ -91,8 +91,8 @@ def build_daemon(
     events = EventLog(publisher, clock, instance)
     ledger = Ledger(events.changed, clock.now_s)
 
-    def note(axis: str, verb: str, status: CommandStatus, reason: str) -> None:
-        events.note(next_command_id(), axis, verb, status, reason)
+    def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
+        events.note(next_command_id(), axis, verb, status, reason, code=code)
 
     def make_axis(axis: AxisConfig, bus: Bus, driver: AxisDriver) -> AxisService:
         return AxisService(axis, bus, driver, publisher, clock, next_command_id, ledger.ended, note)

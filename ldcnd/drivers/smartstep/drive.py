@@ -5,7 +5,7 @@ Source: manual, introduction ("Omission": no command enables, moves, or resets);
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -23,6 +23,8 @@ from ldcnd.drivers.smartstep.monitors import (
     NO_ALARM,
     OUTPUT_SIGNALS,
     SPEED_FEEDBACK,
+    Alarm,
+    AlarmHistory,
     AlarmKind,
     DriverType,
     alarm,
@@ -39,9 +41,12 @@ from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.trace import SmartStepTracer
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.exchange import Timing
+from ldcnd.log import get_logger
 from ldcnd.model.catalogue import verbs_for
 from ldcnd.model.commands import Capability, HomeMethod
 from ldcnd.model.samples import MonitorName, TelemetryItem
+
+log = get_logger("smartstep")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +97,7 @@ class SmartStepAxis(ReadOnlyAxis):
         self._bus = bus
         self.wires_checked = True
         self._poller: UnitPoller | None = None
+        self._history = AlarmHistory()
 
     @property
     @override
@@ -114,13 +120,21 @@ class SmartStepAxis(ReadOnlyAxis):
         def monitored(value: MonitorValue, timing: Timing) -> None:
             listeners.monitored(value, timing)
 
+        def history(words: tuple[int, ...]) -> bool:
+            added = self._history.take(words)
+            for word in added or ():
+                known = alarm(word)
+                log.warning("alarm history has grown", axis=self.spec.name, code=f"{known.code:04X}H", text=known.text)
+                listeners.alarmed(fault_of(known))
+            return added is None
+
         self._poller = UnitPoller(
             self._bus,
             self.spec.address,
             self.profile,
             self._rates_hz,
             start_at_s,
-            Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself),
+            Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself, history),
             wires_checked=self.wires_checked,
         )
         return self._poller
@@ -135,7 +149,7 @@ class SmartStepAxis(ReadOnlyAxis):
         stops = present.kind is AlarmKind.ALARM or (present.kind is not AlarmKind.NONE and out)
         faults = []
         if present.code != NO_ALARM:
-            faults.append(Fault(f"alarm_{present.code:04x}", f"A.{present.code:02X}: {present.text}", stops=stops))
+            faults.append(replace(fault_of(present), stops=stops))
         speed_rpm = signed_word(words[SPEED_FEEDBACK.address])
         return AxisReading(
             position_counts=latest.position.signed,
@@ -155,3 +169,8 @@ class SmartStepAxis(ReadOnlyAxis):
     def _cleared(self) -> None:
         if self._poller:
             self._poller.forget_position()
+
+
+def fault_of(known: Alarm) -> Fault:
+    """Return an alarm or a warning as a fault of the axis."""
+    return Fault(f"alarm_{known.code:04x}", f"A.{known.code:02X}: {known.text}")

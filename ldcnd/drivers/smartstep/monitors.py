@@ -215,6 +215,45 @@ def alarm(word: int) -> Alarm:
     return Alarm(word, f"unlisted alarm code {word:04X}H", AlarmKind.UNKNOWN)
 
 
+class AlarmHistory:
+    """What a drive adds to its alarm history, from one complete reading of it to the next.
+
+    Entry 0 is the newest (INFERRED_MEDIUM); a drive that adds at the other end shows that by its first new alarm. The
+    ten words are read one after the other, so an alarm that comes meanwhile may tear them: what cannot follow from the
+    reading before is believed only when it reads the same again, and is then another drive's. An alarm that fills the
+    whole history already cannot be seen coming again.
+    """
+
+    def __init__(self) -> None:
+        self._known: tuple[int, ...] | None = None
+        self._odd: tuple[int, ...] | None = None
+
+    def take(self, words: tuple[int, ...]) -> tuple[int, ...] | None:
+        """Return the codes that are new, oldest first; None when the history has to be read again.
+
+        The first reading tells nothing new: when its alarms came is not known.
+        """
+        known, odd = self._known, self._odd
+        added: tuple[int, ...] | None = ()
+        if known is not None:
+            added = _added(known, words)
+            if added is None:
+                added = _added(known[::-1], words[::-1])
+        if added is None and words != odd:
+            self._odd = words
+            return None
+        self._known, self._odd = words, None
+        return tuple(code for code in reversed(added or ()) if code != NO_ALARM)
+
+
+def _added(before: tuple[int, ...], now: tuple[int, ...]) -> tuple[int, ...] | None:
+    """Return the fewest entries that were put in front of `before`, newest first; None when that cannot be."""
+    for count in range(len(now)):
+        if now[count:] == before[: len(now) - count]:
+            return now[:count]
+    return None
+
+
 GUARD_COUNTS = 256
 """How near to a boundary the low half must be to make the high half suspect."""
 GUARD_READS = 8

@@ -18,6 +18,7 @@ from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import Refusal, is_self_hearing, reference, with_response_time
 from ldcnd.drivers.smartstep.monitors import (
     COUNTERS,
+    HISTORY_LENGTH,
     INPUT_SIGNALS,
     OUTPUT_SIGNALS,
     SPEED_FEEDBACK,
@@ -55,6 +56,7 @@ class Basic(Enum):
     STATE = "state"
     VELOCITY = "velocity"
     POSITION = "position"
+    ALARM_HISTORY = "alarm_history"
 
 
 Item = Basic | MonitorName
@@ -63,6 +65,7 @@ BASIC_WORDS: Mapping[Basic, tuple[int, ...]] = {
     Basic.IDENTITY: (Register.DRIVER_TYPE, Register.SOFTWARE_VERSION),
     Basic.STATE: (Register.PRESENT_ALARM, INPUT_SIGNALS.address, OUTPUT_SIGNALS.address),
     Basic.VELOCITY: (SPEED_FEEDBACK.address,),
+    Basic.ALARM_HISTORY: tuple(Register.ALARM_HISTORY + place for place in range(HISTORY_LENGTH)),
 }
 PUBLISHED = {
     Basic.STATE: TelemetryItem.STATE,
@@ -94,6 +97,7 @@ class Listeners:
         identified: of driver type and software version, whenever the drive may be another one.
         missed: of a poll that brought nothing.
         self_hearing: of a drive that takes its own replies for commands.
+        history: of the alarm history; it returns whether that has to be read again at once.
     """
 
     read: Callable[[UnitWords, TelemetryItem, Timing], None]
@@ -101,6 +105,7 @@ class Listeners:
     identified: Callable[[int, int], None]
     missed: Callable[[BusError], None]
     self_hearing: Callable[[], None]
+    history: Callable[[tuple[int, ...]], bool]
 
 
 class UnitPoller(Poller[int | Refusal]):
@@ -188,6 +193,8 @@ class UnitPoller(Poller[int | Refusal]):
         elif self._counter and isinstance(reply, int):
             self._take_half(self._counter, reply, timing)
         elif self._item and isinstance(reply, int):
+            if self._address == Register.PRESENT_ALARM and reply != self._words.get(self._address):
+                self._hasten(Basic.ALARM_HISTORY, timing.received_at_s)
             self._words[self._address] = reply
             if not self._left:
                 self._finish(self._item, timing)
@@ -255,6 +262,11 @@ class UnitPoller(Poller[int | Refusal]):
         if item is not Basic.STATE:
             self._due_s[item] = NEVER_S
 
+    def _hasten(self, item: Item, now_s: float) -> None:
+        """Have an item that is read at all read next."""
+        if self._due_s.get(item, NEVER_S) < NEVER_S:
+            self._due_s[item] = now_s
+
     def _back(self, now_s: float) -> None:
         """The drive answers again: it may have been off, or be another one."""
         self._words.clear()
@@ -286,6 +298,9 @@ class UnitPoller(Poller[int | Refusal]):
             self._listeners.monitored(word_value(item, self._words[WORDS[item].address], self._profile), timing)
         elif item is Basic.IDENTITY:
             self._listeners.identified(*(self._words[address] for address in BASIC_WORDS[Basic.IDENTITY]))
+        elif item is Basic.ALARM_HISTORY:
+            if self._listeners.history(tuple(self._words[address] for address in BASIC_WORDS[item])):
+                self._hasten(item, timing.received_at_s)
         else:
             self._tell(item, timing)
 
