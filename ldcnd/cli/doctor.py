@@ -1,11 +1,11 @@
 """`ldcnd doctor`: examine a line before a daemon uses it; opens the port itself, reads unless told otherwise."""
 
 import asyncio
-import re
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from enum import StrEnum
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 
@@ -13,6 +13,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.config.bus import BusConfig
+from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.line import examination
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
@@ -20,16 +21,20 @@ from ldcnd.daemon.line.smartstep_line import build_line
 from ldcnd.drivers.smartstep.commands import FLUSH
 from ldcnd.drivers.smartstep.commissioning import examine
 from ldcnd.drivers.smartstep.commissioning import scan as scan_units
+from ldcnd.drivers.smartstep.config import SmartStepTraceConfig
 from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
-from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, TriggerMap
-from ldcnd.drivers.smartstep.trigger_search import Stimulus, find_trigger_map
+from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, TriggerMap, Verification
+from ldcnd.drivers.smartstep.trigger_search import find_trigger_map
+from ldcnd.drivers.smartstep.verification import Verified, verify_traces
 from ldcnd.errors import BusDown, ConfigError
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.transport.port_url import port_opener
 from ldcnd.transport.transport import Opener
 
+ResultT = TypeVar("ResultT")
+CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 OPEN_TIME_S = 5.0
 SOFT_PARITY = SmartStepProfile(framing=Framing.SOFT_PARITY)
 """Parity is made here, so that any adapter will do and wrong parity is seen character by character."""
@@ -53,10 +58,9 @@ def ldcn(config: Path, name: str, *, as_json: bool) -> None:
 @click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
 @click.option("--bus", "name", required=True, help="The line to examine.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
-@click.option("--trace", is_flag=True, help="Also record a short trace, which shows how its words are laid out.")
-def smartstep(config: Path, name: str, *, as_json: bool, trace: bool) -> None:
+def smartstep(config: Path, name: str, *, as_json: bool) -> None:
     """Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."""
-    _examine(config, name, "smartstep", as_json=as_json, trace=trace)
+    _examine(config, name, "smartstep", as_json=as_json)
 
 
 @command.command()
@@ -94,74 +98,102 @@ async def scan_line(opener: Opener, port: str, show: Callable[[Finding], None]) 
             owner.cancel()
 
 
+def _one_drive(function: CommandT) -> CommandT:
+    """Give a command the options that name one SmartStep."""
+    options = (
+        click.option(
+            "--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML)."
+        ),
+        click.option("--bus", "name", required=True, help="The line."),
+        click.option("--axis", required=True, help="The SmartStep; RUN must be off."),
+    )
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
 @command.command("trigger-bits")
-@click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
-@click.option("--bus", "name", required=True, help="The line.")
-@click.option("--axis", required=True, help="The SmartStep; RUN must be off.")
+@_one_drive
 @click.option("--write", is_flag=True, help="Write the bits into the configuration.")
 def trigger_bits(config: Path, name: str, axis: str, *, write: bool) -> None:
     """Find the trigger bits of a SmartStep by trying words; asks for the shaft to be turned and RESET to be pressed."""
+    found = asyncio.run(_with_drive(config, name, axis, lambda _bus, unit: find_trigger_map(unit.words, _act)))
+    table = {key: f"0x{getattr(found, key):04X}" for key in TriggerMap.__slots__}
+    print("\n".join(f"{key} = {literal}" for key, literal in table.items()))
+    if write:
+        set_for_axis(config, axis, {"smartstep.trace.trigger_map": table})
+        print(f"written to {config}")
+
+
+@command.command()
+@_one_drive
+@click.option("--write", is_flag=True, help="Write what was verified into the configuration.")
+def verify(config: Path, name: str, axis: str, *, write: bool) -> None:
+    """Verify what a SmartStep's traces look like: strings, words, gear; asks for the shaft to be turned and for pulses.
+
+    Exits with 1 when something stays open.
+    """
+    found: list[Verified] = []
+
+    async def work(bus: Bus, unit: SmartStepAxis) -> None:
+        async for each in verify_traces(bus, unit.words, unit.profile, _act):
+            found.append(each)
+            state = "open" if each.setting is None else "verified"
+            print(f"{each.key:22} {state:8} {each.text}", flush=True)
+
+    asyncio.run(_with_drive(config, name, axis, work))
+    if write:
+        set_for_axis(config, axis, verified_tables(found))
+        print(f"written to {config}")
+    sys.exit(1 if any(each.setting is None for each in found) else 0)
+
+
+def verified_tables(found: Sequence[Verified]) -> dict[str, dict[str, str]]:
+    """Return the tables of the configuration that say what was verified."""
+    tables: dict[str, dict[str, str]] = {"smartstep": {}, "smartstep.trace": {}, "smartstep.verified": {}}
+    for each in found:
+        if each.setting is None:
+            continue
+        key = each.key.removeprefix("trace_")
+        table = "smartstep.trace" if key in SmartStepTraceConfig.model_fields else "smartstep"
+        tables[table][key] = str(each.setting) if isinstance(each.setting, int) else f'"{each.setting}"'
+        tables["smartstep.verified"][each.key] = f'"{Verification.VERIFIED.value}"'
+    return {name: values for name, values in tables.items() if values}
+
+
+async def _act(stimulus: StrEnum) -> None:
+    await asyncio.to_thread(click.prompt, f"{stimulus.value}; Enter", default="", show_default=False, err=True)
+
+
+async def _with_drive(
+    config: Path, name: str, axis: str, work: Callable[[Bus, SmartStepAxis], Awaitable[ResultT]]
+) -> ResultT:
+    """Open the line of a SmartStep, do something with the drive, and close it.
+
+    Raises:
+        ConfigError: there is no such line or axis.
+        BusDown: the port does not open.
+    """
     rig = load_config(config)
     settings = next((bus for bus in rig.bus if bus.name == name and bus.family == "smartstep"), None)
     if settings is None or axis not in [each.name for each in settings.axis]:
         raise ConfigError(f"{config}: no smartstep line {name!r} with an axis {axis!r}")
     configure_logging(level="error")
-    found = asyncio.run(_search(rig, settings, axis))
-    print(trigger_table(found))
-    if write:
-        with_trigger_map(config, axis, found)
-        print(f"written to {config}")
-
-
-async def _search(rig: RigConfig, settings: BusConfig, axis: str) -> TriggerMap:
     bus, units = build_line(rig, settings, None, {})
     bus.resync = units.resync
     unit = units.axes[axis]
     if not isinstance(unit, SmartStepAxis):
         raise ConfigError(f"{axis} is no SmartStep")
-
-    async def act(stimulus: Stimulus) -> None:
-        await asyncio.to_thread(click.prompt, f"{stimulus.value}; Enter", default="", show_default=False, err=True)
-
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name=f"bus {settings.name}")
         try:
             await _opened(bus, settings.port)
-            return await find_trigger_map(unit.words, act)
+            return await work(bus, unit)
         finally:
             owner.cancel()
 
 
-def trigger_table(bits: TriggerMap) -> str:
-    """Return the table of the configuration that says these bits."""
-    keys = "\n".join(f"{key} = 0x{getattr(bits, key):04X}" for key in TriggerMap.__slots__)
-    return f"[bus.axis.smartstep.trace.trigger_map]\n{keys}\n"
-
-
-def with_trigger_map(config: Path, axis: str, bits: TriggerMap) -> None:
-    """Write the bits of one axis into a configuration, its comments and its order left as they are.
-
-    Raises:
-        ConfigError: there are other bits already, or the file is laid out so that the table has to be put in by hand.
-    """
-    lines = config.read_text(encoding="utf-8").splitlines(keepends=True)
-    named = [place for place, line in enumerate(lines) if re.match(rf"\s*name\s*=\s*[\"']{re.escape(axis)}[\"']", line)]
-    draft = config.with_suffix(".new")
-    for place in named:
-        after = next((n for n in range(place, len(lines)) if lines[n].lstrip().startswith("[[")), len(lines))
-        draft.write_text("".join([*lines[:after], "\n", trigger_table(bits), "\n", *lines[after:]]), encoding="utf-8")
-        with suppress(ConfigError):
-            rig = load_config(draft)
-            (found,) = [each for bus in rig.bus for each in bus.axis if each.name == axis]
-            wanted = {key: getattr(bits, key) for key in TriggerMap.__slots__}
-            if found.smartstep.trace.trigger_map and found.smartstep.trace.trigger_map.model_dump() == wanted:
-                draft.replace(config)
-                return
-    draft.unlink(missing_ok=True)
-    raise ConfigError(f"{config}: put this table behind axis {axis} by hand:\n{trigger_table(bits)}")
-
-
-def _examine(config: Path, name: str, family: str, *, as_json: bool, trace: bool = False) -> None:
+def _examine(config: Path, name: str, family: str, *, as_json: bool) -> None:
     rig = load_config(config)
     settings = next((bus for bus in rig.bus if bus.name == name and bus.family == family), None)
     if settings is None:
@@ -177,13 +209,11 @@ def _examine(config: Path, name: str, family: str, *, as_json: bool, trace: bool
         print(finding.model_dump_json() if as_json else text, flush=True)
 
     configure_logging(level="error")  # findings say the rest
-    asyncio.run(examine_line(rig, settings, show, trace=trace))
+    asyncio.run(examine_line(rig, settings, show))
     sys.exit(1 if wrong else 0)
 
 
-async def examine_line(
-    rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None], *, trace: bool = False
-) -> None:
+async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None]) -> None:
     """Open a line, examine it and every configured drive on it, and close it.
 
     Raises:
@@ -193,7 +223,7 @@ async def examine_line(
     if settings.family == "smartstep":
         bus, units = build_line(rig, settings, None, {})
         bus.resync = units.resync
-        findings = _smartstep(bus, units, trace=trace)
+        findings = _smartstep(bus, units)
     else:
         bus, network = build_ldcn_line(rig, settings, {})
         bus.resync = network.resync
@@ -208,10 +238,10 @@ async def examine_line(
             owner.cancel()
 
 
-async def _smartstep(bus: Bus, network: SmartStepNetwork, *, trace: bool) -> AsyncIterator[Finding]:
+async def _smartstep(bus: Bus, network: SmartStepNetwork) -> AsyncIterator[Finding]:
     for axis in network.axes.values():
         if isinstance(axis, SmartStepAxis):
-            async for finding in examine(bus, axis, trace=trace):
+            async for finding in examine(bus, axis):
                 yield finding
 
 

@@ -23,20 +23,17 @@ from ldcnd.drivers.smartstep.monitors import (
 from ldcnd.drivers.smartstep.network import hears_itself
 from ldcnd.drivers.smartstep.packet import DAMAGED, HIGHEST_UNIT
 from ldcnd.drivers.smartstep.parameters import PN000, unit_number
-from ldcnd.drivers.smartstep.profiles import SmartStepProfile, Verification
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile
 from ldcnd.drivers.smartstep.words import Words
 from ldcnd.errors import BadReply, BusError, DriveFault
 from ldcnd.model.health import Finding, Verdict
-from ldcnd.model.traces import TakeTrace
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 
-async def examine(bus: Bus, unit: SmartStepAxis, *, trace: bool = False) -> AsyncIterator[Finding]:
+async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
     """Examine one drive on an open line that nobody else uses; yields each finding as it comes.
 
-    It reads only, unless `trace` asks for a short trace, which sets the working registers of the drive's recorder.
-
-    Ends early when the drive does not answer or hears itself.
+    It reads only. Ends early when the drive does not answer or hears itself.
     """
     examination = Examination(bus, unit)
     alive = await examination.alive()
@@ -53,7 +50,6 @@ async def examine(bus: Bus, unit: SmartStepAxis, *, trace: bool = False) -> Asyn
         examination.string_range,
         examination.longest_string,
         examination.atomic_counter,
-        *((examination.trace_words,) if trace else ()),
     ):
         try:
             finding = await part()
@@ -171,24 +167,6 @@ class Examination:
         halves = await self._string(INPUT_COUNTER_LOW.address, 4)
         can = "can" if isinstance(halves, StringReply) else "cannot"
         return self.finding("atomic counter", Verdict.FINE, f"a counter {can} be read at once", "atomic_counter")
-
-    async def trace_words(self) -> Finding:
-        """Record a short trace of everything that a monitor shows, and compare; nothing moves, no EEPROM is written.
-
-        It tells layouts apart where a signal is high or a value is not zero: best with the shaft turned by hand.
-        """
-        request = TakeTrace(channels=("speed_feedback", "position_deviation", "reset", "bkir"), interval_s=0.004)
-        tracer = self._unit.tracer
-        if tracer is None:
-            return self.finding("trace words", Verdict.LOOK, "the drive has no recorder")
-        armed = await tracer.arm(request)
-        recorded = await armed.record(lambda _phase: None)
-        known = recorded.drive.assumptions if recorded.drive else ()
-        verified = [each.key for each in known if each.verification == Verification.VERIFIED.value]
-        if recorded.problems:
-            return self.finding("trace words", Verdict.LOOK, "; ".join(recorded.problems), "trace_word_layout")
-        text = f"agree with the monitors; verified: {', '.join(verified) or 'nothing, as all layouts agree'}"
-        return self.finding("trace words", Verdict.FINE, text, "trace_word_layout")
 
     async def _string(self, address: int, byte_count: int) -> StringReply | Refusal:
         return await self._bus.execute(

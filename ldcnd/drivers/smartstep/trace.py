@@ -41,13 +41,13 @@ from ldcnd.drivers.smartstep.trace_check import (
     TRIGGER_LATE_S,
     Comparison,
     Judgement,
+    Reading,
     Samples,
     Shown,
     comparisons,
     judge,
     trigger_problem,
 )
-from ldcnd.drivers.smartstep.trace_check import Words as TraceWords
 from ldcnd.drivers.smartstep.trace_data import (
     LONGEST_INTERVAL,
     POINTS,
@@ -141,7 +141,11 @@ class _Setup:
 
 
 class SmartStepTracer(Tracer):
-    """See `Tracer`."""
+    """See `Tracer`.
+
+    Attributes:
+        possible: the readings of the drive's words that its traces have left; None for any.
+    """
 
     source = TraceSource.DRIVE
     channels = CHANNELS
@@ -150,15 +154,15 @@ class SmartStepTracer(Tracer):
         self._bus = bus
         self._words = words
         self._profile = profile
-        self._possible: frozenset[TraceWords] | None = None
+        self.possible: frozenset[Reading] | None = None
 
     def forget(self) -> None:
         """The drive may be another one: what traces have verified about it counts no more."""
-        self._possible = None
+        self.possible = None
 
     def _judge(self, setup: _Setup, samples: Samples, shown: tuple[Shown, ...]) -> Judgement:
-        judgement = judge(self._profile, setup.constants, setup.assignment, samples, shown, self._possible)
-        self._possible = judgement.possible
+        judgement = judge(self._profile, setup.constants, setup.assignment, samples, shown, self.possible)
+        self.possible = judgement.possible
         return judgement
 
     async def arm(self, request: TakeTrace) -> ArmedTrace:

@@ -58,8 +58,36 @@ _SIGNALS: Mapping[IoObject, tuple[Monitor, int]] = {
 }
 
 
-Words = tuple[TraceWordLayout, ByteOrder]
-"""What the words of a trace memory look like."""
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One way to read the words of a trace, of those that the manual leaves open.
+
+    Attributes:
+        trace_word_layout: where the I/O bit and the value sit.
+        trace_byte_order: which half of a word comes first.
+        command_pulse_gear: which way command pulses are geared to motor speed.
+        encoder_counts_per_rev: encoder counts in one turn of the motor.
+    """
+
+    trace_word_layout: TraceWordLayout
+    trace_byte_order: ByteOrder
+    command_pulse_gear: CommandPulseGear
+    encoder_counts_per_rev: int
+
+    def applied_to(self, profile: SmartStepProfile) -> SmartStepProfile:
+        """Return a profile that reads words so."""
+        return replace(profile, **{key: getattr(self, key) for key in READING})
+
+    def named(self, *, geared: bool) -> str:
+        """Return it in words; the gear only where command pulses were recorded."""
+        name = f"{self.trace_word_layout.value}, {self.trace_byte_order.value} byte first"
+        if geared:
+            name += f", gear {self.command_pulse_gear.value}, {self.encoder_counts_per_rev} counts a revolution"
+        return name
+
+
+READING = tuple(Reading.__slots__)
+"""The assumptions of a profile that a reading is made of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +145,13 @@ class Judgement:
         problems: why its values are uncertain; none when they are right.
         verified: assumptions that this trace, with those before it, has verified.
         contradicted: assumptions that it has contradicted.
-        possible: what the drive's words may look like by all traces so far.
+        possible: the readings of the drive's words that are left by all traces so far; None for any.
     """
 
     problems: tuple[str, ...] = ()
     verified: frozenset[str] = frozenset()
     contradicted: frozenset[str] = frozenset()
-    possible: frozenset[Words] | None = None
+    possible: frozenset[Reading] | None = None
 
 
 def comparisons(assignment: Assignment) -> tuple[Comparison, ...]:
@@ -143,7 +171,7 @@ def judge(
     assignment: Assignment,
     samples: Samples,
     shown: Sequence[Shown],
-    possible: frozenset[Words] | None = None,
+    possible: frozenset[Reading] | None = None,
 ) -> Judgement:
     """Compare a trace with what the monitors showed meanwhile.
 
@@ -158,38 +186,48 @@ def judge(
     if profile.trace_word_layout is TraceWordLayout.RAW:
         return Judgement(("the words of the trace memory are published as they are, without a layout",))
     windows = [(each, window) for each in shown if (window := samples.window(each))]
+    assumed, everything = reading_of(profile), readings(profile)
+    candidates = everything if possible is None else [each for each in everything if each in possible]
+    geared = DataObject.COMMAND_PULSE_SPEED in _data(assignment)
+    given = _Given(profile, constants, assignment, samples)
 
-    def contradiction(reading: SmartStepProfile) -> str | None:
-        for each, window in windows:
-            text = _contradiction(reading, profile.trace_byte_order, constants, assignment, samples, each, window)
-            if text:
-                return text
-        return None
-
-    everything = _readings(profile, assignment)
-    readings = [each for each in everything if possible is None or _words(each) in possible]
-    agreeing = [reading for reading in readings if contradiction(reading) is None]
-    against = contradiction(profile)
-    if against:
-        others = "; ".join(sorted({_name(reading, assignment) for reading in agreeing})) or "no layout that is known"
-        return Judgement((f"{against}; {others} agrees with the monitors",), contradicted=_varied(everything))
-    assumed = _columns(profile, profile.trace_byte_order, constants, assignment, samples)
-    different = [
-        reading
-        for reading in agreeing
-        if reading != profile
-        and not _alike(_columns(reading, profile.trace_byte_order, constants, assignment, samples), assumed)
-    ]
-    problems = _wrapped(profile, assignment, assumed)
-    if different:
-        others = "; ".join(sorted({_name(reading, assignment) for reading in different}))
-        problems.append(
-            f"not verified: words are taken as {_name(profile, assignment)}, and the monitors allow {others} as well"
+    def shown_by(reading: Reading) -> Reading:
+        """Return a reading as far as this trace can tell it from others."""
+        if geared:
+            return reading
+        return replace(
+            reading,
+            command_pulse_gear=assumed.command_pulse_gear,
+            encoder_counts_per_rev=assumed.encoder_counts_per_rev,
         )
-    enough = len(windows) >= FEWEST_AGREEING
-    left = frozenset(map(_words, agreeing)) if enough else possible
-    verified = _varied(everything) - _varied(agreeing if enough else readings)
-    return Judgement(tuple(problems), verified=verified, possible=left)
+
+    distinct = list(dict.fromkeys(map(shown_by, candidates)))
+    agreeing = [each for each in distinct if given.contradiction(each, windows) is None]
+    against = given.contradiction(assumed, windows)
+    if against:
+        others = "; ".join(sorted({each.named(geared=geared) for each in agreeing})) or "no layout that is known"
+        contradicted = frozenset(
+            key for key in _varied(distinct) if all(getattr(each, key) != getattr(assumed, key) for each in agreeing)
+        )
+        left = frozenset(each for each in candidates if shown_by(each) in agreeing)
+        text = f"{against}; {others} agrees with the monitors"
+        return Judgement((text,), contradicted=contradicted, possible=left or None)
+    if not agreeing:
+        text = "the monitors of this trace and of those before it agree with no layout at once"
+        return Judgement((text,), possible=None)
+    expected = given.columns(assumed)
+    different = [each for each in agreeing if each != assumed and not _alike(given.columns(each), expected)]
+    problems = _wrapped(profile, assignment, expected)
+    if different:
+        others = "; ".join(sorted({each.named(geared=geared) for each in different}))
+        problems.append(
+            f"not verified: words are taken as {assumed.named(geared=geared)}, and the monitors allow {others} as well"
+        )
+    if len(windows) >= FEWEST_AGREEING:
+        candidates = [each for each in candidates if shown_by(each) in agreeing]
+        possible = frozenset(candidates)
+    verified = _varied(everything) - _varied(candidates)
+    return Judgement(tuple(problems), verified=verified, possible=possible)
 
 
 def trigger_problem(
@@ -234,73 +272,87 @@ def trigger_problem(
 # -- readings of a word ----------------------------------------------------------------------------------------------
 
 
-def _readings(profile: SmartStepProfile, assignment: Assignment) -> list[SmartStepProfile]:
-    """Return the profile with every combination of what is not verified about the words of a trace."""
-    layouts: list[TraceWordLayout] = [each for each in TraceWordLayout if each is not TraceWordLayout.RAW]
-    if profile.is_verified("trace_word_layout"):
-        layouts = [profile.trace_word_layout]
-    orders = [profile.trace_byte_order] if profile.is_verified("trace_byte_order") else list(ByteOrder)
-    gears, counts = [profile.command_pulse_gear], [profile.encoder_counts_per_rev]
-    if DataObject.COMMAND_PULSE_SPEED in _data(assignment):
-        if not profile.is_verified("command_pulse_gear"):
-            gears = list(CommandPulseGear)
-        if not profile.is_verified("encoder_counts_per_rev"):
-            counts = sorted({max(1, round(counts[0] * factor)) for factor in (0.25, 0.5, 1, 2, 4)})
-    return [
-        replace(
-            profile,
-            trace_word_layout=layout,
-            trace_byte_order=order,
-            command_pulse_gear=gear,
-            encoder_counts_per_rev=count,
-        )
-        for layout, order, gear, count in product(layouts, orders, gears, counts)
+def reading_of(profile: SmartStepProfile) -> Reading:
+    """Return the reading that a profile assumes."""
+    return Reading(*(getattr(profile, key) for key in READING))
+
+
+def readings(profile: SmartStepProfile) -> list[Reading]:
+    """Return every combination of what is not verified about the words of a trace."""
+    counts = sorted({max(1, round(profile.encoder_counts_per_rev * factor)) for factor in (0.25, 0.5, 1, 2, 4)})
+    choices: tuple[Sequence[object], ...] = (
+        [each for each in TraceWordLayout if each is not TraceWordLayout.RAW],
+        list(ByteOrder),
+        list(CommandPulseGear),
+        counts,
+    )
+    left = [
+        [getattr(profile, key)] if profile.is_verified(key) else choice
+        for key, choice in zip(READING, choices, strict=True)
     ]
-
-
-def _words(reading: SmartStepProfile) -> Words:
-    return reading.trace_word_layout, reading.trace_byte_order
+    return [Reading(*values) for values in product(*left)]
 
 
 def _data(assignment: Assignment) -> tuple[DataObject, ...]:
     return tuple(DATA[name] for name in assignment.channels if name in DATA)
 
 
-def _varied(readings: Sequence[SmartStepProfile]) -> frozenset[str]:
+def _varied(some: Sequence[Reading]) -> frozenset[str]:
     """Return the assumptions in which readings differ."""
-    keys = ("trace_word_layout", "trace_byte_order", "command_pulse_gear", "encoder_counts_per_rev")
-    return frozenset(key for key in keys if len({getattr(reading, key) for reading in readings}) > 1)
+    return frozenset(key for key in READING if len({getattr(reading, key) for reading in some}) > 1)
 
 
-def _name(reading: SmartStepProfile, assignment: Assignment) -> str:
-    name = f"{reading.trace_word_layout.value}, {reading.trace_byte_order.value} byte first"
-    if DataObject.COMMAND_PULSE_SPEED in _data(assignment):
-        name += f", gear {reading.command_pulse_gear.value}, {reading.encoder_counts_per_rev} counts a revolution"
-    return name
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """A trace, to be read in any way."""
 
+    profile: SmartStepProfile
+    constants: TraceConstants
+    assignment: Assignment
+    samples: Samples
 
-def _decoder(
-    reading: SmartStepProfile, order: ByteOrder, constants: TraceConstants, channel: str
-) -> Callable[[int], float]:
-    """Return what a word, split in the byte order `order`, means for a channel."""
-    swapped = reading.trace_byte_order is not order
-    factor = scale(reading, constants, DATA[channel]) if channel in DATA else None
+    def columns(self, reading: Reading) -> list[list[float]]:
+        """Return the values of each channel."""
+        columns = []
+        for name in self.assignment.channels:
+            decode = self._decoder(reading, name)
+            columns.append([decode(word) for word in self.samples.words[self.assignment.memory(name)]])
+        return columns
 
-    def decode(word: int) -> float:
-        point = decode_word((word >> 8 | word << 8) & 0xFFFF if swapped else word, reading.trace_word_layout)
-        return float(bool(point.io)) if factor is None else point.value * factor
+    def contradiction(self, reading: Reading, windows: Sequence[tuple[Shown, range]]) -> str | None:
+        """Return how a reading of the words cannot be, by what monitors have shown; None when it can."""
+        texts = (self._against(reading, shown, window) for shown, window in windows)
+        return next((text for text in texts if text), None)
 
-    return decode
+    def _decoder(self, reading: Reading, channel: str) -> Callable[[int], float]:
+        """Return what a word, split in the byte order of the profile, means for a channel."""
+        swapped = reading.trace_byte_order is not self.profile.trace_byte_order
+        factor = self._scale(reading, channel) if channel in DATA else None
 
+        def decode(word: int) -> float:
+            point = decode_word((word >> 8 | word << 8) & 0xFFFF if swapped else word, reading.trace_word_layout)
+            return float(bool(point.io)) if factor is None else point.value * factor
 
-def _columns(
-    reading: SmartStepProfile, order: ByteOrder, constants: TraceConstants, assignment: Assignment, samples: Samples
-) -> list[list[float]]:
-    columns = []
-    for name in assignment.channels:
-        decode = _decoder(reading, order, constants, name)
-        columns.append([decode(word) for word in samples.words[assignment.memory(name)]])
-    return columns
+        return decode
+
+    def _scale(self, reading: Reading, channel: str) -> float:
+        return scale(reading.applied_to(self.profile), self.constants, DATA[channel])
+
+    def _against(self, reading: Reading, shown: Shown, window: range) -> str | None:
+        comparison = shown.comparison
+        decode = self._decoder(reading, comparison.channel)
+        words = self.samples.words[self.assignment.memory(comparison.channel)]
+        values = [decode(words[place]) for place in window]
+        where = f"monitor {comparison.monitor.address:04X}H shows {comparison.channel} at {shown.value:g}"
+        taken = f"while the words, taken as {reading.trace_word_layout.value}, say"
+        if comparison.bit is not None:
+            return None if shown.value in values else f"{where} {taken} {values[0]:g}"
+        # A monitor has whole units; a value may have passed between two samples, and one layout loses its lowest bit.
+        slack = 1.0 + 2 * self._scale(reading, comparison.channel)
+        slack += max((abs(after - before) for before, after in pairwise(values)), default=0.0)
+        if min(values) - slack <= shown.value <= max(values) + slack:
+            return None
+        return f"{where} {taken} {min(values):g} to {max(values):g}"
 
 
 def _alike(columns: list[list[float]], others: list[list[float]]) -> bool:
@@ -308,35 +360,6 @@ def _alike(columns: list[list[float]], others: list[list[float]]) -> bool:
         math.isclose(value, other, rel_tol=1e-9, abs_tol=1e-9)
         for column, known in zip(columns, others, strict=True)
         for value, other in zip(column, known, strict=True)
-    )
-
-
-def _contradiction(
-    reading: SmartStepProfile,
-    order: ByteOrder,
-    constants: TraceConstants,
-    assignment: Assignment,
-    samples: Samples,
-    shown: Shown,
-    window: range,
-) -> str | None:
-    """Return how a reading of the words cannot be, by what a monitor has shown among these samples."""
-    comparison = shown.comparison
-    decode = _decoder(reading, order, constants, comparison.channel)
-    words = samples.words[assignment.memory(comparison.channel)]
-    values = [decode(words[place]) for place in window]
-    where = f"monitor {comparison.monitor.address:04X}H shows {comparison.channel} at {shown.value:g}"
-    if comparison.bit is not None:
-        if shown.value in values:
-            return None
-        return f"{where} while the words, taken as {reading.trace_word_layout.value}, say {values[0]:g}"
-    # A monitor has whole units; a value may have passed between two samples, and one layout loses its lowest bit.
-    slack = 1.0 + 2 * scale(reading, constants, DATA[comparison.channel])
-    slack += max((abs(after - before) for before, after in pairwise(values)), default=0.0)
-    if min(values) - slack <= shown.value <= max(values) + slack:
-        return None
-    return (
-        f"{where} while the words, taken as {reading.trace_word_layout.value}, say {min(values):g} to {max(values):g}"
     )
 
 

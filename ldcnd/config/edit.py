@@ -1,0 +1,116 @@
+"""Writing settings of one axis into a configuration, its comments and its order left as they are."""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from ldcnd.config.rig import load_config
+from ldcnd.errors import ConfigError
+
+AXIS = "bus.axis"
+Literals = Mapping[str, str]
+"""Settings of a table as TOML writes their values."""
+
+
+def set_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> None:
+    """Set values of an axis; those that are there already are replaced.
+
+    Args:
+        config: the file.
+        axis: its name.
+        tables: by their names below the axis, such as `smartstep.trace`.
+
+    Raises:
+        ConfigError: the file is laid out so that the tables have to be put in by hand, or would be none any more.
+    """
+    lines = config.read_text(encoding="utf-8").splitlines()
+    draft = config.with_suffix(".new")
+    try:
+        for place in _places(lines, axis):
+            end = _end_of_axis(lines, place)
+            section = lines[place:end]
+            for name, values in tables.items():
+                _set(section, name, values)
+            draft.write_text("\n".join([*lines[:place], *section, *lines[end:]]) + "\n", encoding="utf-8")
+            with suppress(ConfigError):
+                if _holds(draft, axis, tables):
+                    draft.replace(config)
+                    return
+    finally:
+        draft.unlink(missing_ok=True)
+    by_hand = "\n".join(_table(name, values) for name, values in tables.items())
+    raise ConfigError(f"{config}: put this behind axis {axis} by hand:\n{by_hand}")
+
+
+def _table(name: str, values: Literals) -> str:
+    return "\n".join([f"[{AXIS}.{name}]", *(f"{key} = {literal}" for key, literal in values.items())])
+
+
+def _places(lines: list[str], axis: str) -> list[int]:
+    return [n for n, line in enumerate(lines) if re.match(rf"\s*name\s*=\s*[\"']{re.escape(axis)}[\"']", line)]
+
+
+def _end_of_axis(lines: list[str], place: int) -> int:
+    """Return where the next table of an array begins; empty lines and remarks before it are its own."""
+    end = next((n for n in range(place, len(lines)) if lines[n].lstrip().startswith("[[")), len(lines))
+    while end > place and (not lines[end - 1].strip() or lines[end - 1].lstrip().startswith("#")):
+        end -= 1
+    return end
+
+
+def _set(section: list[str], name: str, values: Literals) -> None:
+    """Set the values of a table among the lines of an axis: in its own lines, in one of its parent, or at the end."""
+    header = f"[{AXIS}.{name}]"
+    if header in [line.strip() for line in section]:
+        _replace(section, [line.strip() for line in section].index(header) + 1, values)
+        return
+    parent, _, leaf = name.rpartition(".")
+    inline = next((n for n, line in enumerate(section) if re.match(rf"\s*{re.escape(leaf)}\s*=\s*\{{", line)), None)
+    if inline is not None and f"[{AXIS}.{parent}]" in [line.strip() for line in section[:inline]]:
+        held = {key: _literal(value) for key, value in tomllib.loads(section[inline])[leaf].items()}
+        section[inline] = f"{leaf} = {_inline({**held, **values})}"
+        return
+    section += ["", *_table(name, values).splitlines()]
+
+
+def _replace(section: list[str], start: int, values: Literals) -> None:
+    for key, literal in values.items():
+        end = next((n for n in range(start, len(section)) if section[n].lstrip().startswith("[")), len(section))
+        known = [n for n in range(start, end) if re.match(rf"\s*{re.escape(key)}\s*=", section[n])]
+        if known:
+            remark = re.search(r"\s+#[^\"']*$", section[known[0]])
+            section[known[0]] = f"{key} = {literal}{remark.group() if remark else ''}"
+        else:
+            section.insert(start, f"{key} = {literal}")
+
+
+def _literal(value: object) -> str:
+    match value:
+        case bool():
+            return str(value).lower()
+        case dict():
+            return _inline({key: _literal(each) for key, each in value.items()})
+        case str():
+            return f'"{value}"'
+        case _:
+            return str(value)
+
+
+def _inline(values: Literals) -> str:
+    return f"{{ {', '.join(f'{key} = {literal}' for key, literal in values.items())} }}"
+
+
+def _holds(draft: Path, axis: str, tables: Mapping[str, Literals]) -> bool:
+    """Tell whether a configuration is one, and says these values of the axis."""
+    rig = load_config(draft)
+    (found,) = [each for bus in rig.bus for each in bus.axis if each.name == axis]
+    for name, values in tables.items():
+        table: object = found.model_dump(mode="json")
+        for part in name.split("."):
+            table = table.get(part) if isinstance(table, dict) else None
+        wanted = tomllib.loads("\n".join(f"{key} = {literal}" for key, literal in values.items()))
+        if not isinstance(table, dict) or any(table.get(key) != value for key, value in wanted.items()):
+            return False
+    return True
