@@ -4,17 +4,13 @@ import asyncio
 
 import pytest
 
-from ldcnd.cli.doctor import trigger_table, with_trigger_map
-from ldcnd.config.rig import load_config
 from ldcnd.drivers.smartstep.monitors import InputSignal
 from ldcnd.drivers.smartstep.profiles import TriggerMap
 from ldcnd.drivers.smartstep.trigger_search import Stimulus, find_trigger_map
-from ldcnd.errors import ConfigError, DriveFault
+from ldcnd.errors import DriveFault
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
-from tests.support.process import ROOT
 from tests.support.smartstep_line import simulated, smartstep_line
 
-MIXED = ROOT / "config" / "mixed.toml"
 MAPS = [
     BENCH_TRIGGER_MAP,
     TriggerMap(trace1=0x0000, trace2=0x0010, io=0x0020, rising=0x4000, falling=0x8000),
@@ -61,18 +57,3 @@ async def test_a_person_who_does_nothing_finds_nothing():
             await find_trigger_map(line.axis("u1").words, nothing)
 
     assert unit.drive.mode == 0
-
-
-def test_the_bits_are_written_into_the_configuration_and_nothing_else(tmp_path):
-    config = tmp_path / "mixed.toml"
-    before = MIXED.read_text()
-    config.write_text(before)
-
-    with_trigger_map(config, "feed", MAPS[1])
-
-    axes = {axis.name: axis for bus in load_config(config).bus for axis in bus.axis}
-    assert axes["feed"].smartstep.trace.trigger_map.model_dump()["rising"] == 0x4000
-    assert axes["spool"].smartstep.trace.trigger_map is None
-    assert config.read_text().replace("\n" + trigger_table(MAPS[1]) + "\n", "") == before
-    with pytest.raises(ConfigError, match="by hand"):
-        with_trigger_map(config, "feed", MAPS[0])

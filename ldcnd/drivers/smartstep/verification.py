@@ -13,7 +13,7 @@ from enum import StrEnum
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA
-from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES, string_reference
+from ldcnd.drivers.smartstep.commands import AGREEING_REPLIES, LONGEST_STRING_BYTES, string_reference
 from ldcnd.drivers.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
 from ldcnd.drivers.smartstep.trace import SmartStepTracer
 from ldcnd.drivers.smartstep.trace_check import Reading, readings
@@ -27,13 +27,14 @@ ATTEMPTS = 3
 """Traces for one question; each leaves fewer readings."""
 SHORTEST_STRING_BYTES = 4
 WORDS = ("trace_word_layout", "trace_byte_order")
-GEAR = ("command_pulse_gear", "encoder_counts_per_rev")
+GEAR = "command_pulse_gear"
 Setting = str | int
 
 
 class Stimulus(StrEnum):
     """What a person is to do while a trace is recorded."""
 
+    REST = "leave the drive alone, RUN off and RESET not pressed"
     TURN = "turn the shaft by hand, RUN off, to and fro, until the next message"
     PULSES = "let command pulses come in, at a constant speed, until the next message"
 
@@ -75,26 +76,25 @@ async def verify_traces(bus: Bus, words: Words, profile: SmartStepProfile, act: 
     )
     tracer = SmartStepTracer(bus, words, profile)
     checksum = StringChecksum.AUTO
-    channels = ("speed_feedback", "position_deviation", "reset", "bkir")
-    for _ in range(ATTEMPTS):
-        await act(Stimulus.TURN)
-        checksum = await _trace(tracer, channels)
+    # At rest a signal that is high shows its bit and the byte order; only a value that is not zero shows its scale.
+    for stimulus in (Stimulus.REST, *[Stimulus.TURN] * ATTEMPTS):
+        await act(stimulus)
+        checksum = await _trace(tracer, ("speed_feedback", "position_deviation", "run", "reset"))
         if _is_single(tracer, profile, WORDS):
             break
     yield (
         Verified("string_checksum", None, "the traces leave a choice: every variant is taken")
         if checksum is StringChecksum.AUTO
-        else Verified("string_checksum", checksum.value, f"{checksum.value}, by {ATTEMPTS} replies or more")
+        else Verified("string_checksum", checksum.value, f"{checksum.value}, by {AGREEING_REPLIES} replies or more")
     )
     for key in WORDS:
         yield _of(tracer, profile, key, "a value that is not zero would tell them apart: turn the shaft faster")
     for _ in range(ATTEMPTS):
         await act(Stimulus.PULSES)
         await _trace(tracer, ("command_pulse_speed", "reset"))
-        if _is_single(tracer, profile, GEAR):
+        if _is_single(tracer, profile, (GEAR,)):
             break
-    for key in GEAR:
-        yield _of(tracer, profile, key, "pulses at a gear Pn202/Pn203 other than 1/1 would tell them apart")
+    yield _of(tracer, profile, GEAR, "pulses at a gear Pn202/Pn203 other than 1/1 would tell them apart")
 
 
 async def _string_settings(words: Words, profile: SmartStepProfile) -> Mapping[str, Setting]:
@@ -135,9 +135,13 @@ async def _trace(tracer: SmartStepTracer, channels: tuple[str, ...]) -> StringCh
 
 
 def _left(tracer: SmartStepTracer, profile: SmartStepProfile, key: str) -> list[Setting]:
-    """Return the settings of an assumption that the traces have left."""
+    """Return the settings of an assumption that the traces have left.
+
+    Only the quotient of gear and encoder counts shows, so the gear is that with the counts of the profile.
+    """
     possible: list[Reading] = readings(profile) if tracer.possible is None else list(tracer.possible)
-    return sorted({getattr(each, key) for each in possible})
+    counts = profile.encoder_counts_per_rev
+    return sorted({getattr(each, key) for each in possible if each.encoder_counts_per_rev == counts})
 
 
 def _is_single(tracer: SmartStepTracer, profile: SmartStepProfile, keys: tuple[str, ...]) -> bool:

@@ -1,0 +1,75 @@
+"""Settings of one axis are written into a configuration; nothing else of the file changes."""
+
+import pytest
+
+from ldcnd.config.edit import set_for_axis
+from ldcnd.config.rig import load_config
+from ldcnd.errors import ConfigError
+from tests.support.process import ROOT
+
+MIXED = (ROOT / "config" / "mixed.toml").read_text()
+BITS = {"trace1": "0x0000", "trace2": "0x0010", "io": "0x0020", "rising": "0x4000", "falling": "0x8000"}
+LAYOUT = {
+    "smartstep.trace": {"word_layout": '"lsb-io-shift"'},
+    "smartstep.verified": {"trace_word_layout": '"verified"'},
+}
+HEAD = MIXED[: MIXED.index("[bus.axis.smartstep]")]
+TAIL = MIXED[MIXED.index('[[bus.axis]]\nname = "spool"') :]
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "mixed.toml"
+    path.write_text(MIXED)
+    return path
+
+
+def smartstep_of(config, axis):
+    return next(each for bus in load_config(config).bus for each in bus.axis if each.name == axis).smartstep
+
+
+def test_tables_that_are_missing_come_behind_the_axis(config):
+    set_for_axis(config, "feed", {"smartstep.trace.trigger_map": BITS})
+
+    added = "\n[bus.axis.smartstep.trace.trigger_map]\n" + "".join(f"{key} = {text}\n" for key, text in BITS.items())
+    assert smartstep_of(config, "feed").trace.trigger_map.rising == 0x4000
+    assert smartstep_of(config, "spool").trace.trigger_map is None
+    assert config.read_text().replace(added, "") == MIXED
+    assert list(config.parent.iterdir()) == [config]
+
+
+INLINE = """[bus.axis.smartstep]
+trace = { word_layout = "msb-io", chunk_bytes = 100 }
+verified = { wiring = "verified" }
+"""
+TABLES = """[bus.axis.smartstep.trace]
+word_layout = "msb-io" # as on the bench
+chunk_bytes = 100
+"""
+
+
+@pytest.mark.parametrize("own", ["[bus.axis.smartstep]\n", INLINE, TABLES], ids=["none", "inline", "tables"])
+def test_values_that_are_there_are_replaced_and_others_kept(config, own):
+    config.write_text(HEAD + own + "\n# the other drive\n" + TAIL)
+
+    set_for_axis(config, "feed", LAYOUT)
+    set_for_axis(config, "feed", LAYOUT)
+
+    unit = smartstep_of(config, "feed")
+    assert unit.trace.word_layout == "lsb-io-shift"
+    assert unit.trace.chunk_bytes == (100 if "chunk_bytes" in own else 200)
+    assert unit.verified["trace_word_layout"] == "verified"
+    assert ("wiring" in unit.verified) is ("wiring" in own)
+    assert ("# as on the bench" in config.read_text()) is ("# as on the bench" in own)
+    assert config.read_text().endswith("\n# the other drive\n" + TAIL)
+
+
+def test_a_file_that_is_laid_out_otherwise_is_left_alone(config):
+    text = HEAD + "smartstep = { eeprom_budget = 9000 }\n" + TAIL
+    config.write_text(text)
+
+    with pytest.raises(ConfigError, match="by hand"):
+        set_for_axis(config, "feed", LAYOUT)
+
+    assert config.read_text() == text
+    assert list(config.parent.iterdir()) == [config]
