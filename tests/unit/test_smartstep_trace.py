@@ -417,3 +417,11 @@ async def test_a_host_trigger_that_does_not_come_leaves_nothing_armed():
             await armed.record(ignore)
 
     assert unit.drive.mode == 0
+
+
+@pytest.mark.parametrize("cyclec_us", [62, 125, 400])
+async def test_the_fastest_interval_is_two_time_units_of_the_drive(cyclec_us):
+    async with smartstep_line([simulated(1, SimulatedVariant(cyclec_us=cyclec_us))]) as line:
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), interval_s="fastest"))
+
+    assert armed.granted.interval_s == pytest.approx(2 * cyclec_us * 1e-6)

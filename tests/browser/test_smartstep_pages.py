@@ -1,0 +1,108 @@
+"""The console's pages of a drive with parameters: digits, wear, alarms, signals, tuning by parameters."""
+
+import re
+
+import pytest
+
+from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
+from ldcnd.model.parameters import ReadAllParameters, ReadParameter
+
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+expect = playwright.expect
+
+pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+
+FAULTS_OF_A_DRIVE = """async ({ reset }) => {
+  const { html, render } = await import('/static/html.js');
+  const { FaultPanel } = await import('/static/pages/axis_faults.js');
+  const fault = { code: "alarm_0010", text: "A.10: Overcurrent", since: 0, source: "drive", stops: true };
+  const axis = { name: "feed", can: (verb) => verb !== "reset" || reset, faults: [fault], samples: {}, rig: {} };
+  const place = document.createElement("div");
+  render(html`<${FaultPanel} axis=${axis} />`, place);
+  return { text: place.innerText || place.textContent, buttons: place.querySelectorAll("button").length };
+}"""
+
+
+async def test_a_reset_is_offered_only_where_the_drive_has_one(house):
+    async with house.desk() as desk:
+        await desk.open("rig")
+        without = await desk.page.evaluate(FAULTS_OF_A_DRIVE, {"reset": False})
+        resettable = await desk.page.evaluate(FAULTS_OF_A_DRIVE, {"reset": True})
+
+    assert (without["buttons"], resettable["buttons"]) == (0, 1)
+    assert "reset at the drive, not over its line" in without["text"]
+    assert "stops the axis" in without["text"]
+    assert "motor off" not in without["text"]
+
+
+async def test_a_signal_is_shown_by_its_active_level(house):
+    async with house.desk() as desk:
+        await desk.open("axis/mixed/feed")
+
+        await expect(desk.panel("Now")).to_contain_text("RUN on (high: RESET)")
+
+
+async def test_parameters_are_shown_with_factory_values_as_hints_and_written_digit_by_digit(house):
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Take control").click()
+        await desk.button("Read all").click()
+        await expect(desk.button("Read all again")).to_be_visible()
+        table = desk.page.get_by_role("region", name="Parameters")
+        heads = await table.get_by_role("columnheader").all_inner_texts()
+        row = table.get_by_role("row", name="Pn505")
+        cells = await row.get_by_role("cell").all_inner_texts()
+
+        assert cells[heads.index("Factory (a hint)") - 1] == "1024"
+        change = desk.panel("Change one")
+        await change.get_by_label("Parameter").select_option("Pn001")
+        await expect(change.get_by_label("Pn001.0")).to_contain_text("2: coasting")
+        await change.get_by_label("Pn001.0").select_option("2")
+        await expect(change.get_by_label("New value")).to_have_value("0002H")
+        await change.get_by_label("New value").fill("0x0102")
+        await expect(change.get_by_label("Pn001.2")).to_have_value("1")
+        await change.get_by_label("Memory").select_option("eeprom")
+        await desk.button("Write Pn001").click()
+
+        await expect(table.get_by_role("row", name="Pn001")).to_contain_text("0102H")
+        reading = await house.mixed.rig.command("spool", ReadParameter(parameter="Pn001"), 60)
+        assert reading.value.stored == 0x0102
+
+        wear = desk.panel("EEPROM writes")
+        await expect(wear).to_contain_text("Only for a drive that was replaced.")
+        await wear.get_by_label("The drive was replaced by a new one").check()
+        await desk.button("Count anew").click()
+        await expect(wear).to_contain_text("0 writes counted for this drive.")
+        dump = await house.mixed.rig.command("spool", ReadAllParameters(), 60)
+        assert {value.eeprom_total for value in dump.values} == {0}
+
+
+async def test_the_alarm_history_is_numbered_as_in_the_manual(house):
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/feed")
+        await desk.button("Read alarms").click()
+        rows = desk.page.get_by_role("region", name="Alarms", exact=True).get_by_role("rowheader")
+        await expect(rows).to_have_count(1 + HISTORY_LENGTH)
+
+        assert await rows.all_inner_texts() == ["now", *map(str, range(HISTORY_LENGTH))]
+
+
+async def test_a_drive_is_tuned_by_its_parameters_and_its_recorder(house):
+    async with house.desk() as desk:
+        await desk.open("tuning/mixed/feed")
+        await desk.button("Take control").click()
+        gain = desk.page.get_by_label(re.compile("^Pn102 "))
+        await expect(gain).not_to_have_value("")
+        await gain.fill("47")
+        await desk.panel("Gains").get_by_role("button", name="Write").nth(2).click()
+        await expect(desk.panel("Gains")).to_contain_text(re.compile(r"\d+ is stored"))
+        reading = await house.mixed.rig.command("feed", ReadParameter(parameter="Pn102"), 60)
+        assert reading.value.active == 47
+
+        await desk.page.get_by_label("Duration").fill("1")
+        await desk.button("Record").click()
+
+        row = desk.panel("Runs").get_by_role("row", name=re.compile("^1 "))
+        await expect(row).to_contain_text("Pn102 47")
+        top_speed = float((await row.get_by_role("cell").nth(2).inner_text()))
+        assert top_speed == pytest.approx(6.0, abs=1.0)  # 200 command units a second, geared by 4, of 8000 counts
