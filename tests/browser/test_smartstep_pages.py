@@ -104,5 +104,5 @@ async def test_a_drive_is_tuned_by_its_parameters_and_its_recorder(house):
 
         row = desk.panel("Runs").get_by_role("row", name=re.compile("^1 "))
         await expect(row).to_contain_text("Pn102 47")
-        top_speed = float((await row.get_by_role("cell").nth(2).inner_text()))
+        top_speed = float(await row.get_by_role("cell").nth(2).inner_text())
         assert top_speed == pytest.approx(6.0, abs=1.0)  # 200 command units a second, geared by 4, of 8000 counts
