@@ -8,7 +8,7 @@ import pytest
 from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
 from ldcnd.drivers.smartstep.monitors import ALARMS, MONITORS, AlarmKind
 from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, Fact, Parameter
+from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, UNIT_DIGIT, Fact, Parameter
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Confidence, SmartStepProfile
 from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject
 
@@ -56,6 +56,21 @@ def test_test_that_the_page_names_exists(name):
 @pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda parameter: parameter.label)
 def test_page_lists_the_parameter_with_all_that_is_known(parameter):
     assert has_row(*parameter_row(parameter))
+
+
+DIGITS = [(parameter, digit) for parameter in PARAMETERS for digit in parameter.digits]
+
+
+@pytest.mark.parametrize(("parameter", "digit"), DIGITS, ids=lambda each: getattr(each, "label", None) or each.place)
+def test_page_lists_the_digit_with_its_mark(parameter, digit):
+    values = ", ".join(f"{value:X} {text}" for value, text in digit.values.items())
+    mark = digit.confidence
+
+    assert any(
+        row[:2] == [f"{parameter.label}.{digit.place}", digit.title] and row[3] == mark.value and values in row[2]
+        for row in ROWS
+    )
+    assert (mark is Confidence.STATED) is ((parameter, digit.place) == (PN000, UNIT_DIGIT))
 
 
 @pytest.mark.parametrize("monitor", MONITORS, ids=lambda monitor: f"{monitor.address:04X}")
