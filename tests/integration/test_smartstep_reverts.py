@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutants.__main__ import copied
 from tests.support.process import ROOT
 
 S = "ldcnd/drivers/smartstep/"
@@ -252,7 +251,9 @@ def test_every_finding_is_put_back_by_the_test_that_the_reference_page_names():
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory):
     """A copy of the project in which code may be changed."""
-    copy = copied(tmp_path_factory.mktemp("reverts"))
+    copy = tmp_path_factory.mktemp("reverts") / "project"
+    left_out = shutil.ignore_patterns(".git", ".venv", "build", "dist", "__pycache__", ".*_cache", ".hypothesis")
+    shutil.copytree(ROOT, copy, ignore=left_out)
     yield copy
     shutil.rmtree(copy)
 

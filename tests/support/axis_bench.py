@@ -188,7 +188,7 @@ class AxisBench:
             Clock(lambda: round(asyncio.get_running_loop().time() * 1e9)),
             lambda: next(self._ids),
             self._ended,
-            lambda _axis, verb, status, reason: self.notes.append((verb, status, reason)),
+            lambda _axis, verb, status, reason, _code: self.notes.append((verb, status, reason)),
         )
         self.tracker = self.axis.tracker
         self.axis.connected(referenced=True)
