@@ -5,17 +5,21 @@ import json
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode
+from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_AREA, OperatingMode, Register, TraceRegister
+from ldcnd.drivers.smartstep.packet import Function, decode_command
 from ldcnd.drivers.smartstep.parameters import PN102
-from ldcnd.drivers.smartstep.profiles import SmartStepProfile
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile, TriggerWordSource
 from ldcnd.errors import BusError, DriveFault, RequestRefused
 from ldcnd.model.parameters import CounterName, Memory, WriteParameter
-from ldcnd.model.traces import TakeTrace
+from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
+from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import LosingUnit, executes_in_a_fresh_mode_only, smartstep_line
 
 WITHIN_S = 30.0
-SHORT = SmartStepProfile(trace_chunk_bytes=1000)
+SHORT = SmartStepProfile(
+    trace_chunk_bytes=1000, trigger_word=TriggerWordSource.CONFIGURED, trigger_map=BENCH_TRIGGER_MAP
+)
 LOSSES = [("request",), ("reply",), ("request", "reply"), ("reply", "request", "reply")]
 
 
@@ -39,9 +43,59 @@ async def write(axis, _unit):
     return (await axis.parameters.write(request)).value.stored
 
 
-STEPS = {trace: 31, clear: 19, write: 6}
+async def triggered(axis, unit):
+    trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=100.0)
+    request = TakeTrace(
+        channels=("speed_feedback",), trigger=trigger, full_scale={"speed_feedback": 3000.0}, timeout_s=20
+    )
+    armed = await axis.tracer.arm(request)
+    unit.drive.set_run(asyncio.get_running_loop().time(), on=True)
+    unit.drive.set_pulse_rate(8000.0, asyncio.get_running_loop().time())
+    recorded = await armed.record(lambda _phase: None)
+    first = unit.drive.read(Register.TRGADR)
+    return list(recorded.raw[0][-first:] + recorded.raw[0][:-first]) if first else list(recorded.raw[0])
+
+
+async def try_out(axis, _unit):
+    return (await axis.parameters.write(WriteParameter(parameter="Pn102", value=77))).value.active
+
+
+STEPS = {trace: 31, clear: 19, write: 6, try_out: 6, triggered: 40}
 """At least as many commands as each takes without a loss; a step beyond the last one loses nothing."""
-CASES = [(work, step, losses) for work, steps in STEPS.items() for step in range(steps) for losses in LOSSES]
+CASES = [
+    pytest.param(
+        work,
+        step,
+        losses,
+        id=f"{work.__name__}-{step}-{'-'.join(losses)}",
+        marks=[pytest.mark.soak] if work is triggered and (step % 4 or losses is not LOSSES[-1]) else [],
+    )
+    for work, steps in STEPS.items()
+    for step in range(steps)
+    for losses in LOSSES
+]
+
+
+def kind_of(packet):
+    """Return what a command is, as far as its repeating matters."""
+    command = decode_command(packet)
+    if command.function is not Function.SETTING:
+        return command.function.name
+    if command.address in EEPROM_AREA:
+        return "EEPROM"
+    return "RAM" if command.address in RAM_AREA else f"{command.address:04X}H"
+
+
+async def test_every_command_of_the_manual_is_among_those_that_are_lost(tmp_path):
+    kinds = set()
+    for work in STEPS:
+        unit = LosingUnit(1, lambda _place, _packet: None)
+        async with smartstep_line([unit], profile=SHORT, ledger=tmp_path / "ledger.json") as line:
+            await work(line.axis("u1"), unit)
+        kinds |= set(map(kind_of, unit.commands))
+
+    settings = {f"{each.value:04X}H" for each in TraceRegister if each is not TraceRegister.MAXTRQC}
+    assert kinds == {"REFERENCE", "STRING_REFERENCE", "EEPROM", "RAM", "2000H", "2001H", *settings}
 
 
 @pytest.mark.parametrize("work", STEPS)
@@ -53,9 +107,7 @@ async def test_every_step_is_among_those_that_are_lost(work, tmp_path):
     assert len(unit.commands) <= STEPS[work]
 
 
-@pytest.mark.parametrize(
-    ("work", "step", "losses"), CASES, ids=[f"{work.__name__}-{step}-{'-'.join(lost)}" for work, step, lost in CASES]
-)
+@pytest.mark.parametrize(("work", "step", "losses"), CASES)
 async def test_after_any_loss_the_end_state_is_known_within_seconds(work, step, losses, tmp_path):
     unit = LosingUnit(1, loses(step, losses))
     unit.drive.motor.position = 2800.0
@@ -70,14 +122,17 @@ async def test_after_any_loss_the_end_state_is_known_within_seconds(work, step, 
         sent = [record.data for record in line.bus.wire_log.records() if record.event is WireEvent.SENT]
 
     assert unit.drive.mode is OperatingMode.NORMAL
+    assert unit.drive.read(Register.OSVELCC) == unit.variant.osvelcc
     assert executes_in_a_fresh_mode_only(sent)
     known = json.loads(path.read_text())["u1"]["Pn102"] if path.exists() else 0
     assert unit.drive.memory.writes[PN102.number] <= known <= unit.drive.memory.writes[PN102.number] + 1
     if error:
         assert error.message
-    elif work is trace:
+    elif work in {trace, triggered}:
         assert result == unit.drive.recorder.rings[0]
     elif work is clear:
         assert result == unit.drive.feedback_counter == 0
+    elif work is try_out:
+        assert result == unit.drive.memory.active(PN102) == 77
     else:
         assert result == unit.drive.memory.stored(PN102) == 77
