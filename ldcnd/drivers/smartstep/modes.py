@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 from dataclasses import dataclass
 
+from ldcnd.drivers.parameter_access import ClearedCounter
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import execute, read_monitor, set_operating_mode
 from ldcnd.drivers.smartstep.monitors import (
@@ -151,19 +152,6 @@ async def leave(words: Words) -> None:
 # -- counters --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Cleared:
-    """A counter after its clear.
-
-    Attributes:
-        value: what it counts now, signed.
-        remarks: what deserves attention.
-    """
-
-    value: int
-    remarks: tuple[str, ...] = ()
-
-
 async def read_counter(words: Words, counter: Counter) -> CounterValue:
     """Read a counter whose halves no latch holds together.
 
@@ -179,7 +167,7 @@ async def read_counter(words: Words, counter: Counter) -> CounterValue:
     return reading.value
 
 
-async def clear_counter(words: Words, counter: Counter) -> Cleared:
+async def clear_counter(words: Words, counter: Counter) -> ClearedCounter:
     """Clear a counter, and read it.
 
     Raises:
@@ -200,9 +188,9 @@ async def clear_counter(words: Words, counter: Counter) -> Cleared:
     value = (await read_counter(words, counter)).signed
     log.info("counter cleared", axis=words.axis, counter=counter.name.lower(), value=value)
     if value == 0:
-        return Cleared(value)
+        return ClearedCounter(value)
     remark = f"the counter reads {value} after its clear: pulses came in, or the shaft moved, since then"
-    return Cleared(value, (remark,))
+    return ClearedCounter(value, (remark,))
 
 
 async def _require_rest(words: Words, counter: Counter) -> None:

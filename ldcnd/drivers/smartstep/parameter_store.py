@@ -8,7 +8,6 @@ Source: manual 2.2, note on EEPROM; 3.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 from typing_extensions import override
 
@@ -87,15 +86,19 @@ class EepromRules:
     budget: int = DEFAULT_BUDGET
 
 
-class ParameterStore:
-    """The parameters of one drive; one call at a time."""
+COUNTERS = {CounterName.COMMAND: Counter.COMMAND, CounterName.FEEDBACK: Counter.FEEDBACK}
+
+
+class UnitParameters(ParameterAccess):
+    """See `ParameterAccess`."""
 
     def __init__(
         self,
         words: Words,
         profile: SmartStepProfile,
         rules: EepromRules,
-        others: Mapping[int, str] = MappingProxyType({}),
+        others: Mapping[int, str],
+        cleared: Callable[[], None],
     ) -> None:
         """Prepare the access; asks nothing.
 
@@ -104,17 +107,19 @@ class ParameterStore:
             profile: how it is taken to behave.
             rules: when EEPROM may be written.
             others: the other axes of its line, by unit number.
+            cleared: called when a counter was cleared.
         """
         self._words = words
         self._profile = profile
         self._rules = rules
         self._others = others
+        self._cleared = cleared
 
     @property
     def _axis(self) -> str:
         return self._words.axis
 
-    def find(self, text: str, *, unlisted: bool) -> Parameter:
+    def _find(self, text: str, *, unlisted: bool) -> Parameter:
         """Return the parameter with this number or name.
 
         Raises:
@@ -130,25 +135,52 @@ class ParameterStore:
             remedy="send list_parameters, or allow unlisted ones",
         )
 
-    async def read(self, parameter: Parameter) -> ParameterValue:
-        """Read both memories."""
+    @property
+    @override
+    def self_hearing(self) -> bool:
+        return self._words.self_hearing
+
+    @override
+    def known(self) -> tuple[ParameterInfo, ...]:
+        return tuple(map(parameter_info, PARAMETERS))
+
+    @override
+    async def read(self, parameter: str, *, unlisted: bool = False) -> ParameterValue:
+        return await self._read(self._find(parameter, unlisted=unlisted))
+
+    async def _read(self, parameter: Parameter) -> ParameterValue:
         active = await self._words.read(parameter.ram_address)
         return self._value(parameter, active, await self._words.read(parameter.eeprom_address))
 
+    @override
     async def read_all(self) -> tuple[ParameterValue, ...]:
-        """Read all listed parameters; a drive may lack some."""
         values = []
         for parameter in PARAMETERS:
             try:
-                values.append(await self.read(parameter))
+                values.append(await self._read(parameter))
             except AddressRefused:
                 log.info("parameter not there", axis=self._axis, parameter=parameter.label)
         return tuple(values)
 
+    @override
+    async def facts(self) -> DriveFacts:
+        words = self._words
+        return DriveFacts(
+            driver_type=await words.read(Register.DRIVER_TYPE),
+            software_version=await words.read(Register.SOFTWARE_VERSION),
+            unit=words.unit,
+            gain_switch=gain_switch(await words.read(Register.GAIN_SWITCH)),
+            switches=tuple(each.name or "" for each in function_switches(await words.read(Register.FUNCTION_SWITCHES))),
+        )
+
+    @override
+    async def plan(self, request: PlanParameters) -> PlannedParameters:
+        return plan_writes(request, await self.read_all(), await self.facts())
+
+    @override
     async def write(self, request: WriteParameter) -> Written:
-        """Write one parameter; see `ParameterAccess`."""
-        parameter = self.find(request.parameter, unlisted=request.unlisted)
-        before = await self.read(parameter)
+        parameter = self._find(request.parameter, unlisted=request.unlisted)
+        before = await self._read(parameter)
         await self._check_unit(parameter, before, request)
         if request.memory is Memory.RAM:
             if before.active == request.value:
@@ -159,7 +191,7 @@ class ParameterStore:
             if before.stored == request.value:
                 return Written(before, written=False, remarks=_pending(parameter, before))
             await self._write_eeprom(parameter, before.stored, request.value)
-        after = await self.read(parameter)
+        after = await self._read(parameter)
         held = after.active if request.memory is Memory.RAM else after.stored
         if held != request.value:
             raise DriveFault(
@@ -205,8 +237,8 @@ class ParameterStore:
             return held != old
         return True
 
-    async def restart_count(self, writes: int) -> int:
-        """Count writes of a replaced drive; see `ParameterAccess`."""
+    @override
+    async def restart_eeprom_count(self, writes: int) -> int:
         previous = await self._ledger().restart(self._axis, writes)
         log.warning("EEPROM count begun anew", axis=self._axis, previous=previous, total=writes)
         return previous
@@ -273,6 +305,40 @@ class ParameterStore:
             f"axis {self._axis}: {reason}", axis=self._axis, value=unit, remedy="choose a free unit number"
         )
 
+    # -- counters, alarms, monitors ------------------------------------------------------------------------------------
+
+    @override
+    async def clear_counter(self, counter: CounterName) -> ClearedCounter:
+        cleared = await clear_counter(self._words, COUNTERS[counter])
+        self._cleared()
+        return cleared
+
+    @override
+    async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
+        present = _entry(await self._words.read(Register.PRESENT_ALARM))
+        history = [_entry(await self._words.read(Register.ALARM_HISTORY + place)) for place in range(HISTORY_LENGTH)]
+        return present, tuple(history)
+
+    @override
+    async def monitors(self, names: tuple[MonitorName, ...]) -> tuple[MonitorValue, ...]:
+        values = []
+        for name in names or tuple(MonitorName):
+            try:
+                values.append(await self._monitor(name))
+            except AddressRefused:
+                log.info("monitor not there", axis=self._words.axis, monitor=name.value)
+        return tuple(values)
+
+    async def _monitor(self, name: MonitorName) -> MonitorValue:
+        if name in MONITOR_COUNTERS:
+            value = await read_counter(self._words, MONITOR_COUNTERS[name])
+            return counter_value(name, value.signed, resolved=value.quality is CounterQuality.RESOLVED)
+        return word_value(name, await self._words.read(WORDS[name].address), self._profile)
+
+    @override
+    def assumptions(self) -> tuple[AssumptionInfo, ...]:
+        return tuple(assumption_info(self._profile, each) for each in self._profile.assumptions)
+
     # -- results -----------------------------------------------------------------------------------------------------
 
     def _value(self, parameter: Parameter, active: int, stored: int) -> ParameterValue:
@@ -326,98 +392,6 @@ def _pending(parameter: Parameter, value: ParameterValue) -> tuple[str, ...]:
     if not value.differs:
         return ()
     return (f"{parameter.label}: {value.active} is in use, {value.stored} is stored: they meet at the next power-on",)
-
-
-COUNTERS = {CounterName.COMMAND: Counter.COMMAND, CounterName.FEEDBACK: Counter.FEEDBACK}
-
-
-class UnitParameters(ParameterAccess):
-    """See `ParameterAccess`."""
-
-    def __init__(
-        self,
-        words: Words,
-        profile: SmartStepProfile,
-        eeprom: EepromRules,
-        others: Mapping[int, str],
-        cleared: Callable[[], None],
-    ) -> None:
-        self._words = words
-        self._profile = profile
-        self._store = ParameterStore(words, profile, eeprom, others)
-        self._cleared = cleared
-
-    @property
-    @override
-    def self_hearing(self) -> bool:
-        return self._words.self_hearing
-
-    @override
-    def known(self) -> tuple[ParameterInfo, ...]:
-        return tuple(map(parameter_info, PARAMETERS))
-
-    @override
-    async def read(self, parameter: str, *, unlisted: bool = False) -> ParameterValue:
-        return await self._store.read(self._store.find(parameter, unlisted=unlisted))
-
-    @override
-    async def read_all(self) -> tuple[ParameterValue, ...]:
-        return await self._store.read_all()
-
-    @override
-    async def facts(self) -> DriveFacts:
-        words = self._words
-        return DriveFacts(
-            driver_type=await words.read(Register.DRIVER_TYPE),
-            software_version=await words.read(Register.SOFTWARE_VERSION),
-            unit=words.unit,
-            gain_switch=gain_switch(await words.read(Register.GAIN_SWITCH)),
-            switches=tuple(each.name or "" for each in function_switches(await words.read(Register.FUNCTION_SWITCHES))),
-        )
-
-    @override
-    async def plan(self, request: PlanParameters) -> PlannedParameters:
-        return plan_writes(request, await self._store.read_all(), await self.facts())
-
-    @override
-    async def write(self, request: WriteParameter) -> Written:
-        return await self._store.write(request)
-
-    @override
-    async def clear_counter(self, counter: CounterName) -> ClearedCounter:
-        cleared = await clear_counter(self._words, COUNTERS[counter])
-        self._cleared()
-        return ClearedCounter(cleared.value, cleared.remarks)
-
-    @override
-    async def restart_eeprom_count(self, writes: int) -> int:
-        return await self._store.restart_count(writes)
-
-    @override
-    async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:
-        present = _entry(await self._words.read(Register.PRESENT_ALARM))
-        history = [_entry(await self._words.read(Register.ALARM_HISTORY + place)) for place in range(HISTORY_LENGTH)]
-        return present, tuple(history)
-
-    @override
-    async def monitors(self, names: tuple[MonitorName, ...]) -> tuple[MonitorValue, ...]:
-        values = []
-        for name in names or tuple(MonitorName):
-            try:
-                values.append(await self._monitor(name))
-            except AddressRefused:
-                log.info("monitor not there", axis=self._words.axis, monitor=name.value)
-        return tuple(values)
-
-    async def _monitor(self, name: MonitorName) -> MonitorValue:
-        if name in MONITOR_COUNTERS:
-            value = await read_counter(self._words, MONITOR_COUNTERS[name])
-            return counter_value(name, value.signed, resolved=value.quality is CounterQuality.RESOLVED)
-        return word_value(name, await self._words.read(WORDS[name].address), self._profile)
-
-    @override
-    def assumptions(self) -> tuple[AssumptionInfo, ...]:
-        return tuple(assumption_info(self._profile, each) for each in self._profile.assumptions)
 
 
 def _entry(word: int) -> AlarmEntry:
