@@ -6,13 +6,14 @@ from dataclasses import replace
 from ldcnd.config.axis import AxisConfig
 from ldcnd.config.bus import BusConfig
 from ldcnd.drivers.smartstep.costs import BAUD, price_list, words_of
+from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
 from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.planning.cost import Cost, LineTiming, cost_of
 from ldcnd.planning.line_plan import Poll, Urgent
 
-ALARM_HISTORY_HZ = 1 / 60
-"""An alarm that came and went between two readings of the state is found within a minute."""
+ALARM_HISTORY_HZ = HISTORY_LENGTH / 60
+"""One word a turn: an alarm that came and went between two readings of the state is found within a minute."""
 
 
 def rates_hz(axis: AxisConfig) -> Mapping[Item, float]:

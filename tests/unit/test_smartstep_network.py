@@ -271,3 +271,24 @@ async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_on
     assert axis.words.self_hearing
     assert sent[-1].startswith(b"W20850A")
     assert {data[3:7] for data in sent} == {b"850A"}
+
+
+async def test_an_alarm_that_came_and_went_between_two_readings_is_told_within_a_minute():
+    drive, heard = simulated(1), Heard()
+    drive.drive.alarm_history[0] = 0x0010
+    async with smartstep_line([drive]) as line:
+        line.axis("u1")._rates_hz = {Basic.STATE: 1.0, Basic.VELOCITY: 1.0, Basic.ALARM_HISTORY: 10 / 60}
+        heard.listen(line, "u1")
+        await asyncio.sleep(10.0)
+        before = list(heard.alarms)
+        now_s = asyncio.get_running_loop().time()
+        drive.drive.provoke(0x0051, now_s)
+        drive.drive.press_reset(now_s)
+        drive.power_off(now_s)  # what comes while it is out of reach is told when it is back
+        await asyncio.sleep(15.0)
+        drive.drive.alarm_history.insert(0, 0x0070)
+        drive.power_on(asyncio.get_running_loop().time())
+        await asyncio.sleep(60.0)
+
+    assert before == []
+    assert [alarm.code for alarm in heard.alarms] == ["alarm_0051", "alarm_0070"]

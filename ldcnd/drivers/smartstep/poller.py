@@ -65,8 +65,9 @@ BASIC_WORDS: Mapping[Basic, tuple[int, ...]] = {
     Basic.IDENTITY: (Register.DRIVER_TYPE, Register.SOFTWARE_VERSION),
     Basic.STATE: (Register.PRESENT_ALARM, INPUT_SIGNALS.address, OUTPUT_SIGNALS.address),
     Basic.VELOCITY: (SPEED_FEEDBACK.address,),
-    Basic.ALARM_HISTORY: tuple(Register.ALARM_HISTORY + place for place in range(HISTORY_LENGTH)),
+    Basic.ALARM_HISTORY: (Register.ALARM_HISTORY,),  # and nine more, each in a turn of its own
 }
+HISTORY = tuple(Register.ALARM_HISTORY + place for place in range(HISTORY_LENGTH))
 PUBLISHED = {
     Basic.STATE: TelemetryItem.STATE,
     Basic.VELOCITY: TelemetryItem.VELOCITY,
@@ -154,6 +155,8 @@ class UnitPoller(Poller[int | Refusal]):
         self._address = 0
         self._low_timing: Timing | None = None
         self._one_word_only = False
+        self._history_place = 0
+        self._hurries_history = True
         self._misses = 0 if wires_checked else MISSES_BEFORE_BACKOFF
 
     def forget_position(self) -> None:
@@ -194,7 +197,7 @@ class UnitPoller(Poller[int | Refusal]):
             self._take_half(self._counter, reply, timing)
         elif self._item and isinstance(reply, int):
             if self._address == Register.PRESENT_ALARM and reply != self._words.get(self._address):
-                self._hasten(Basic.ALARM_HISTORY, timing.received_at_s)
+                self._read_history(timing.received_at_s)
             self._words[self._address] = reply
             if not self._left:
                 self._finish(self._item, timing)
@@ -247,6 +250,8 @@ class UnitPoller(Poller[int | Refusal]):
             self._counter = CounterReading(counter, last.raw if last else None)
         elif isinstance(item, MonitorName):
             self._left.append(WORDS[item].address)
+        elif item is Basic.ALARM_HISTORY:
+            self._left.append(HISTORY[self._history_place])
         else:
             self._left.extend(BASIC_WORDS[item])
 
@@ -262,11 +267,6 @@ class UnitPoller(Poller[int | Refusal]):
         if item is not Basic.STATE:
             self._due_s[item] = NEVER_S
 
-    def _hasten(self, item: Item, now_s: float) -> None:
-        """Have an item that is read at all read next."""
-        if self._due_s.get(item, NEVER_S) < NEVER_S:
-            self._due_s[item] = now_s
-
     def _back(self, now_s: float) -> None:
         """The drive answers again: it may have been off, or be another one."""
         self._words.clear()
@@ -275,6 +275,7 @@ class UnitPoller(Poller[int | Refusal]):
             if self._due_s[item] < NEVER_S:
                 self._due_s[item] = now_s
         self._due_s[Basic.IDENTITY] = now_s
+        self._read_history(now_s)
         # The word that it was asked for is never zero, so a drive that takes its own replies for commands shows now.
         self._one_word_only = True
         self._next_turn(now_s + LONGEST_BACKOFF_S)
@@ -299,8 +300,7 @@ class UnitPoller(Poller[int | Refusal]):
         elif item is Basic.IDENTITY:
             self._listeners.identified(*(self._words[address] for address in BASIC_WORDS[Basic.IDENTITY]))
         elif item is Basic.ALARM_HISTORY:
-            if self._listeners.history(tuple(self._words[address] for address in BASIC_WORDS[item])):
-                self._hasten(item, timing.received_at_s)
+            self._take_history(timing.received_at_s)
         else:
             self._tell(item, timing)
 
@@ -311,6 +311,27 @@ class UnitPoller(Poller[int | Refusal]):
         needed: Sequence[int] = (*BASIC_WORDS[Basic.STATE], *BASIC_WORDS[Basic.VELOCITY])
         if self._position and all(address in self._words for address in needed):
             self._listeners.read(UnitWords(self._words, self._position), PUBLISHED[item], timing)
+
+    # -- alarm history -----------------------------------------------------------------------------------------------
+
+    def _read_history(self, now_s: float) -> None:
+        """Read the history from its first word on, one turn after the other, if it is read at all."""
+        self._history_place = 0
+        self._hurries_history = True
+        if self._due_s.get(Basic.ALARM_HISTORY, NEVER_S) < NEVER_S:
+            self._due_s[Basic.ALARM_HISTORY] = now_s
+
+    def _take_history(self, now_s: float) -> None:
+        """Go on to the next word, or tell of the whole history."""
+        self._history_place += 1
+        if self._history_place < HISTORY_LENGTH:
+            if self._hurries_history:
+                self._due_s[Basic.ALARM_HISTORY] = now_s
+            return
+        self._history_place = 0
+        self._hurries_history = False
+        if self._listeners.history(tuple(self._words[address] for address in HISTORY)):
+            self._read_history(now_s)
 
     # -- counters ----------------------------------------------------------------------------------------------------
 
