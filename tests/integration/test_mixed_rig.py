@@ -213,9 +213,9 @@ async def test_an_alarm_that_a_drive_enters_in_its_history_is_an_event(tmp_path)
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:
         await rig.until("feed", lambda state: state.enabled)
-        await asyncio.sleep(8.0)  # its history was read: what stands there is no news
+        await asyncio.sleep(12.0)  # its history was read: what stands there is no news
         units[0].drive.provoke(0x0051, asyncio.get_running_loop().time())
-        await asyncio.sleep(8.0)
+        await asyncio.sleep(12.0)
         events = await latest_events(rig.client, 100, "feed")
 
     (alarm,) = [event for event in events if event.verb == "alarm_history"]
