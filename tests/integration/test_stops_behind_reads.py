@@ -1,9 +1,7 @@
-"""However much is read, and whoever is frozen: a stop begins and is answered as without."""
+"""However much is read, a stop begins as without; what it takes over real links is for `make bench`."""
 
 import asyncio
 import contextlib
-import time
-from statistics import median
 from typing import Any
 
 import pytest
@@ -15,12 +13,8 @@ from ldcnd.daemon.publish.meta import WORK_PER_STEP
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import READS_OF_A_CLIENT, Query
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.wirelog.recorder import WireEvent
-from tests.bench.stops_under_load import LOADS, compared
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
-from tests.support.session_pair import free_endpoint
 
 STOP_MOTOR = 0x7
 """Command code in the low half of the third byte."""
@@ -99,28 +93,6 @@ async def test_a_stop_reaches_the_line_behind_256_reads_in_as_many_turns_as_with
     print(f"{alone} turns without reads; {behind_reads} turns and {read} payloads of reads behind them")
     assert behind_reads == alone
     assert read <= behind_reads * WORK_PER_STEP
-
-
-@pytest.mark.real_time
-@pytest.mark.parametrize("load", list(LOADS))
-async def test_a_stop_over_its_own_link_waits_for_no_reader(load: str):
-    """Generous: it shares its machine with the readers and all other tests; `make bench` looks at the figures."""
-    endpoint = free_endpoint()
-    async with open_zenoh_session(ZenohSettings(listen=(endpoint,))) as session, asyncio.TaskGroup() as group:
-        daemon = build_daemon(load_config(SIMULATED), session, time.time_ns, "test")
-        running = group.create_task(daemon.run(), name="daemon")
-        await daemon.wait_up()
-        quiet, loaded = await compared(daemon, endpoint, LOADS[load], rounds=1, stops=15, nice=0)
-        daemon.end()
-        await running
-
-    for what, without, with_load in (
-        ("begun", quiet.begun_s, loaded.begun_s),
-        ("answered", quiet.answered_s, loaded.answered_s),
-    ):
-        print(f"{what}: {median(without) * 1e3:.1f} ms without, {median(with_load) * 1e3:.1f} ms with")
-        assert median(with_load) <= 5 * median(without) + 0.05
-    assert (quiet.failed, loaded.failed) == (0, 0)
 
 
 async def test_a_stop_that_comes_before_there_is_a_daemon_is_answered_by_it():

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import random
 from collections.abc import AsyncIterator
+from typing import TypeVar
 
 import pytest
 from structlog.testing import capture_logs
@@ -18,10 +19,12 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.errors import LdcndError, OutcomeUnknown
+from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import (
     AxisCommand,
     BufferMode,
+    Command,
     CommandReply,
     Effect,
     Halt,
@@ -33,6 +36,7 @@ from ldcnd.model.commands import (
     MoveVelocity,
     PinMode,
     Power,
+    Preview,
     QuickStop,
     Reset,
     SetGains,
@@ -40,14 +44,17 @@ from ldcnd.model.commands import (
     SetPosition,
     SetPwm,
     Track,
+    Why,
 )
-from ldcnd.model.rig_commands import Acquire, AxisMove, MoveTogether, Release, Renew
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.rig_commands import Acquire, AxisMove, ListHolders, MoveTogether, Release, Renew
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, run_with_copies
 from tests.support.witness import Witness
 
+ReplyT = TypeVar("ReplyT", bound=Frozen)
 LEASE_S = 1.0
 FREEZES_S = (0.4, 1.5, 6.0)
 LINE_S = 1.5
@@ -122,12 +129,22 @@ class Client:
         self.name = name
         self.sent: list[tuple[str, AxisCommand[CommandReply]]] = []
         self.refused = 0
+        self.others = 0
         self.lease: str | None = None
 
     async def acquire(self, *axes: str, force: bool = False) -> None:
-        with contextlib.suppress(LdcndError):
-            request = Acquire(client=self.name, axes=axes, lease_s=LEASE_S, force=force)
-            self.lease = (await self.rig.ask(request)).lease
+        if reply := await self.ask(Acquire(client=self.name, axes=axes, lease_s=LEASE_S, force=force)):
+            self.lease = reply.lease
+
+    async def ask(self, command: Command[ReplyT], axis: str = RIG_ITSELF) -> ReplyT | None:
+        """Send what is no command of an axis."""
+        self.others += 1
+        try:
+            return await self.rig.ask(command, axis)
+        except LdcndError as error:
+            self.refused += 1
+            self.why = f"{command!r}: {error}"
+            return None
 
     async def keep(self) -> None:
         while True:
@@ -182,11 +199,7 @@ async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witn
     await ann.send("x", SetPosition(position=0.0))
     assert position is not None
     moves = (AxisMove(axis="x", position=2.0, lease=ann.lease), AxisMove(axis="y", position=2.0, lease=ann.lease))
-    try:
-        await ann.rig.ask(MoveTogether(moves=moves))
-    except LdcndError as error:
-        ann.refused += 1
-        ann.why = str(error)
+    await ann.ask(MoveTogether(moves=moves))
     await ann.standing("x", "y")
     await ann.send("x", TakeTrace(channels=("position",), interval_s=0.02, samples=20))
     await ann.send("y", MoveVelocity(velocity=8.0))
@@ -197,6 +210,11 @@ async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witn
     await ann.send("z", SetPwm(duty=0.05, duration_s=0.2))
     await asyncio.sleep(0.3)
     await ann.standing("z")
+    await ann.ask(Why(lease=ann.lease), "z")
+    await ann.ask(Preview(position=1.0), "y")
+    await ann.send("y", MoveRelative(distance=0.5))
+    await ann.send("y", MoveRelative(distance=0.5, buffer_mode=BufferMode.BUFFERED))
+    await ann.ask(ListHolders())
     places.pop("z", None)
     await ann.done("z", Home(method=HomeMethod.INDEX, velocity=1.0, position=0.0, timeout_s=PROFILE_S))
     for step in range(3):
@@ -219,8 +237,7 @@ async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witn
         await ann.send(name, Reset())
     await ann.send("z", Power(on=False))
     await ann.send("x", MoveRelative(distance=1.0))
-    with contextlib.suppress(LdcndError):
-        await ann.rig.ask(Release(lease=ann.lease or "", leave_running=False))
+    await ann.ask(Release(lease=ann.lease or "", leave_running=False))
     await bob.acquire("x", "y")
     await bob.standing("x")
     await bob.send("x", MoveVelocity(velocity=6.0))
@@ -291,7 +308,7 @@ class Run:
             await self.witness.look(daemon, self.places)
             check_homed(self.witness, daemon)
             self.refused, self.why = ann.refused + bob.refused, getattr(ann, "why", "")
-            self.sent = len(ann.sent) + len(bob.sent)
+            self.sent = sum(len(each.sent) + each.others for each in (ann, bob))
 
     def _interrupt(self, step: int) -> list[str] | None:
         loop = asyncio.get_running_loop()
