@@ -23,8 +23,8 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
 from ldcnd.model.traces import TakeTrace, TraceTrigger
 
-LINGER_S = 0.02
-"""A sample may wait for so long for others: to wake a program up for each costs more than all else."""
+LINGER_S = 0.03
+"""A position may wait for so long for others: to wake a program up for each costs more than all else."""
 KEPT_SAMPLES = 256
 """A reader that is too slow keeps so many samples; the oldest give way."""
 HALT_S = 2.0
@@ -218,7 +218,7 @@ class Axis(AxisVerbs, Watched):
     async def watched(self) -> AsyncIterator["Axis"]:
         """Take states and positions for the time of the context; the last ones are there when it begins."""
         async with (
-            self._client.values(self.name, TelemetryItem.STATE, self._take_state, LINGER_S),
+            self._client.values(self.name, TelemetryItem.STATE, self._take_state),
             self._client.values(self.name, TelemetryItem.POSITION, self._take_position, LINGER_S),
         ):
             now_s = self._loop.time()

@@ -249,7 +249,7 @@ class RigClient:
 
     @asynccontextmanager
     async def values(
-        self, axis: str, item: str, take: Callable[[Sample], None], linger_s: float
+        self, axis: str, item: str, take: Callable[[Sample], None], linger_s: float = 0.0
     ) -> AsyncIterator[None]:
         """Hand one item of an axis to `take`, encoded as it came, for the time of the context."""
         key = self._keys.telemetry_pattern(axis, item)

@@ -121,7 +121,7 @@ async def _wire_bytes() -> float:
 
 async def _publish(publisher: Publisher, count: int) -> None:
     for number in range(count):
-        publisher.publish("x", TelemetryItem.POSITION, _sample)
+        publisher.item("x", TelemetryItem.POSITION).publish(_sample(number))
         if number % BATCH == BATCH - 1:
             await asyncio.sleep(PAUSE_S)
 
@@ -149,7 +149,7 @@ async def _key_bytes() -> float:
             await _publish(publisher, SAMPLES // 10)
             before = _resident_bytes(router.pid)
             for number in range(KEYS_DECLARED):
-                publisher.publish(f"a{number}", TelemetryItem.POSITION, _sample)
+                publisher.item(f"a{number}", TelemetryItem.POSITION).publish(_sample(0))
                 if number % BATCH == 0:
                     await asyncio.sleep(PAUSE_S)
             await asyncio.sleep(2.0)
