@@ -240,6 +240,7 @@ def campaign(seeds: range) -> Interruptions:
     return came
 
 
+@pytest.mark.timeout(600)
 def test_no_schedule_moves_anything_twice_unasked_or_with_nobody_in_charge():
     campaign(range(300))
 
