@@ -18,7 +18,8 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -89,12 +90,15 @@ class Campaign:
         self._workers = workers
         self._ends_s = ends_s
         self._items: dict[str, pytest.Item] = {}
+        self._functions: Mapping[tuple[str, str], Sequence[FunctionType]] = {}
         self._sound: dict[str, bool] = {}
         self._failed = False
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Judge all mutants, in as many processes as there are workers."""
         self._items = {item.nodeid: item for item in session.items}
+        self._functions = _loaded_functions()
+        gc.freeze()  # what forks share stays shared
         reading, writing = os.pipe()
         children = []
         for worker in range(self._workers):
@@ -128,16 +132,17 @@ class Campaign:
 
     def _judged(self, mutant: Mutant) -> tuple[Verdict, str]:
         lines = range(mutant.lines[0], mutant.lines[1] + 1)
-        tests = [test for test in self._covering.of(mutant.path, lines) if test in self._items]
+        is_early = not mutant.function or self._covering.is_imported(mutant.path, lines)
+        covering = self._covering.of_module(mutant.path) if is_early else self._covering.of(mutant.path, lines)
+        tests = [test for test in covering if test in self._items]
         if not tests:
             return Verdict.UNCOVERED, ""
         code = mutant.module(ROOT)
-        is_early = not mutant.function or self._covering.is_imported(mutant.path, lines)
-        if is_early or not _is_replaceable(mutant, code):
+        if is_early or not self._is_replaceable(mutant, code):
             return _judged_freshly(mutant, tests)
         tests = self._affordable(tests)
         while (run := self._run(tests, mutant, code)).failed:
-            alone = run if run.hung or len(tests) == 1 else self._run([run.failed], mutant, code)
+            alone = run if run.hung or run.failed == tests[0] else self._run([run.failed], mutant, code)
             if alone.failed and self._is_sound(run.failed):
                 return Verdict.TIMED_OUT if alone.hung else Verdict.KILLED, run.failed
             tests = [test for test in tests if test != run.failed]
@@ -168,7 +173,7 @@ class Campaign:
             with _child_ends():
                 _isolate()
                 if mutant and code:
-                    _replace(mutant, code)
+                    self._replace(mutant, code)
                 self._run_items([self._items[test] for test in tests], writing)
         os.close(writing)
         begun = -1
@@ -186,6 +191,19 @@ class Campaign:
                 os.killpg(child, signal.SIGKILL)
             status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         return _Run(tests[max(begun, 0)]) if status else _Run()
+
+    def _loaded(self, mutant: Mutant) -> Sequence[FunctionType]:
+        return self._functions.get((str(ROOT / mutant.path), mutant.function), ())
+
+    def _is_replaceable(self, mutant: Mutant, module: CodeType) -> bool:
+        """Return whether the change can be made in functions that are already loaded."""
+        pairs = [(each, _changed_code(mutant, module, each.__code__.co_firstlineno)) for each in self._loaded(mutant)]
+        return bool(pairs) and all(code and code.co_freevars == each.__code__.co_freevars for each, code in pairs)
+
+    def _replace(self, mutant: Mutant, module: CodeType) -> None:
+        for function in self._loaded(mutant):
+            if code := _changed_code(mutant, module, function.__code__.co_firstlineno):
+                function.__code__ = code
 
     def _run_items(self, items: Sequence[pytest.Item], writing: int) -> None:
         """Run items in the fork: one byte at the beginning of each; the exit status is 1 at the first that fails."""
@@ -217,16 +235,13 @@ def _isolate() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
 
 
-def _functions(mutant: Mutant) -> list[FunctionType]:
-    """Return the loaded functions that a mutant changes: more than one, where a decorator has made copies."""
-    file = str(ROOT / mutant.path)
-    return [
-        function
-        for function in gc.get_objects()
-        if type(function) is FunctionType
-        and function.__code__.co_qualname == mutant.function
-        and function.__code__.co_filename == file
-    ]
+def _loaded_functions() -> Mapping[tuple[str, str], Sequence[FunctionType]]:
+    """Return all functions by file and qualified name: more than one of a name, where a decorator has made copies."""
+    found: dict[tuple[str, str], list[FunctionType]] = defaultdict(list)
+    for function in gc.get_objects():
+        if type(function) is FunctionType:
+            found[function.__code__.co_filename, function.__code__.co_qualname].append(function)
+    return found
 
 
 def _changed_code(mutant: Mutant, module: CodeType, first_line: int) -> CodeType | None:
@@ -242,18 +257,6 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _codes(constant)
-
-
-def _is_replaceable(mutant: Mutant, module: CodeType) -> bool:
-    """Return whether the change can be made in functions that are already loaded."""
-    pairs = [(each, _changed_code(mutant, module, each.__code__.co_firstlineno)) for each in _functions(mutant)]
-    return bool(pairs) and all(code and code.co_freevars == each.__code__.co_freevars for each, code in pairs)
-
-
-def _replace(mutant: Mutant, module: CodeType) -> None:
-    for function in _functions(mutant):
-        if code := _changed_code(mutant, module, function.__code__.co_firstlineno):
-            function.__code__ = code
 
 
 def _judged_freshly(mutant: Mutant, tests: Sequence[str]) -> tuple[Verdict, str]:

@@ -37,8 +37,9 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import AxisCommand, CommandReply, HomeMethod, PinMode, Power, Verb
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.model.samples import Sample, TelemetryItem
 
+KEYS = Keys("bench")
 COUNTS_PER_MM = 1000
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
 AT_REST = AxisReading(
@@ -180,6 +181,7 @@ class AxisBench:
         self.ended: list[tuple[str, CommandStatus, str | None]] = []
         self.notes: list[tuple[str, CommandStatus, str]] = []
         self._ids = iter(f"own-{number}" for number in range(1000))
+        self._publisher = publisher
         self.axis = AxisService(
             config,
             cast("Bus", self.bus),  # only what is fake is called
@@ -195,6 +197,10 @@ class AxisBench:
 
     def _ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None) -> None:
         self.ended.append((command.command_id, status, reason))
+
+    def published(self, item: TelemetryItem) -> Sample | None:
+        """Return the last sample of an item."""
+        return self._publisher.last.get(KEYS.telemetry(self.axis.config.name, item))
 
     def show(self, **changes: Any) -> None:
         """Let the axis see what the drive reads from now on."""
@@ -256,7 +262,7 @@ async def axis_bench(*, powered: bool = True, **axis: object) -> AsyncIterator[A
     }  # fmt: skip
     config = AxisConfig.model_validate(document | axis)
     async with MemoryBroker().session() as session, asyncio.TaskGroup() as group:
-        bench = AxisBench(config, Publisher(session, Keys("bench"), Encoding.JSON))
+        bench = AxisBench(config, Publisher(session, KEYS, Encoding.JSON))
         running = group.create_task(bench.axis.run(), name="axis")
         try:
             if powered:

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from ldcnd.config.axis import RatesConfig
-from ldcnd.daemon.axis.polling import AxisPoller
+from ldcnd.daemon.axis.polling import AGAIN_S, AxisPoller
+from ldcnd.exchange import Timing
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning.plan import wanted_rates_hz
 
@@ -100,3 +101,62 @@ def test_what_was_prepared_for_a_turn_that_has_passed_is_not_asked():
 
 def test_the_poll_of_an_axis_counts_as_much_work():
     assert poller({POSITION: 1.0}).laborious
+
+
+def test_the_deadline_of_a_poll_is_when_the_next_one_is_due():
+    axis = poller({POSITION: 10.0}, start_at_s=3.0)
+    assert (axis.due_at_s, axis.deadline_at_s) == (3.0, pytest.approx(3.1))
+
+    axis.next_exchange(3.0)
+    assert (axis.due_at_s, axis.deadline_at_s) == (pytest.approx(3.1), pytest.approx(3.2))
+
+
+def test_what_is_not_believed_is_asked_again_at_once_and_the_poll_keeps_its_turn():
+    driver = SimpleNamespace(spec=SimpleNamespace(address=1), reading=lambda items: items)
+    again, moved = [True, False, False], []
+    axis = AxisPoller(
+        driver, {POSITION: 10.0, ADC: 5.0}, 0.0, lambda *_: again.pop(0), lambda _: None, lambda _: moved.append(1)
+    )
+    reply = SimpleNamespace(asked=frozenset({ADC}))
+    axis.next_exchange(0.0)
+
+    axis.deliver(reply, Timing(0.0, 0.0, 0.0, 0.004))
+    assert (axis.due_at_s, axis.deadline_at_s) == (0.004, pytest.approx(0.004 + AGAIN_S))
+    assert axis.next_exchange(0.005) == {ADC}
+    assert (axis.due_at_s, axis.deadline_at_s) == (pytest.approx(0.1), pytest.approx(0.2))
+    axis.deliver(reply, Timing(0.0, 0.0, 0.0, 0.006))
+    assert len(moved) == 1
+    assert axis.next_exchange(0.1) == {POSITION}
+
+
+def test_an_answer_that_comes_before_it_was_asked_again_settles_it():
+    driver = SimpleNamespace(spec=SimpleNamespace(address=1), reading=lambda items: items)
+    again, moved = [True, False], []
+    axis = AxisPoller(driver, {POSITION: 10.0}, 0.0, lambda *_: again.pop(0), lambda _: None, lambda _: moved.append(1))
+    reply = SimpleNamespace(asked=frozenset({POSITION}))
+    axis.next_exchange(0.0)
+    axis.deliver(reply, Timing(0.0, 0.0, 0.0, 0.004))
+
+    axis.deliver(reply, Timing(0.0, 0.0, 0.0, 0.006))
+
+    assert (axis.due_at_s, axis.deadline_at_s, len(moved)) == (pytest.approx(0.1), pytest.approx(0.2), 2)
+
+
+def test_a_poll_that_brought_nothing_is_reported():
+    driver = SimpleNamespace(spec=SimpleNamespace(address=1), reading=lambda items: items)
+    missed: list[object] = []
+    axis = AxisPoller(driver, {POSITION: 10.0}, 0.0, lambda *_: False, missed.append, lambda _: None)
+
+    axis.missed("lost")
+
+    assert missed == ["lost"]
+
+
+def test_a_poll_that_was_prepared_too_early_is_made_anew():
+    axis = poller({POSITION: 10.0, ADC: 5.0})
+    axis.next_exchange(0.0)
+    axis.prepare(0.1)
+    assert axis.next_exchange(0.1) == {POSITION}
+    axis.prepare(0.2)
+    assert axis.next_exchange(0.4) == {POSITION, ADC}
+    assert axis.due_at_s == pytest.approx(0.5)

@@ -37,7 +37,7 @@ from ldcnd.model.commands import (
     Verb,
 )
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
 
 THERE = MoveAbsolute(position=10.0)
@@ -261,9 +261,10 @@ async def test_a_buffered_move_does_not_begin_after_a_policy_has_brought_the_axi
             waiting = group.create_task(outcome(in_turn(bench, buffered())), name="next")
             await asyncio.sleep(0.1)
             await bench.axis.bring_to_rest(StopMode.SMOOTH)
+            await asyncio.sleep(0.001)
+            assert isinstance(waiting.result(), StopLatched)  # at once, not when the axis stands
             await bench.settled()
 
-        assert isinstance(waiting.result(), StopLatched)
         assert bench.drive.calls == ["stop"]
 
 
@@ -431,6 +432,32 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
         assert bench.drive.shown.position_counts == 0
 
 
+async def test_a_shaft_that_is_turned_by_hand_is_believed_where_its_velocity_leads():
+    async with axis_bench() as bench:
+        bench.axis.judged(bench.drive.shown, frozenset(), now())
+        verdicts = []
+        for counts in (100, 300, 500):
+            await asyncio.sleep(0.01)
+            turned = _reading(bench, velocity_counts_per_s=20_000.0, position_counts=counts)
+            verdicts.append(bench.axis.judged(turned, frozenset(), now()))
+
+        assert (bench.tracker.command, bench.tracker.at_rest) == (None, False)
+        assert verdicts == [True, False, False]  # so sudden a velocity is asked for again, once
+
+
+async def test_what_only_the_first_of_two_readings_was_asked_for_is_published_as_well():
+    both = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
+    async with axis_bench() as bench:
+        bench.axis.judged(bench.drive.shown, frozenset(), now())
+        changed = _reading(bench, profile_done=False, asked=both)
+        assert bench.axis.judged(changed, both, now())
+        assert bench.published(TelemetryItem.VELOCITY) is None
+        assert not bench.axis.judged(changed, frozenset({TelemetryItem.POSITION}), now())
+
+        assert bench.published(TelemetryItem.VELOCITY)
+        assert bench.published(TelemetryItem.POSITION).seq == 0
+
+
 async def test_misses_take_an_axis_down_only_in_a_row():
     async with axis_bench() as bench:
         for _ in range(10):
@@ -510,6 +537,8 @@ async def test_a_start_that_was_not_taken_ends_the_command_at_once():
 
         assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
         assert bench.ended[-1] == ("first", CommandStatus.FAILED, "no reply")
+        await asyncio.sleep(0)
+        assert bench.published(TelemetryItem.STATE).state is AxisState.STANDSTILL
 
 
 def _reading(bench: AxisBench, **changes):

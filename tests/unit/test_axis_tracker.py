@@ -6,6 +6,7 @@ from ldcnd.daemon.axis.state import MISSES_UNTIL_DOWN, ActiveCommand, AxisTracke
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import Verb
+from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
 
 OFF = AxisReading(
@@ -261,3 +262,107 @@ def test_readings_count_again_after_a_start_that_no_drive_has_taken(how):
         tracker.observed(OFF, at(at_s), 0)
 
     assert (tracker.moving, tracker.enabled) == (Moving.NO, False)
+
+
+def test_a_change_of_power_leads_out_of_no_error(moving):
+    moving.observed(replace(OFF, faults=(OVERHEAT,)), at(2.5), 0)
+    assert moving.state is AxisState.ERROR_STOP
+
+    moving.powered(on=False, now_s=3.0)
+    assert moving.state is AxisState.ERROR_STOP
+
+
+def test_a_loop_that_is_closed_in_the_course_of_a_command_is_enabled_at_once(moving):
+    moving.switched(on=False, now_s=3.0)
+    assert (moving.enabled, moving.energised, moving.at_rest) == (False, False, False)
+
+    moving.switched(on=True, now_s=4.0)
+    assert (moving.enabled, moving.energised) == (True, True)
+    assert moving.command
+
+
+def test_misses_count_only_in_a_row(moving):
+    for number in range(5):
+        moving.missed(0)
+        moving.missed(0)
+        assert moving.link is LinkState.DEGRADED
+        moving.observed(RUNNING, at(3.0 + number), 0)
+        assert moving.link is LinkState.UP
+
+
+def test_a_drive_that_was_away_is_not_degraded_by_a_further_miss(moving):
+    moving.disconnected(5)
+    faults = moving.active_faults
+    moving.missed(6)
+
+    assert (moving.link, moving.active_faults) == (LinkState.DOWN, faults)
+    assert faults[0].source == "daemon"
+
+
+def test_what_brings_an_axis_to_rest_early_is_the_reason_of_its_end():
+    ended = []
+    tracker = AxisTracker("x", "mm", lambda _command, status, reason: ended.append((status, reason)))
+    tracker.observed(ON, at(1.0), 0)
+    tracker.begin(command(), float("inf"))
+    tracker.started(2.0)
+
+    tracker.observed(replace(RUNNING, cut_short="the drive stopped at the switch"), at(2.1), 0)
+    tracker.observed(ON, at(2.2), 0)
+    tracker.begin(command(Verb.MOVE_RELATIVE), float("inf"))
+    assert tracker.last_error is None
+    tracker.started(3.0)
+    tracker.observed(ON, at(3.1), 0)
+
+    assert ended == [(CommandStatus.FAILED, "the drive stopped at the switch"), (CommandStatus.DONE, None)]
+
+
+def test_an_unconfirmed_stop_is_one_fault_however_often_it_is_sent(moving):
+    moving.stop_unconfirmed(5)
+    moving.stop_unconfirmed(6)
+    moving.observed(replace(RUNNING, faults=(Fault("position_wrap", "wrapped", stops=False),)), at(2.5), 7)
+    assert [(fault.code, fault.since) for fault in moving.active_faults] == [
+        ("position_wrap", 7), ("stop_unconfirmed", 5),
+    ]  # fmt: skip
+
+    moving.stop_confirmed()
+    assert ([fault.code for fault in moving.active_faults], moving.stop_pending) == (["position_wrap"], False)
+
+
+def test_a_jump_is_a_fault_until_reset_and_loses_the_reference(moving):
+    moving.referenced = True
+    moving.jumped()
+    moving.observed(ON, at(2.5), 0)
+    assert (moving.state, moving.referenced) == (AxisState.ERROR_STOP, False)
+    assert moving.first_fault.source == "daemon"
+    moving.observed(ON, at(2.6), 0)
+    assert moving.active_faults
+
+    moving.cleared(3.0)
+    moving.observed(ON, at(3.1), 0)
+    assert (moving.state, moving.active_faults, moving.first_fault) == (AxisState.STANDSTILL, (), None)
+
+
+def test_a_repeated_begin_of_one_command_does_not_abort_it(moving):
+    moving.begin(replace(command(), state=AxisState.STOPPING, completion=Completion.REST), float("inf"))
+
+    assert (moving.last_error, moving.state) == (None, AxisState.STOPPING)
+
+
+def test_an_axis_in_error_stays_there_when_its_loop_is_closed_and_at_rest():
+    tracker = AxisTracker("x", "mm")
+    tracker.observed(ON, at(1.0), 0)
+    tracker.disconnected(0)
+    for step in range(5):
+        tracker.observed(ON, at(2.0 + step), 0)
+
+    assert tracker.state is AxisState.ERROR_STOP
+    assert tracker.at_rest
+
+
+def test_a_disabled_axis_that_is_lost_from_sight_is_in_no_error():
+    tracker = AxisTracker("x", "mm")
+    tracker.observed(OFF, at(1.0), 0)
+    tracker.disconnected(0)
+
+    assert tracker.state is AxisState.DISABLED
+    assert tracker.active_faults

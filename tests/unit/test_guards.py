@@ -39,6 +39,7 @@ def test_an_axis_that_stands_and_is_powered_may_move():
     [
         ({"link": LinkState.DOWN}, AxisUnreachable, "power"),
         ({"stop_latched": True}, StopLatched, "reset"),
+        ({"stop_pending": True}, StopLatched, "wait"),
         ({"state": AxisState.ERROR_STOP, "faults": ("overheat",)}, WrongState, "reset"),
         ({"state": AxisState.DISABLED, "enabled": False}, WrongState, "power"),
         ({"state": AxisState.DISCRETE_MOTION}, WrongState, "halt"),

@@ -1,0 +1,113 @@
+"""What is published of one axis, when, and what it is worth."""
+
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.drivers.driver import Fault
+from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.exchange import Timing
+from ldcnd.model.commands import MoveAbsolute
+from ldcnd.model.samples import AxisState, MonitorName, Quality, TelemetryItem
+from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench
+
+POSITION, VELOCITY, ADC = TelemetryItem.POSITION, TelemetryItem.VELOCITY, TelemetryItem.ADC
+STATE, FAULT = TelemetryItem.STATE, TelemetryItem.FAULT
+TIMING = Timing(1.0, 1.0, 1.002, 1.003)
+
+
+def poll(bench: AxisBench, *asked: TelemetryItem, **changes: object) -> None:
+    bench.axis.observed(replace(bench.drive.shown, **changes), frozenset(asked), TIMING)
+
+
+@pytest.mark.parametrize("item", [POSITION, VELOCITY, ADC])
+async def test_only_what_was_asked_for_is_published(item):
+    async with axis_bench() as bench:
+        poll(bench, item, adc_counts=512)
+
+        published = [each for each in (POSITION, VELOCITY, ADC) if bench.published(each)]
+
+    assert published == [item]
+
+
+async def test_values_are_in_axis_units_and_stamped_with_the_middle_of_when_they_can_have_been_true():
+    async with axis_bench(adc_volts=10.0, direction="reverse") as bench:
+        bench.axis.telemetry.origin_counts = 1000.0
+        poll(
+            bench, POSITION, VELOCITY, ADC, position_counts=3000, velocity_counts_per_s=500.0, adc_counts=512,
+            following_error_counts=20,
+        )  # fmt: skip
+        position, velocity, adc = (bench.published(item) for item in (POSITION, VELOCITY, ADC))
+
+    assert (position.value, position.unit, position.counts, position.following_error) == (-2.0, "mm", 3000, -0.02)
+    assert (velocity.value, velocity.unit, velocity.counts_per_s) == (-0.5, "mm/s", 500.0)
+    assert (adc.counts, adc.full_scale, adc.volts) == (512, 1023, pytest.approx(512 / 1023 * 10.0))
+    assert (position.t, position.t_error_ns) == (pytest.approx(1.001e9, abs=10), 1_000_000)
+
+
+async def test_a_value_that_the_reading_does_not_have_is_not_published():
+    async with axis_bench() as bench:
+        poll(bench, POSITION, ADC)
+
+        assert bench.published(ADC) is None
+        assert bench.published(POSITION).following_error is None
+
+
+async def test_state_and_faults_are_published_when_they_change_and_when_they_are_due():
+    async with axis_bench() as bench:
+        poll(bench)
+        state, fault = bench.published(STATE), bench.published(FAULT)
+        poll(bench)
+        assert (bench.published(STATE), bench.published(FAULT)) == (state, fault)
+        poll(bench, STATE)
+        assert (bench.published(STATE).seq, bench.published(FAULT).seq) == (state.seq + 1, fault.seq + 1)
+        poll(bench, faults=(Fault("position_wrap", "wrapped", stops=False),))
+        assert bench.published(STATE).seq == state.seq + 1
+        assert [entry.code for entry in bench.published(FAULT).active] == ["position_wrap"]
+        bench.tracker.latch_stop()
+        poll(bench, faults=(Fault("position_wrap", "wrapped", stops=False),))
+        assert bench.published(STATE).stop_latched
+
+
+async def test_a_state_names_the_command_with_its_target_and_its_expected_end():
+    async with axis_bench() as bench:
+        reply = await bench.send(MoveAbsolute(position=10.0), "move")
+        await bench.pass_s(0.1, **RUNNING)
+        command = bench.published(STATE).command
+
+    assert (command.command_id, command.verb, command.target) == ("move", "move_absolute", 10.0)
+    assert command.expected_end == command.since + round(reply.duration_s * 1e9)
+
+
+async def test_what_a_drive_that_is_gone_has_shown_is_published_once_more_as_bad():
+    async with axis_bench() as bench:
+        poll(bench, POSITION, VELOCITY, ADC, position_counts=5, adc_counts=7)
+        before = [bench.published(item) for item in (POSITION, VELOCITY, ADC)]
+        bench.axis.missed(None)
+        assert [bench.published(item).quality for item in (POSITION, VELOCITY, ADC)] == [Quality.UNCERTAIN] * 3
+        bench.axis.disconnected()
+        after = [bench.published(item) for item in (POSITION, VELOCITY, ADC)]
+        bench.axis.disconnected()
+        again = [bench.published(item) for item in (POSITION, VELOCITY, ADC)]
+        state = bench.published(STATE)
+
+    assert [sample.quality for sample in before] == [Quality.GOOD] * 3
+    assert [sample.quality for sample in after] == [Quality.BAD] * 3
+    assert [sample.t for sample in after] == [sample.t for sample in before]  # true then, not now
+    assert again == after
+    assert (state.quality, state.state, state.referenced) == (Quality.BAD, AxisState.ERROR_STOP, False)
+
+
+@pytest.mark.parametrize(
+    ("resolved", "away", "quality"),
+    [(False, False, Quality.GOOD), (True, False, Quality.UNCERTAIN), (True, True, Quality.BAD)],
+)
+async def test_a_counter_that_had_to_be_corrected_is_uncertain_and_one_of_a_lost_drive_is_bad(resolved, away, quality):
+    value = MonitorValue(MonitorName.SPEED_FEEDBACK, 100, "rpm", "speed", resolved=resolved)
+    async with axis_bench() as bench:
+        if away:
+            bench.axis.disconnected()
+        bench.axis.monitored(value, TIMING)
+        sample = bench._publisher.last[KEYS.monitor("x", MonitorName.SPEED_FEEDBACK)]
+
+    assert (sample.value, sample.unit, sample.quality) == (100, "rpm", quality)
