@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import random
 import sys
 import time
 import tomllib
@@ -10,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.mutants.campaign import Campaign, Judgement, Verdict, run
+from tests.mutants.campaign import KILLED, Campaign, Judgement, Verdict, run
 from tests.mutants.changes import Mutant, mutants_of
 from tests.mutants.covering import ROOT, Covering, record
 
@@ -43,6 +42,7 @@ def main() -> int:
     parser.add_argument("--tests", nargs="+", default=TESTS, help="which tests")
     parser.add_argument("--subjects", nargs="+", default=SUBJECTS, help="which modules are changed")
     parser.add_argument("--recorded", action="store_true", help="use the recorded coverage as it is")
+    parser.add_argument("--anew", action="store_true", help="judge also what the same test has killed before")
     options = parser.parse_args()
 
     ends_s = time.monotonic() + 60 * options.minutes
@@ -51,8 +51,10 @@ def main() -> int:
     paths = sorted({str(path.relative_to(ROOT)) for glob in options.subjects for path in ROOT.glob(glob)})
     candidates = [mutant for path in paths for mutant in mutants_of(path, ROOT)]
     count = min(options.count or len(candidates), len(candidates))
-    mutants = random.Random(options.seed).sample(candidates, count)
+    mutants = sorted(candidates, key=lambda mutant: mutant.rank(options.seed))[:count]
     print(f"seed {options.seed}: {count} of {len(candidates)} mutants of {len(paths)} modules", flush=True)
+    if options.anew:
+        KILLED.unlink(missing_ok=True)
     campaign = Campaign(mutants, Covering(paths), options.seconds, options.workers, ends_s)
     run(campaign, [ROOT / test for test in options.tests])
     return report(mutants, campaign.judgements, time.monotonic() - ends_s + 60 * options.minutes)

@@ -4,13 +4,15 @@ Pytest imports and collects all tests once. A mutant is then a fork in which the
 the tests that run it are run, so that it costs little more than these tests. Changes of what runs at import, in a
 module or a class, cannot be made so late: those mutants get a pytest of their own (`applied`).
 
-A test that fails decides only if it fails again by itself, and passes by itself on the code as it is.
+A test that fails decides only if it fails again by itself, and passes by itself on the code as it is. A kill is
+remembered, and holds until the module that is changed or the module of the test changes.
 """
 
 import contextlib
 import gc
 import json
 import os
+import re
 import resource
 import select
 import signal
@@ -29,7 +31,7 @@ import pytest
 
 from tests.mutants.applied import MUTANT
 from tests.mutants.changes import Mutant
-from tests.mutants.covering import ROOT, Covering
+from tests.mutants.covering import RECORDS, ROOT, Covering, digest
 
 HANGING_S = 30.0
 """Shortest wall time after which a test is called hanging."""
@@ -41,6 +43,8 @@ MEMORY_BYTES = 4 << 30
 """Address space of a fork: a mutant that appends for ever ends here."""
 FRESH_TESTS = 40
 """Most tests for a mutant that needs a pytest of its own."""
+KILLED = RECORDS / "killed.jsonl"
+"""What was killed by which test."""
 
 
 class Verdict(StrEnum):
@@ -93,6 +97,7 @@ class Campaign:
         self._functions: Mapping[tuple[str, str], Sequence[FunctionType]] = {}
         self._sound: dict[str, bool] = {}
         self._failed = False
+        self._memory = _remembered()
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Judge all mutants, in as many processes as there are workers."""
@@ -108,11 +113,14 @@ class Campaign:
                     self._work(worker, writing)
             children.append(child)
         os.close(writing)
-        with os.fdopen(reading, encoding="utf-8") as lines:
+        with os.fdopen(reading, encoding="utf-8") as lines, KILLED.open("a", encoding="utf-8") as memory:
             for line in lines:
                 number, verdict, test, seconds = json.loads(line)
                 self.judgements.append(judgement := Judgement(number, Verdict(verdict), test, seconds))
                 _print(self._mutants[number], judgement)
+                if judgement.verdict in (Verdict.KILLED, Verdict.TIMED_OUT):
+                    memory.write(json.dumps((_identity(self._mutants[number], test), verdict, test)) + "\n")
+                    memory.flush()
         for child in children:
             os.waitpid(child, 0)
         return True
@@ -131,6 +139,9 @@ class Campaign:
             os.write(writing, line.encode() + b"\n")  # one write of less than a page: lines of workers do not mix
 
     def _judged(self, mutant: Mutant) -> tuple[Verdict, str]:
+        for identity, verdict, test in self._memory.get(str(mutant), ()):
+            if _identity(mutant, test) == identity:
+                return verdict, test
         lines = range(mutant.lines[0], mutant.lines[1] + 1)
         is_early = not mutant.function or self._covering.is_imported(mutant.path, lines)
         covering = self._covering.of_module(mutant.path) if is_early else self._covering.of(mutant.path, lines)
@@ -261,15 +272,34 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 def _judged_freshly(mutant: Mutant, tests: Sequence[str]) -> tuple[Verdict, str]:
     """Judge a mutant in a pytest of its own, which imports the changed module."""
-    command = ("-q", "-x", "--no-header", "-rN", "--tb=no", "-p", "tests.mutants.applied", *tests[:FRESH_TESTS])
+    command = ("-q", "-x", "--no-header", "-rfE", "--tb=no", "-p", "tests.mutants.applied", *tests[:FRESH_TESTS])
     try:
         run = subprocess.run(  # noqa: S603
             (sys.executable, "-m", "pytest", *command), cwd=ROOT, timeout=600, check=False, capture_output=True,
             env=os.environ | {MUTANT: json.dumps((mutant.path, mutant.node, mutant.kind))}, stdin=subprocess.DEVNULL,
+            text=True,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return Verdict.TIMED_OUT, "a pytest of its own"
-    return (Verdict.SURVIVED, "") if run.returncode == 0 else (Verdict.KILLED, "a pytest of its own")
+    if run.returncode == 0:
+        return Verdict.SURVIVED, ""
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.MULTILINE)
+    return Verdict.KILLED, failed[1] if failed else "a pytest of its own"
+
+
+def _identity(mutant: Mutant, test: str) -> list[str]:
+    """Return what a kill depends on: the change, the module that is changed, and the module of the test."""
+    files = [ROOT / mutant.path, ROOT / test.partition("::")[0]]
+    return [str(mutant), str(mutant.node), *(digest(file) if file.is_file() else "" for file in files)]
+
+
+def _remembered() -> Mapping[str, Sequence[tuple[list[str], Verdict, str]]]:
+    """Return the kills of earlier campaigns by mutant."""
+    found: dict[str, list[tuple[list[str], Verdict, str]]] = defaultdict(list)
+    for line in KILLED.read_text(encoding="utf-8").splitlines() if KILLED.exists() else ():
+        identity, verdict, test = json.loads(line)
+        found[identity[0]].append((identity, Verdict(verdict), test))
+    return found
 
 
 def _print(mutant: Mutant, judgement: Judgement) -> None:

@@ -1,6 +1,8 @@
 """What can be changed in a module so that it still runs but does something else."""
 
 import ast
+import hashlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,7 @@ class Mutant:
         node: number of the changed node, as `ast.walk` counts.
         kind: which of the changes of that node.
         change: the code before and after.
+        ordinal: how many alike there are before it in its place.
     """
 
     path: str
@@ -39,6 +42,12 @@ class Mutant:
     node: int
     kind: str
     change: str
+    ordinal: int = 0
+
+    def rank(self, seed: int) -> bytes:
+        """Return what orders mutants at random for a seed, and keeps that order when others come and go."""
+        what = f"{seed} {self.path} {self.place} {self.change} {self.ordinal}"
+        return hashlib.sha256(what.encode()).digest()
 
     def module(self, root: Path) -> CodeType:
         """Compile the changed module; its lines keep their numbers."""
@@ -57,6 +66,7 @@ def mutants_of(path: str, root: Path) -> Iterator[Mutant]:
     tree = ast.parse((root / path).read_text(encoding="utf-8"))
     places = {id(tree): ("", "")} | dict(_places(tree, "", ""))
     left_alone = {id(part) for node in ast.walk(tree) for root_of in _left_alone(node) for part in ast.walk(root_of)}
+    alike: Counter[tuple[str, str]] = Counter()
     for number, node in enumerate(ast.walk(tree)):
         if id(node) in left_alone:
             continue
@@ -65,7 +75,9 @@ def mutants_of(path: str, root: Path) -> Iterator[Mutant]:
             if kind == "assignment removed" and place.endswith("__init__"):
                 continue  # any test would miss the attribute
             before = ast.unparse(node.test if isinstance(node, ast.If) else node).partition("\n")[0][:SHOWN]
-            yield Mutant(path, place, function, _lines(node), number, kind, f"{kind}: {before}")
+            change = f"{kind}: {before}"
+            yield Mutant(path, place, function, _lines(node), number, kind, change, alike[place, change])
+            alike[place, change] += 1
 
 
 def _places(node: ast.AST, place: str, function: str) -> Iterator[tuple[int, tuple[str, str]]]:

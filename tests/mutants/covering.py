@@ -121,7 +121,7 @@ class _Recorder:
                 for line, tests in data.contexts_by_lineno(file).items()
             }
         record = {
-            "module": str(module.relative_to(ROOT)), "digest": _digest(module), "seconds": passed, "lines": lines,
+            "module": str(module.relative_to(ROOT)), "digest": digest(module), "seconds": passed, "lines": lines,
             "sources": sources,
         }  # fmt: skip
         _record_of(module).write_text(json.dumps(record), encoding="utf-8")
@@ -148,20 +148,21 @@ def record(tests: Iterable[str]) -> None:
 
 def _is_recorded(module: Path) -> bool:
     file = _record_of(module)
-    return file.exists() and json.loads(file.read_text(encoding="utf-8"))["digest"] == _digest(module)
+    return file.exists() and json.loads(file.read_text(encoding="utf-8"))["digest"] == digest(module)
 
 
 def _record_of(module: Path) -> Path:
     return RECORDS / (str(module.relative_to(ROOT)).replace("/", ".") + ".json")
 
 
-def _digest(file: Path) -> str:
+def digest(file: Path) -> str:
+    """Return what changes when a file does."""
     return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
 
 
 def _kept_source(file: Path) -> str:
     """Keep the text of a module under its digest, so that its lines can be followed."""
-    kept = RECORDS / "sources" / _digest(file)
+    kept = RECORDS / "sources" / digest(file)
     if not kept.exists():
         kept.write_bytes(file.read_bytes())
     return kept.name

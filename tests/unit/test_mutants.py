@@ -1,7 +1,7 @@
 """The tool behind `make mutants`: what it changes, and which tests it runs for a change."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
@@ -50,6 +50,16 @@ def test_a_change_is_made_where_it_says(mutants: Mapping[str, Mutant], tmp_path:
     assert (removed.lines, removed.place) == ((6, 6), "allowed")
     assert "check" not in function.co_names
     assert "log" in function.co_names
+
+
+def test_the_order_of_mutants_is_the_same_whatever_else_there_is(mutants: Mapping[str, Mutant], tmp_path: Path):
+    (tmp_path / "module.py").write_text("import other\n\n\n" + MODULE + "\n\nother.call(1 < 2)\n")
+    moved = list(mutants_of("module.py", tmp_path))
+
+    def names(those: Iterable[Mutant]) -> list[str]:
+        return [each.change for each in sorted(those, key=lambda mutant: mutant.rank(7)) if each.change in mutants]
+
+    assert names(moved) == names(mutants.values())
 
 
 def test_a_default_is_changed_where_the_function_is_defined(mutants: Mapping[str, Mutant]):

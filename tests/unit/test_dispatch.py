@@ -1,0 +1,501 @@
+"""Who may command an axis, how often, and what becomes of it: dispatcher, leases and requests, without a line."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.clock import Clock
+from ldcnd.daemon.command.authority import Authority
+from ldcnd.daemon.command.dispatch import Dispatcher
+from ldcnd.daemon.command.events import EventLog
+from ldcnd.daemon.command.ledger import Ledger
+from ldcnd.daemon.command.requests import PENDING_REQUESTS, Requests
+from ldcnd.daemon.line.rig import Rig
+from ldcnd.drivers.driver import StopMode
+from ldcnd.errors import (
+    CommandExpired,
+    CommandIdReused,
+    DuplicateDaemon,
+    LdcndError,
+    LeaseExpired,
+    LeaseHeld,
+    LeaseRequired,
+    MalformedRequest,
+    NotReferenced,
+    OutcomeUnknown,
+    ReplyTimeout,
+    StaleSequence,
+    UnknownAxis,
+)
+from ldcnd.messaging.session import Query
+from ldcnd.model.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
+from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.model.rig_commands import (
+    Acquire,
+    AxisMove,
+    LeaseReply,
+    ListHolders,
+    MoveTogether,
+    Rehearsal,
+    Rehearse,
+    Release,
+    Renew,
+)
+from ldcnd.model.samples import AxisState
+from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, raising
+
+THERE = MoveAbsolute(position=10.0)
+INSTANCE = "run-1"
+
+
+class Line:
+    """What is asked of a line here."""
+
+    network = None
+
+    def __init__(self, axes: tuple[AxisService, ...], wire: list[bytes]) -> None:
+        self.axes = axes
+        log = SimpleNamespace(add=lambda _at_s, _event, line: wire.append(line))
+        self.bus = SimpleNamespace(wire_log=log, settings=SimpleNamespace(name="line"))
+
+    async def stop_together(self, _mode: StopMode, _names: frozenset[str]) -> None:
+        """Every drive is stopped by itself as well."""
+
+
+class Commanded:
+    """Two axes and all that stands between them and the network."""
+
+    def __init__(self, x: AxisBench, y: AxisBench, group: asyncio.TaskGroup, *, required: bool) -> None:
+        self.x, self.y = x, y
+        self.wire: list[bytes] = []
+        self.rig = Rig("bench", (Line((x.axis, y.axis), self.wire),), {"both": ("x", "y")})
+        self.authority = Authority(["x", "y"], required=required)
+        clock = Clock(lambda: round(asyncio.get_running_loop().time() * 1e9))
+        events = EventLog(x._publisher, clock, INSTANCE)
+        ledger = Ledger(events.changed, clock.now_s)
+        ids = iter(f"made-{number}" for number in range(1000))
+        self.dispatcher = Dispatcher(self.rig, self.authority, ledger, events, clock, lambda: next(ids), INSTANCE)
+        self.dispatcher.leases.group = group
+        self.requests = Requests(self.rig, KEYS, group, self.dispatcher)
+        for bench in (x, y):
+            bench.tracker._ended = ledger.ended
+        self.answers: list[dict] = []
+
+    async def send(self, command, axis: str = "x", login: str | None = None):
+        return await self.dispatcher.answer(axis, command, login)
+
+    async def acquired(self, *axes: str, client: str = "ann", **fields: object) -> LeaseReply:
+        return await self.send(Acquire(client=client, axes=axes, **fields), "_")
+
+    def query(self, key: str, payload: bytes = b"") -> Query:
+        """Return a query whose answer is kept."""
+        return Query(key, {}, payload, "application/json", lambda answers: self.answers.extend(map(_json, answers)))
+
+    def page(self) -> list[tuple[str, str, str]]:
+        """Return what the events say: axis, verb, status."""
+        found = self.dispatcher.events.page(ReadEvents(count=100)).events
+        return [(event.axis, event.verb, event.status.value) for event in found]
+
+
+def _json(answer) -> dict:
+    return json.loads(answer.payload)
+
+
+@asynccontextmanager
+async def commanded(*, required: bool = False, **axis: object) -> AsyncIterator[Commanded]:
+    async with axis_bench(**axis) as x, axis_bench(name="y", **axis) as y, asyncio.TaskGroup() as group:
+        yield Commanded(x, y, group, required=required)
+
+
+# -- at most once ------------------------------------------------------------------------------------------------------
+
+
+async def test_a_repeated_command_moves_once_and_is_answered_alike_also_while_it_is_under_way():
+    command = THERE.model_copy(update={"command_id": "c1"})
+    async with commanded() as rig:
+        released = asyncio.Event()
+        rig.x.drive.during["load"] = released.wait
+        async with asyncio.TaskGroup() as group:
+            first = group.create_task(rig.send(command), name="first")
+            await asyncio.sleep(0)
+            second = group.create_task(rig.send(command), name="second")
+            await asyncio.sleep(0.01)
+            assert not second.done()
+            released.set()
+        third = await rig.send(command)
+
+        assert first.result() == second.result() == third
+        assert rig.x.drive.calls == ["load", "start"]
+        with pytest.raises(CommandIdReused):
+            await rig.send(command.model_copy(update={"position": 11.0}))
+        with pytest.raises(CommandIdReused):
+            await rig.send(command, "y")
+
+
+async def test_a_repeated_refusal_stays_a_refusal():
+    command = THERE.model_copy(update={"command_id": "c1"})
+    async with commanded() as rig:
+        rig.x.tracker.referenced = False
+        with pytest.raises(NotReferenced):
+            await rig.send(command)
+        rig.x.tracker.referenced = True
+        with pytest.raises(NotReferenced):
+            await rig.send(command)
+
+        outcome = await rig.send(ReadOutcome(command_id="c1"), "_")
+        assert (outcome.status, outcome.axis, outcome.verb) == (CommandStatus.REFUSED, "x", "move_absolute")
+        assert rig.x.drive.calls == []
+
+
+async def test_a_repeated_halt_halts_again_under_an_id_of_its_own():
+    async with commanded() as rig:
+        for expected in (1, 2):
+            await rig.x.send(MoveVelocity(velocity=1.0))
+            await rig.x.pass_s(0.1, **RUNNING)
+            reply = await rig.send(Halt(command_id="h1"))
+            assert rig.x.drive.calls.count("stop") == expected
+            await rig.x.settled()
+
+    assert reply.command_id != "h1"
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(ReplyTimeout("no reply"), CommandStatus.FAILED), (OutcomeUnknown("no reply"), CommandStatus.UNKNOWN)],
+)
+async def test_the_outcome_tells_what_became_of_a_command(error, status):
+    async with commanded() as rig:
+        rig.x.drive.during["start"] = raising(error)
+        with pytest.raises(LdcndError):
+            await rig.send(THERE.model_copy(update={"command_id": "c1"}))
+
+        assert (await rig.send(ReadOutcome(command_id="c1"), "_")).status is status
+
+
+async def test_a_motion_is_executing_until_the_readings_end_it_and_other_commands_are_done_at_once():
+    async with commanded() as rig:
+        await rig.send(SetGains(kp=100, command_id="c0"))
+        await rig.send(THERE.model_copy(update={"command_id": "c1"}))
+        await rig.x.pass_s(0.1, **RUNNING)
+        assert [(await rig.send(ReadOutcome(command_id=each), "_")).status for each in ("c0", "c1")] == [
+            CommandStatus.DONE, CommandStatus.EXECUTING,
+        ]  # fmt: skip
+        await rig.x.pass_s(0.1, **STANDING)
+        assert (await rig.send(ReadOutcome(command_id="c1"), "_")).status is CommandStatus.DONE
+
+
+async def test_a_command_that_is_cut_short_is_unknown_and_not_carried_out_again():
+    command = THERE.model_copy(update={"command_id": "c1"})
+    async with commanded() as rig:
+        rig.x.drive.during["load"] = asyncio.Event().wait
+        task = asyncio.create_task(rig.send(command), name="cut short")
+        await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.wait([task])
+
+        assert (await rig.send(ReadOutcome(command_id="c1"), "_")).status is CommandStatus.UNKNOWN
+        with pytest.raises(OutcomeUnknown):
+            await rig.send(command)
+        assert rig.x.drive.calls == ["load"]
+
+
+# -- who may -----------------------------------------------------------------------------------------------------------
+
+
+async def test_what_brings_an_axis_to_rest_is_admitted_whatever_else_forbids():
+    async with commanded(required=True) as rig:
+        await rig.acquired("x", client="bob")
+        rig.dispatcher.rival = "another"
+        for command in (Stop(not_after=1, instance="other"), Halt(not_after=1, instance="other")):
+            await rig.x.pass_s(0.1, **RUNNING)
+            await rig.send(command)
+            await rig.x.settled()
+
+    assert rig.x.drive.told[0] == ("stop", StopMode.SMOOTH)
+
+
+@pytest.mark.parametrize("command", [THERE, Power(on=True), MoveVelocity(velocity=1.0), SetGains(kp=1)])
+async def test_what_may_move_or_changes_a_drive_is_refused_without_a_right_to_it(command):
+    async with commanded(required=True) as rig:
+        with pytest.raises(LeaseRequired):
+            await rig.send(command)
+        other = await rig.acquired("y")
+        with pytest.raises(LeaseHeld):
+            await rig.send(command.model_copy(update={"lease": other.lease}))
+        mine = await rig.acquired("x")
+        rig.dispatcher.rival = "another"
+        with pytest.raises(DuplicateDaemon):
+            await rig.send(command.model_copy(update={"lease": mine.lease}))
+        rig.dispatcher.rival = None
+        with pytest.raises(CommandExpired, match="another run"):
+            await rig.send(command.model_copy(update={"lease": mine.lease, "instance": "run-0"}))
+        with pytest.raises(CommandExpired, match="later than its sender allows"):
+            await rig.send(command.model_copy(update={"lease": mine.lease, "not_after": 1}))
+        assert rig.x.drive.calls == []
+
+        later_ns = round((asyncio.get_running_loop().time() + 1.0) * 1e9)
+        await rig.send(command.model_copy(update={"lease": mine.lease, "instance": INSTANCE, "not_after": later_ns}))
+        assert rig.x.drive.calls
+
+
+async def test_sequences_go_upwards_and_an_event_names_who_sent():
+    async with commanded() as rig:
+        mine = await rig.acquired("x")
+        await rig.send(SetGains(kp=1, lease=mine.lease, sequence=5))
+        with pytest.raises(StaleSequence):
+            await rig.send(SetGains(kp=2, lease=mine.lease, sequence=5))
+        events = rig.dispatcher.events.page(ReadEvents(count=10)).events
+
+    assert [event.client for event in events if event.verb == "set_gains"] == ["ann", "ann"]
+
+
+async def test_a_buffered_move_is_refused_when_its_lease_has_ended_before_its_turn():
+    async with commanded() as rig:
+        mine = await rig.acquired("x", lease_s=0.5)
+        await rig.send(THERE.model_copy(update={"lease": mine.lease}))
+        await rig.x.pass_s(0.1, **RUNNING)
+        async with asyncio.TaskGroup() as group:
+            waiting = group.create_task(
+                _outcome(rig.send(MoveAbsolute(position=20.0, lease=mine.lease, buffer_mode=BufferMode.BUFFERED))),
+                name="next",
+            )
+            await rig.x.pass_s(0.5, **STANDING)
+
+        assert isinstance(waiting.result(), LeaseExpired)
+        assert rig.x.drive.calls == ["load", "start"]
+
+
+async def test_a_buffered_move_is_refused_when_it_comes_too_late_or_a_rival_has_appeared():
+    async with commanded() as rig:
+        for late in (True, False):
+            await rig.send(THERE)
+            await rig.x.pass_s(0.1, **RUNNING)
+            not_after = round((asyncio.get_running_loop().time() + (0.3 if late else 9.0)) * 1e9)
+            move = MoveAbsolute(position=20.0, buffer_mode=BufferMode.BUFFERED, not_after=not_after)
+            async with asyncio.TaskGroup() as group:
+                waiting = group.create_task(_outcome(rig.send(move)), name="next")
+                await asyncio.sleep(0.5)
+                rig.dispatcher.rival = None if late else "another"
+                await rig.x.settled()
+            assert isinstance(waiting.result(), CommandExpired if late else DuplicateDaemon)
+
+    assert rig.x.drive.calls == ["load", "start"] * 2
+
+
+async def test_why_and_preview_tell_what_the_sender_would_be_refused_with_and_do_nothing():
+    async with commanded(required=True) as rig:
+        mine = await rig.acquired("x")
+        assert [cause.code for cause in (await rig.send(Why())).causes] == ["lease_held"]
+        assert (await rig.send(Why(lease=mine.lease))).can_move
+        rig.dispatcher.rival = "another"
+        assert [cause.code for cause in (await rig.send(Why(lease=mine.lease))).causes] == ["duplicate_daemon"]
+        rig.x.tracker.referenced = False
+        obstacles = (await rig.send(Preview(position=1.0))).obstacles
+        assert len(obstacles) == 2
+        assert len((await rig.send(Preview(distance=1.0))).obstacles) == 1
+
+    assert rig.x.drive.calls == []
+    assert rig.page() == []
+
+
+@pytest.mark.parametrize("kind", Rehearsal)
+async def test_a_loss_is_rehearsed_only_by_who_may_move_all_that_it_concerns(kind):
+    async with commanded(required=True) as rig:
+        mine = await rig.acquired("x")
+        rig.dispatcher.rival = "another"
+        with pytest.raises(DuplicateDaemon):
+            await rig.send(Rehearse(kind=kind, axis="x", lease=mine.lease), "_")
+        rig.dispatcher.rival = None
+        with pytest.raises((LeaseRequired, LeaseHeld)):
+            await rig.send(Rehearse(kind=kind, axis="y"), "_")
+        if kind is Rehearsal.BUS_LOSS:  # y is on the same line
+            with pytest.raises(LeaseHeld):
+                await rig.send(Rehearse(kind=kind, axis="x", lease=mine.lease), "_")
+        else:
+            await rig.x.send(MoveVelocity(velocity=1.0))
+            await rig.x.pass_s(0.1, **RUNNING)
+            reply = await rig.send(Rehearse(kind=kind, axis="x", lease=mine.lease), "_")
+            assert (reply.policy, rig.x.drive.told[-1]) == ("halt", ("stop", StopMode.SMOOTH))
+
+
+async def test_a_group_move_names_each_axis_once_and_axes_of_one_line():
+    async with commanded() as rig:
+        with pytest.raises(MalformedRequest):
+            await rig.send(MoveTogether(moves=(AxisMove(axis="x", position=1.0),) * 2), "_")
+        with pytest.raises(UnknownAxis):
+            await rig.send(
+                MoveTogether(moves=(AxisMove(axis="x", position=1.0), AxisMove(axis="q", position=1.0))), "_"
+            )
+
+
+# -- leases ------------------------------------------------------------------------------------------------------------
+
+
+async def moving(rig: Commanded, lease: str | None = None) -> None:
+    await rig.send(MoveVelocity(velocity=1.0, lease=lease))
+    await rig.x.pass_s(0.1, **RUNNING)
+    rig.x.drive.told.clear()
+
+
+@pytest.mark.parametrize("how", ["expired", "forced", "subset", "released"])
+async def test_however_control_ends_what_moved_comes_to_rest(how):
+    async with commanded(loss={"client": "quick_stop"}) as rig:
+        mine = await rig.acquired("x", "y", lease_s=1.0)
+        await moving(rig, mine.lease)
+        if how == "expired":
+            await asyncio.sleep(1.0)
+            rig.dispatcher.leases.expire()
+        elif how == "forced":
+            await rig.acquired("y", client="bob", force=True)
+        elif how == "subset":
+            await rig.acquired("y")
+        else:
+            await rig.send(Release(lease=mine.lease), "_")
+        await asyncio.sleep(0.001)
+
+        assert rig.x.drive.told == [("stop", StopMode.ABRUPT)]
+        assert rig.y.drive.calls == []  # it stands
+        lost = [event for event in rig.page() if event[1] == "acquire"]
+        assert ("x", "acquire", "aborted") in lost
+
+
+async def test_a_renewed_or_wider_lease_keeps_what_moves_and_leave_running_lets_it_go_on():
+    async with commanded() as rig:
+        mine = await rig.acquired("x", lease_s=1.0)
+        await moving(rig, mine.lease)
+        await asyncio.sleep(0.6)
+        renewed = await rig.send(Renew(lease=mine.lease), "_")
+        await asyncio.sleep(0.6)
+        rig.dispatcher.leases.expire()
+        wider = await rig.acquired("both")
+        await rig.send(Release(lease=wider.lease, leave_running=True), "_")
+        await asyncio.sleep(0.001)
+
+        assert (renewed.lease, wider.axes) == (mine.lease, ("x", "y"))
+        assert rig.x.drive.calls == []
+        assert [event for event in rig.page() if event[1] == "acquire"] == [("x", "acquire", "done")]
+
+
+async def test_holders_are_told_and_a_refused_acquire_leaves_an_event():
+    async with commanded(required=True) as rig:
+        await rig.acquired("x")
+        with pytest.raises(LeaseHeld):
+            await rig.acquired("x", client="bob")
+        holders = await rig.send(ListHolders(), "_")
+
+        assert holders.required
+        assert [(each.axis, each.client) for each in holders.holders] == [("x", "ann"), ("y", None)]
+        assert rig.page() == [("x", "acquire", "refused")]
+
+
+async def test_the_watch_ends_leases_by_itself():
+    async with commanded() as rig:
+        mine = await rig.acquired("x", lease_s=1.0)
+        await moving(rig, mine.lease)
+        watch = asyncio.create_task(rig.dispatcher.leases.run(), name="watch")
+        await asyncio.sleep(1.01)
+        assert rig.x.drive.calls == ["stop"]
+        watch.cancel()
+        await asyncio.wait([watch])
+
+
+# -- queries -----------------------------------------------------------------------------------------------------------
+
+
+async def test_a_lease_that_has_ended_is_acted_upon_before_a_command_that_waited_is_looked_at():
+    async with commanded(loss={"client": "power_off"}) as rig:
+        mine = await rig.acquired("x", lease_s=1.0)
+        await moving(rig, mine.lease)
+        await asyncio.sleep(2.0)  # nobody has looked: the process was frozen
+
+        rig.requests.on_command(rig.query(KEYS.command("x", "power"), b'{"on": true}'))
+        await asyncio.sleep(0.01)
+
+        assert rig.x.drive.told[0] == ("stop", StopMode.OFF)
+
+
+async def test_so_many_commands_may_be_under_way_and_no_more():
+    async with commanded() as rig:
+        released = asyncio.Event()
+        rig.x.drive.during["set_gains"] = released.wait
+        for _ in range(PENDING_REQUESTS + 1):
+            rig.requests.on_command(rig.query(KEYS.command("x", "set_gains"), b'{"kp": 1}'))
+        assert [answer["code"] for answer in rig.answers] == ["too_many_requests"]
+        released.set()
+        await asyncio.sleep(0.01)
+        rig.answers.clear()
+        rig.requests.on_command(rig.query(KEYS.command("x", "set_gains"), b'{"kp": 1}'))
+        await asyncio.sleep(0.01)
+
+    assert rig.answers[0]["verb"] == "set_gains"
+
+
+@pytest.mark.parametrize(
+    ("axis", "verb", "payload", "code"),
+    [
+        ("q", "halt", b"", "unknown_axis"),
+        ("q", "dance", b"", "unknown_axis"),
+        ("x", "dance", b"", "unknown_verb"),
+        ("_", "dance", b"", "unknown_verb"),
+        ("x", "plan", b"", "unknown_verb"),
+        ("x", "power", b"nonsense", "malformed_request"),
+    ],
+)
+async def test_a_query_that_means_nothing_is_refused(axis, verb, payload, code):
+    async with commanded() as rig:
+        rig.requests.on_command(rig.query(KEYS.command(axis, verb), payload))
+        await asyncio.sleep(0.01)
+
+    assert [answer["code"] for answer in rig.answers] == [code]
+
+
+async def test_a_daemon_that_ends_takes_stops_and_refuses_everything_else():
+    async with commanded() as rig:
+        await moving(rig)
+        rig.requests.close()
+        rig.requests.on_command(rig.query(KEYS.command("x", "power"), b'{"on": true}'))
+        rig.requests.on_stop(rig.query(KEYS.stop("x"), b"nonsense"))
+        await asyncio.sleep(0.01)
+
+    assert [answer.get("code") for answer in rig.answers] == ["shutting_down", None]
+    assert rig.answers[1]["confirmed"] == ["x"]
+    assert rig.x.drive.calls == ["stop"]
+    assert rig.page()[-1] == ("x", "stop", "done")
+
+
+async def test_a_stop_of_the_rig_latches_every_axis_and_enters_one_event_for_each():
+    async with commanded() as rig:
+        rig.y.drive.during["stop"] = raising(ReplyTimeout("no reply"))
+        rig.y.bus.is_open = False
+        rig.requests.on_stop(rig.query(KEYS.stop(None), b'{"client": "ann"}'))
+        assert not rig.x.tracker.stop_latched  # callbacks only hand over
+        await asyncio.sleep(0.01)
+
+        assert (rig.x.tracker.stop_latched, rig.y.tracker.stop_latched) == (True, True)
+        assert rig.answers[0]["axes"] == ["x", "y"]
+        assert rig.answers[0]["confirmed"] == ["x"]
+        assert rig.page() == [("x", "stop", "done"), ("y", "stop", "unknown")]
+        assert rig.wire[-1] == b"@stop {}"
+
+
+async def test_commands_are_noted_on_the_wire_log_and_questions_are_not():
+    async with commanded() as rig:
+        await rig.send(THERE)
+        await rig.send(Why())
+        await rig.send(ListHolders(), "_")
+        await rig.acquired("x")
+
+        assert [line.split(b" ")[0] for line in rig.wire] == [b"x/move_absolute", b"_/acquire"]
+        assert rig.x.tracker.state is AxisState.DISCRETE_MOTION
+
+
+async def _outcome(call):
+    try:
+        return await call
+    except LdcndError as error:
+        return error
