@@ -55,7 +55,7 @@ async def test_a_path_that_a_host_has_left_is_stopped():
 
     async with adopting_rig(SC, rig, loss=RUN_ON) as again:
         assert again.drive.loop.trajectory.path.running
-        await asyncio.sleep(0.5)
+        await asyncio.sleep(0.9)
 
         assert not again.drive.loop.trajectory.path.running
         assert abs(await true_speed(again)) < 0.1

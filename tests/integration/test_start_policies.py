@@ -5,6 +5,7 @@ import contextlib
 
 import pytest
 
+from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import LoadTrajectory
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
@@ -57,9 +58,11 @@ async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_adopts():
         await asyncio.sleep(0.5)
         (bus,) = await rig.client.buses()
         sent = commands_in(rig.sent)
+        stops = [packet.data[0] & StopControl.SMOOTH for packet in rig.sent if packet.command is Command.STOP_MOTOR]
 
     assert adopted_with <= HARMLESS | OPEN_LOOPS_OFF
     assert sent <= HARMLESS | OPEN_LOOPS_OFF
+    assert not any(stops)  # a motion with an end has it
     assert (moving.state, moving.referenced) == (AxisState.DISCRETE_MOTION, False)
     assert (ended.state, ended.last_error) == (AxisState.STANDSTILL, None)
     assert (bus.up, bus.started_by, bus.baud) == (True, "adoption", 115_200)

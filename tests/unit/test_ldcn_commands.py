@@ -88,6 +88,21 @@ def test_a_node_address_is_a_byte(address):
 # -- what may be sent again ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("to", [NODE, Group(0x81, LS_182AP)])
+def test_what_can_move_a_motor_says_so(to):
+    standing = Trajectory(velocity=0, acceleration=1, mode=ProfileMode.VELOCITY)
+    moving = (
+        commands.start_motion(to),
+        commands.load_trajectory(to, standing),
+        commands.stop_motor(to, StopControl.AMP_ENABLE | StopControl.SMOOTH),
+        commands.set_gain(to, GAINS),
+    )
+    quiet = (commands.read_status(to, StatusItem.AUX), commands.no_operation(to), commands.clear_sticky_bits(to))
+
+    assert all(exchange.moves for exchange in moving)
+    assert not any(exchange.moves for exchange in quiet)
+
+
 def test_what_could_act_twice_is_never_repeated():
     exchanges = (
         commands.reset_position(NODE),

@@ -21,7 +21,7 @@ from ldcnd.daemon.axis.parameters import Parameters
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedure import Turn
-from ldcnd.daemon.axis.state import AxisTracker, Ended, ObservedTracker
+from ldcnd.daemon.axis.state import REST_COUNTS, AxisTracker, Ended, ObservedTracker
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
@@ -152,6 +152,8 @@ def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str, _code
     pass
 
 
+SETTLES_WITHIN_S = 0.25
+"""A shaft whose profile is done follows it by then."""
 STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
 """Of two stops that no drive has confirmed, the stronger one is sent again."""
 
@@ -207,6 +209,7 @@ class AxisService:
         self._pending: StopMode | None = None
         self.line_up = False
         self._inherited = False
+        self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
         self._seen = False
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
@@ -288,7 +291,7 @@ class AxisService:
         if self._commands.step_due:
             self._turns.wake()
         if self._inherited:
-            self._end_what_has_no_end(reading)
+            self._end_what_has_no_end(reading, timing.sent_at_s)
         t, t_error_ns = self._clock.stamp(timing)
         self.telemetry.reading(reading, asked, t, t_error_ns)
 
@@ -466,16 +469,26 @@ class AxisService:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
         self._inherited = self.stoppable
 
-    def _end_what_has_no_end(self, reading: AxisReading) -> None:
+    def _end_what_has_no_end(self, reading: AxisReading, at_s: float) -> None:
         """Have a motion stopped that an earlier host has left, if its profile is done and yet it goes on.
 
-        So does velocity mode as soon as its velocity is reached; a trapezoid is done when it stands.
+        So does velocity mode as soon as its velocity is reached; a trapezoid is done when it stands, and settles.
         """
-        tracker = self.tracker
+        tracker, position = self.tracker, reading.position_counts
         if tracker.command is not None or tracker.at_rest:
-            self._inherited = False
-        elif reading.enabled and reading.profile_done and tracker.moving is Moving.YES:
-            self._inherited = False
+            self._inherited, self._done = False, None
+        elif not (reading.enabled and reading.profile_done):
+            self._done = None
+        elif self._done is None:
+            self._done = (at_s, position, False)
+        else:
+            since_s, was_at, settled = self._done
+            if at_s - since_s < SETTLES_WITHIN_S:
+                return
+            if not settled or abs(position - was_at) <= REST_COUNTS:
+                self._done = (at_s, position, True)
+                return
+            self._inherited, self._done = False, None
             log.warning("motion without an end found", axis=self.config.name)
             self._pending = self._pending or StopMode.SMOOTH
             self._not_confirmed()
