@@ -22,7 +22,7 @@ def test_a_fix_that_can_be_taken_back_stands_in_its_module(revert: Revert):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("number", range(len(REVERTS)), ids=map(name, REVERTS))
 def test_a_fix_that_is_taken_back_is_missed_by_each_of_its_tests(number: int):
     revert = REVERTS[number]
