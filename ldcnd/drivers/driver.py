@@ -203,7 +203,7 @@ class ReadingListeners:
 class AxisDriver(ABC):
     """One drive. Commands raise the `BusError` that befell them; none of them is repeated when that could move twice.
 
-    Exchanges that can make a motor move say so (`Exchange.moves`): the bus asks for permission when their turn has come.
+    What can make a motor move says so (`Exchange.moves`): the bus asks for permission when the turn of it has come.
 
     Attributes:
         spec: what the configuration says.
