@@ -201,10 +201,10 @@ async def test_parameters_are_read_compared_and_written(house, tmp_path):
         await desk.page.get_by_label("Compare with a file").set_input_files(dump)
         await expect(row).to_contain_text("differs")
         await desk.button("Plan").click()
-        await expect(desk.panel("Restore from the file")).to_contain_text("Pn100")
+        await expect(desk.panel("Restore, save or clone")).to_contain_text("Pn100")
         await desk.button("Write 2 values").click()
 
-        await expect(desk.panel("Restore from the file")).to_contain_text("the drive holds the values")
+        await expect(desk.panel("Restore, save or clone")).to_contain_text("the drive holds the values")
         request = ReadParameter(parameter="Pn100")
         reading = await house.mixed.rig.command("feed", request, 60)
         assert (reading.value.active, reading.value.stored) == (90, 90)

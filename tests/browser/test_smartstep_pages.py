@@ -5,7 +5,7 @@ import re
 import pytest
 
 from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
-from ldcnd.model.parameters import ReadAllParameters, ReadParameter
+from ldcnd.model.parameters import Memory, ReadAllParameters, ReadParameter, WriteParameter
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
@@ -75,6 +75,28 @@ async def test_parameters_are_shown_with_factory_values_as_hints_and_written_dig
         await expect(wear).to_contain_text("0 writes counted for this drive.")
         dump = await house.mixed.rig.command("spool", ReadAllParameters(), 60)
         assert {value.eeprom_total for value in dump.values} == {0}
+
+
+async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
+    await house.mixed.rig.command("spool", WriteParameter(parameter="Pn401", value=77), 60)
+    await house.mixed.rig.command("feed", WriteParameter(parameter="Pn402", value=222, memory=Memory.EEPROM), 60)
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Take control").click()
+        await desk.button("Read all").click()
+        panel = desk.panel("Restore, save or clone")
+        await panel.get_by_label("Values of").select_option("what spool has in use, for good")
+        await desk.button("Plan").click()
+        await expect(panel.get_by_role("row", name=re.compile("Pn401 "))).to_contain_text("004DH")
+        await panel.get_by_role("button", name=re.compile("^Write ")).click()
+        await expect(panel).to_contain_text("the drive holds the values")
+
+        await panel.get_by_label("Values of").select_option("the drive mixed · feed")
+        await desk.button("Plan").click()
+        await expect(panel.get_by_role("row", name=re.compile("Pn402 .* eeprom"))).to_contain_text("222 (00DEH)")
+
+    saved = await house.mixed.rig.command("spool", ReadParameter(parameter="Pn401"), 60)
+    assert saved.value.stored == 77
 
 
 async def test_the_alarm_history_is_numbered_as_in_the_manual(house):

@@ -1,4 +1,4 @@
-/** The parameters of a drive that has readable ones: both memories, wear, dump, compare, restore. */
+/** The parameters of a drive that has readable ones: both memories, wear, digits, compare, restore, save, clone. */
 
 import { html, useEffect, useState } from "../html.js";
 import { save } from "../parts/chart_view.js";
@@ -76,7 +76,7 @@ function Memories({ axis }) {
     <//>
     ${values && html`<${Change} axis=${axis} values=${values} listed=${listed} onWritten=${renew} />`}
     ${values && html`<${Wear} axis=${axis} values=${values} onCounted=${recount} />`}
-    ${values && file && html`<${Restore} axis=${axis} file=${file} onWritten=${renew} />`}
+    ${values && html`<${Transfer} key=${file?.name} axis=${axis} file=${file} values=${values} onWritten=${renew} />`}
     <${AuthorityPanel} axis=${axis} />
     <${AlarmPanel} axis=${axis} />`;
 }
@@ -227,18 +227,55 @@ function Wear({ axis, values, onCounted }) {
   <//>`;
 }
 
+/** Where values can come from: a file, another drive, or what this drive has in use. */
+function sourcesOf(axis, file, values) {
+  const others = [...useRigs().values()]
+    .flatMap((rig) => [...rig.axes.values()])
+    .filter((each) => each !== axis && each.can("list_parameters"));
+  return [
+    file && {
+      title: `the file ${file.name}`,
+      ask: async () => ({ values: Object.fromEntries(file.values), driver_type: file.driverType }),
+    },
+    {
+      title: `what ${axis.name} has in use, for good`,
+      ask: async () => ({ values: words(values.filter(differing), "active"), any_type: true, memory: "eeprom" }),
+    },
+    ...others.map((other) => ({
+      title: `the drive ${other.rig.name} · ${other.name}`,
+      ask: async () => {
+        const dump = await command(other, "read_all_parameters", {}, PATIENCE_MS);
+        return { values: words(dump.values, "stored"), driver_type: dump.facts.driver_type };
+      },
+    })),
+  ].filter(Boolean);
+}
+
+function differing({ active, stored }) {
+  return active !== stored;
+}
+
+function words(values, memory) {
+  return Object.fromEntries(values.map((value) => [value.parameter, value[memory]]));
+}
+
 /** The daemon plans; this page shows the plan, sends its writes one by one, and plans again to prove them. */
-function Restore({ axis, file, onWritten }) {
+function Transfer({ axis, file, values, onWritten }) {
+  const sources = sourcesOf(axis, file, values);
+  const [chosen, setChosen] = useState(null);
+  const [wanted, setWanted] = useState(null);
   const [plan, setPlan] = useState(null);
   const [told, setTold] = useState([]);
+  const source = sources.find((each) => each.title === chosen) ?? sources[0];
+  const planned = async (request) => (await command(axis, "plan_parameters", request, PATIENCE_MS)).plan;
   const ask = async () => {
-    const wanted = { values: Object.fromEntries(file.values), driver_type: file.driverType };
-    return (await command(axis, "plan_parameters", wanted, PATIENCE_MS)).plan;
+    const request = await source.ask();
+    return { request, plan: await planned(request) };
   };
   const way =
     obstacle(axis, "write_parameter") ??
     (!plan ? "Plan it first." : plan.problems.length ? plan.problems[0] : plan.writes.length ? null : "Nothing differs.");
-  async function restore() {
+  async function transfer() {
     const lines = [];
     for (const [place, { parameter, value, memory }] of plan.writes.entries()) {
       setTold([`${place + 1} of ${plan.writes.length}: ${parameter} to ${memory}`]);
@@ -251,25 +288,33 @@ function Restore({ axis, file, onWritten }) {
         break;
       }
     }
-    const left = await ask();
+    const left = await planned(wanted);
     setPlan(left);
-    setTold([left.writes.length ? "Read back: not all is written. The same again completes it." :
-      "Read back: the drive holds the values.", ...new Set(lines)]);
+    setTold([
+      left.writes.length
+        ? "Read back: not all is written. The same again completes it."
+        : "Read back: the drive holds the values.",
+      ...new Set(lines),
+    ]);
   }
-  return html`<${Panel} title="Restore from the file" note="The unit number in Pn000 stays as it is in the drive.">
-    <p class="row"><${Action} act=${ask} onDone=${setPlan} obstacle=${obstacle(axis, "parameters")}>Plan<//></p>
+  return html`<${Panel} title="Restore, save or clone" note="The unit number in Pn000 stays as it is in the drive.">
+    <${Choice} label="Values of" options=${sources.map(({ title }) => [title, title])} value=${source.title}
+      onChange=${(title) => (setChosen(title), setPlan(null))} />
+    <p class="row"><${Action} act=${ask} obstacle=${obstacle(axis, "parameters")}
+      onDone=${({ request, plan }) => (setWanted(request), setPlan(plan))}>Plan<//></p>
     ${plan?.problems.map((each) => html`<p><${Mark} level="bad">cannot be done<//> ${each}</p>`)}
     ${
       plan?.writes.length > 0 &&
       html`<${Table} label="Writes" head=${["Parameter", "Memory", "#Now", "#New", "Takes effect"]}
       rows=${plan.writes.map(
         (write) => html`<tr><th scope="row">${write.parameter} ${write.name}</th><td>${write.memory}</td>
-        <td class="number">${write.before}</td><td class="number">${write.value} (${hex(write.value)})</td>
+        <td class="number">${write.before} (${hex(write.before)})</td>
+        <td class="number">${write.value} (${hex(write.value)})</td>
         <td>${write.effective}${write.digits.map((digit) => html`<br /><small>${digit}</small>`)}</td></tr>`,
       )} />`
     }
     ${plan?.remarks.map((each) => html`<p class="quiet">${each}</p>`)}
-    <p class="row"><${Action} act=${restore} obstacle=${way}
+    <p class="row"><${Action} act=${transfer} obstacle=${way}
       kind="main">Write ${plan?.writes.length === 1 ? "1 value" : `${plan?.writes.length ?? 0} values`}<//></p>
     <div role="status">${told.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;

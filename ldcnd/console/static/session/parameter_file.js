@@ -8,7 +8,8 @@ export function asToml(axis, { values, facts }) {
   const stored = values.map(({ parameter, stored, name }) => `${parameter} = ${stored}  # ${name}`);
   const inUse = values.map(({ parameter, active }) => `${parameter} = ${active}`);
   const about = facts
-    ? `driver_type = ${facts.driver_type}\nsoftware_version = ${facts.software_version}\nunit = ${facts.unit}\n`
+    ? `driver_type = ${facts.driver_type}\nsoftware_version = ${facts.software_version}\nunit = ${facts.unit}\n` +
+      `gain_switch = ${facts.gain_switch}\nswitches_on = ${JSON.stringify(facts.switches.map((each) => each.toLowerCase()))}\n`
     : "";
   const head = `axis = "${axis}"\nread_at = ${new Date().toISOString()}\n${about}`;
   return `${head}\n[parameters]\n${stored.join("\n")}\n\n[in_use]\n${inUse.join("\n")}\n`;
