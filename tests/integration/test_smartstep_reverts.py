@@ -69,8 +69,8 @@ REVERTS = (
         4,
         "unit/test_smartstep_trace.py::test_either_edge_of_a_value_is_refused_because_the_drive_would_take_any_change",
         S + "trace_result.py",
-        "    elif trigger.kind is TriggerKind.EITHER:\n",
-        "    elif trigger.kind is None:\n",
+        "    if kind is TriggerKind.EITHER and trigger.channel not in SIGNALS:\n",
+        "    if kind is None:\n",
     ),
     revert(
         5,

@@ -8,7 +8,7 @@ import pytest
 from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_AREA, OperatingMode, Register, TraceRegister
 from ldcnd.drivers.smartstep.packet import Function, decode_command
 from ldcnd.drivers.smartstep.parameters import PN102
-from ldcnd.drivers.smartstep.profiles import SmartStepProfile, TriggerWordSource
+from ldcnd.drivers.smartstep.profiles import SmartStepProfile
 from ldcnd.errors import BusError, DriveFault, RequestRefused
 from ldcnd.model.parameters import CounterName, Memory, WriteParameter
 from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
@@ -17,9 +17,7 @@ from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import LosingUnit, executes_in_a_fresh_mode_only, smartstep_line
 
 WITHIN_S = 30.0
-SHORT = SmartStepProfile(
-    trace_chunk_bytes=1000, trigger_word=TriggerWordSource.CONFIGURED, trigger_map=BENCH_TRIGGER_MAP
-)
+SHORT = SmartStepProfile(trace_chunk_bytes=1000, trigger_map=BENCH_TRIGGER_MAP)
 LOSSES = [("request",), ("reply",), ("request", "reply"), ("reply", "request", "reply")]
 
 

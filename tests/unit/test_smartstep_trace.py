@@ -11,7 +11,6 @@ from ldcnd.drivers.smartstep.profiles import (
     SmartStepProfile,
     StringChecksum,
     TraceWordLayout,
-    TriggerWordSource,
     Verification,
 )
 from ldcnd.drivers.smartstep.trace_upload import TraceUpload
@@ -117,7 +116,7 @@ async def test_memory_that_never_rests_is_no_trace():
             disturbing.cancel()
 
 
-TRIGGERED = SmartStepProfile(trigger_word=TriggerWordSource.CONFIGURED, trigger_map=BENCH_TRIGGER_MAP)
+TRIGGERED = SmartStepProfile(trigger_map=BENCH_TRIGGER_MAP)
 NEVER = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=4000.0)
 
 

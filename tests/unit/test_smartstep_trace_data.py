@@ -6,26 +6,20 @@ from ldcnd.drivers.smartstep.profiles import (
     CommandPulseGear,
     SmartStepProfile,
     TraceWordLayout,
-    TriggerMap,
-    TriggerWordSource,
 )
 from ldcnd.drivers.smartstep.trace_data import (
+    POINTS,
     Chunk,
     DataObject,
-    Edge,
     IoObject,
     TraceConstants,
     TracePoint,
-    TriggerObject,
-    TriggerWord,
     chunk_plan,
     decode_word,
-    duration_s,
     encode_word,
     first_point,
     is_beyond_full_scale,
     join_words,
-    no_trigger,
     object_word,
     period_s,
     require_pre_trigger,
@@ -33,11 +27,10 @@ from ldcnd.drivers.smartstep.trace_data import (
     scale,
     split_words,
     trigger_level,
-    trigger_word,
     unit_of,
     unwrap,
 )
-from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
+from ldcnd.errors import BadReply, ValueOutOfRange
 
 MSB, SHIFT, MASK, RAW = TraceWordLayout
 
@@ -138,10 +131,6 @@ def test_pre_trigger_must_leave_room_for_the_trigger(points):
         require_pre_trigger(points)
 
 
-MAP = TriggerMap(trace1=0x10, trace2=0x20, io=0x40, rising=0x01, falling=0x02)
-MAPPED = SmartStepProfile(trigger_word=TriggerWordSource.CONFIGURED, trigger_map=MAP)
-
-
 def test_object_word_has_io_left_and_data_right():
     assert object_word(DataObject.SPEED_FEEDBACK, IoObject.INP) == 0x8101
     assert object_word(DataObject.POSITION_DEVIATION, IoObject.ALM) == 0x8004
@@ -175,31 +164,7 @@ def test_impossible_time_unit_is_refused():
 
 def test_trace_lasts_500_points():
     assert period_s(8, 250) == pytest.approx(0.002)
-    assert duration_s(8, 250) == pytest.approx(1.0)
-
-
-def test_no_trigger_is_zero():
-    assert no_trigger() == TriggerWord(0, TriggerWordSource.NONE)
-
-
-CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500, gear_numerator=4, gear_denominator=1)
-
-
-@pytest.mark.parametrize(
-    ("watched", "edge", "word"),
-    [
-        (TriggerObject.TRACE_1, Edge.RISING, 0x11),
-        (TriggerObject.TRACE_2, Edge.FALLING, 0x22),
-        (TriggerObject.IO, Edge.BOTH, 0x43),
-    ],
-)
-def test_trigger_word_comes_from_the_configured_map(watched, edge, word):
-    assert trigger_word(MAPPED, watched, edge) == TriggerWord(word, TriggerWordSource.CONFIGURED)
-
-
-def test_without_a_map_there_is_no_trigger():
-    with pytest.raises(NotSupported):
-        trigger_word(SMARTSTEP, TriggerObject.IO, Edge.RISING)
+    assert POINTS * period_s(8, 250) == pytest.approx(1.0)
 
 
 CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500, gear_numerator=4, gear_denominator=1)

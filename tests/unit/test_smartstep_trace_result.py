@@ -1,13 +1,13 @@
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile, TriggerWordSource
+from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.trace_data import TraceConstants
 from ldcnd.drivers.smartstep.trace_result import CHANNELS, assign, trigger_condition, trigger_operand
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.model.traces import TraceTrigger, TriggerKind
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
 
-MAPPED = SmartStepProfile(trigger_word=TriggerWordSource.CONFIGURED, trigger_map=BENCH_TRIGGER_MAP)
+MAPPED = SmartStepProfile(trigger_map=BENCH_TRIGGER_MAP)
 CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500)
 
 
@@ -51,7 +51,7 @@ def test_trigger_watches_the_memory_of_its_channel(channel, kind, word):
 
     condition = trigger_condition("a", MAPPED, assignment, TraceTrigger(channel=channel, kind=kind))
 
-    assert condition.word == word
+    assert condition == word
 
 
 @pytest.mark.parametrize(
@@ -65,13 +65,13 @@ def test_operand_is_a_level_in_trace_data_or_the_memory_of_the_signal(channel, l
     assert trigger_operand(SMARTSTEP, CONSTANTS, assignment, trigger) == operand
 
 
-def test_no_trigger_is_the_word_0():
+def test_no_trigger_is_zero():
     assignment = assign("a", ("run",))
 
-    assert trigger_condition("a", SMARTSTEP, assignment, None).word == 0
+    assert trigger_condition("a", SMARTSTEP, assignment, None) == 0
     assert trigger_operand(SMARTSTEP, CONSTANTS, assignment, None) == 0
 
 
-def test_a_drive_without_a_map_has_no_trigger():
+def test_without_a_map_there_is_no_trigger():
     with pytest.raises(NotSupported):
         trigger_condition("a", SMARTSTEP, assign("a", ("run",)), TraceTrigger(channel="run", kind=TriggerKind.RISING))

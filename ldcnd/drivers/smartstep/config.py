@@ -17,7 +17,6 @@ from ldcnd.drivers.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
     TriggerMap,
-    TriggerWordSource,
     Verification,
     Wiring,
 )
@@ -81,7 +80,6 @@ class SmartStepTraceConfig(Frozen):
             trace_chunk_bytes=self.chunk_bytes,
             trace_verify=self.verify,
             command_pulse_gear=self.command_pulse_gear,
-            trigger_word=TriggerWordSource.CONFIGURED if bits else TriggerWordSource.NONE,
             trigger_map=TriggerMap(**bits.model_dump()) if bits else None,
         )
 

@@ -207,7 +207,6 @@ class SmartStepProfile:
     trace_verify: bool = True
     trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
     trace_byte_order: ByteOrder = ByteOrder.BIG
-    trigger_word: TriggerWordSource = TriggerWordSource.NONE
     trigger_map: TriggerMap | None = None
     command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
     encoder_counts_per_rev: int = 8000
@@ -215,6 +214,11 @@ class SmartStepProfile:
     reset_active_low: bool = True
     alarm_output_high: bool = True
     assumptions: tuple[Assumption, ...] = ASSUMPTIONS
+
+    @property
+    def trigger_word(self) -> TriggerWordSource:
+        """Where the drive's own trigger comes from."""
+        return TriggerWordSource.CONFIGURED if self.trigger_map else TriggerWordSource.NONE
 
     def verified(self, key: str, verification: Verification) -> "SmartStepProfile":
         """Return this profile with the result of a test on the drive.
@@ -250,7 +254,7 @@ def assumption_info(profile: SmartStepProfile, assumption: Assumption) -> Assump
 
 
 def _setting(profile: SmartStepProfile, key: str) -> str | None:
-    if key not in SmartStepProfile.__slots__:
+    value = getattr(profile, key, None)
+    if value is None:
         return None
-    value = getattr(profile, key)
     return str(value.value if isinstance(value, Enum) else value)

@@ -54,7 +54,6 @@ from ldcnd.drivers.smartstep.trace_data import (
     SHORTEST_INTERVAL,
     DataObject,
     TraceConstants,
-    no_trigger,
     period_s,
     require_pre_trigger,
     sampling_interval,
@@ -171,8 +170,10 @@ class SmartStepTracer(Tracer):
         require_channels(words.axis, request, self.channels)
         require_no_full_scale(words.axis, request, [name for name in request.full_scale if not self._scales(name)])
         assignment = assign(words.axis, request.channels)
-        by_host = request.trigger is not None and profile.trigger_word is not TriggerWordSource.CONFIGURED
-        condition = no_trigger() if by_host else trigger_condition(words.axis, profile, assignment, request.trigger)
+        by_host = request.trigger is not None and profile.trigger_map is None
+        no_word = TriggerWordSource.HOST if by_host else TriggerWordSource.NONE
+        drives_trigger = None if by_host else request.trigger
+        condition = trigger_condition(words.axis, profile, assignment, drives_trigger)
         pre_trigger = require_pre_trigger(request.pre_trigger) if request.trigger else 0
         self._require_possible(request, by_host=by_host)
         await require_idle(words)
@@ -184,13 +185,12 @@ class SmartStepTracer(Tracer):
             if request.interval_s != "fastest":
                 smptms = sampling_interval(request.interval_s, constants.cyclec_us)
             first, second = assignment.objects
-            drives_trigger = None if by_host else request.trigger
             settings = {
                 TraceRegister.TRACE_1_OBJECT: first,
                 TraceRegister.TRACE_2_OBJECT: second,
                 TraceRegister.SMPTMS: smptms,
                 TraceRegister.PTRGNO: pre_trigger,
-                TraceRegister.TRGC1: condition.word,
+                TraceRegister.TRGC1: condition,
                 TraceRegister.TRGC2: trigger_operand(profile, constants, assignment, drives_trigger),
             }
             for register, value in settings.items():
@@ -201,7 +201,7 @@ class SmartStepTracer(Tracer):
                 assignment,
                 settings,
                 constants,
-                TriggerWordSource.HOST if by_host else condition.source,
+                profile.trigger_word if drives_trigger else no_word,
                 originals,
                 problems,
             )

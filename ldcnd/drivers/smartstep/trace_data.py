@@ -9,7 +9,7 @@ Source: manual 4, "Related addresses", settings 3 to 9, "Unit conversion" (twice
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import IntEnum
 from typing import TypeVar
 
 from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TRACE_2_AREA
@@ -19,9 +19,8 @@ from ldcnd.drivers.smartstep.profiles import (
     CommandPulseGear,
     SmartStepProfile,
     TraceWordLayout,
-    TriggerWordSource,
 )
-from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
+from ldcnd.errors import BadReply, ValueOutOfRange
 
 FULL_SCALE = 15_000
 """Torque and speed data reach this at MAXTRQC and OSVELCC."""
@@ -196,30 +195,6 @@ class IoObject(IntEnum):
     BKIR = 0x87
 
 
-class TriggerObject(Enum):
-    """What a trigger watches."""
-
-    TRACE_1 = "trace1"
-    TRACE_2 = "trace2"
-    IO = "io"
-
-
-class Edge(Enum):
-    """Which change is a trigger."""
-
-    RISING = "rising"
-    FALLING = "falling"
-    BOTH = "both"
-
-
-@dataclass(frozen=True, slots=True)
-class TriggerWord:
-    """The word of 5004H and where it comes from, to be kept with the result."""
-
-    word: int
-    source: TriggerWordSource
-
-
 def object_word(data: DataObject, io: IoObject) -> int:
     """Return the word of 5000H or 5001H: I/O code in the left byte, data code in the right one."""
     return io << 8 | data
@@ -251,36 +226,6 @@ def sampling_interval(period_s: float, cyclec_us: int) -> int:
 def period_s(smptms: int, cyclec_us: int) -> float:
     """Return the time between two points."""
     return smptms * cyclec_us * 1e-6
-
-
-def duration_s(smptms: int, cyclec_us: int) -> float:
-    """Return the time that a trace records."""
-    return POINTS * period_s(smptms, cyclec_us)
-
-
-def trigger_word(profile: SmartStepProfile, watched: TriggerObject, edge: Edge) -> TriggerWord:
-    """Return the trigger condition by the profile's map.
-
-    Raises:
-        NotSupported: the profile has no map; there is none to ship, as the manual's figure is lost.
-    """
-    bits = profile.trigger_map
-    if profile.trigger_word is not TriggerWordSource.CONFIGURED or bits is None:
-        raise NotSupported(
-            "the bits of the trigger condition are not known for this drive",
-            remedy="trace without a trigger, or find the bits on a bench and configure trigger_word",
-        )
-    word = {TriggerObject.TRACE_1: bits.trace1, TriggerObject.TRACE_2: bits.trace2, TriggerObject.IO: bits.io}[watched]
-    if edge is not Edge.FALLING:
-        word |= bits.rising
-    if edge is not Edge.RISING:
-        word |= bits.falling
-    return TriggerWord(word, TriggerWordSource.CONFIGURED)
-
-
-def no_trigger() -> TriggerWord:
-    """Return the condition that is never waited for."""
-    return TriggerWord(NO_TRIGGER, TriggerWordSource.NONE)
 
 
 _US_PER_MINUTE = 60_000_000

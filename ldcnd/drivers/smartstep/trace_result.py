@@ -19,22 +19,18 @@ from ldcnd.drivers.smartstep.profiles import (
 )
 from ldcnd.drivers.smartstep.trace_data import (
     FULL_SCALE,
+    NO_TRIGGER,
     POINTS,
     DataObject,
-    Edge,
     IoObject,
     TraceConstants,
     TracePoint,
-    TriggerObject,
-    TriggerWord,
     decode_word,
     is_beyond_full_scale,
-    no_trigger,
     object_word,
     period_s,
     scale,
     trigger_level,
-    trigger_word,
     unit_of,
     unwrap,
 )
@@ -46,15 +42,8 @@ MEMORIES = 2
 DATA: Mapping[str, DataObject] = MappingProxyType({each.name.lower(): each for each in DataObject})
 SIGNALS: Mapping[str, IoObject] = MappingProxyType({each.name.lower(): each for each in IoObject})
 CHANNELS = (*DATA, *SIGNALS)
-
-_EDGES: Mapping[TriggerKind, Edge] = MappingProxyType(
-    {
-        TriggerKind.RISING: Edge.RISING,
-        TriggerKind.FALLING: Edge.FALLING,
-        TriggerKind.EITHER: Edge.BOTH,
-        TriggerKind.CHANGE: Edge.BOTH,
-    }
-)
+EDGES = frozenset({TriggerKind.RISING, TriggerKind.FALLING, TriggerKind.EITHER, TriggerKind.CHANGE})
+"""What a drive can wait for; with both edges it is any change (manual 4 (7))."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,33 +97,40 @@ def assign(axis: str, channels: tuple[str, ...]) -> Assignment:
 
 def trigger_condition(
     axis: str, profile: SmartStepProfile, assignment: Assignment, trigger: TraceTrigger | None
-) -> TriggerWord:
+) -> int:
     """Return the word of 5004H for a trigger on a recorded channel.
 
     Raises:
         NotSupported: the drive has no such trigger, or its bits are not known.
     """
     if trigger is None:
-        return no_trigger()
-    if trigger.kind not in _EDGES:
+        return NO_TRIGGER
+    kind, bits = trigger.kind, profile.trigger_map
+    if kind not in EDGES:
         raise NotSupported(
-            f"axis {axis}: the drive triggers on edges only, not on {trigger.kind.value!r}",
+            f"axis {axis}: the drive triggers on edges only, not on {kind.value!r}",
             axis=axis,
-            value=trigger.kind.value,
+            value=kind.value,
             remedy="use rising, falling or change",
         )
-    if trigger.channel in SIGNALS:
-        watched = TriggerObject.IO
-    elif trigger.kind is TriggerKind.EITHER:
+    if kind is TriggerKind.EITHER and trigger.channel not in SIGNALS:
         raise NotSupported(
             f"axis {axis}: with both edges of a value the drive triggers on any change, whatever the level",
             axis=axis,
-            value=trigger.kind.value,
+            value=kind.value,
             remedy="use rising, falling or change",
         )
-    else:
-        watched = (TriggerObject.TRACE_1, TriggerObject.TRACE_2)[assignment.memory(trigger.channel)]
-    return trigger_word(profile, watched, _EDGES[trigger.kind])
+    if bits is None:
+        raise NotSupported(
+            "the bits of the trigger condition are not known for this drive",
+            remedy="trace without a trigger, or find the bits with `ldcnd doctor trigger-bits`",
+        )
+    word = bits.io if trigger.channel in SIGNALS else (bits.trace1, bits.trace2)[assignment.memory(trigger.channel)]
+    if kind is not TriggerKind.FALLING:
+        word |= bits.rising
+    if kind is not TriggerKind.RISING:
+        word |= bits.falling
+    return word
 
 
 def trigger_operand(
