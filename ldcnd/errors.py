@@ -265,7 +265,7 @@ class NotSupported(RequestRefused):
 
 
 class EepromBudgetSpent(RequestRefused):
-    """The parameter was written to EEPROM so often that further writes are refused."""
+    """The EEPROM of the drive was written so often that further writes are refused."""
 
     code = ErrorCode.EEPROM_BUDGET
     way_out = "write to RAM, or raise the budget in the configuration"
