@@ -22,7 +22,7 @@ async def test_a_write_that_was_not_carried_out_is_taken_back(tmp_path):
     ledger = EepromLedger(tmp_path / "ledger.json")
     await ledger.enter("feed", "Pn100", budget=10)
 
-    await ledger.take_back("feed", "Pn100")
+    await ledger.withdraw("feed", "Pn100")
 
     assert EepromLedger(tmp_path / "ledger.json").writes("feed", "Pn100") == 0
 

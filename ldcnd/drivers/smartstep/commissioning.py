@@ -31,7 +31,7 @@ from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 
 async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
-    """Examine one drive on an open line that nobody else uses; yields each finding as it comes.
+    """Examine one drive on an open line that no other program uses; yields each finding as it comes.
 
     It reads only. Ends early when the drive does not answer or hears itself.
     """
@@ -61,7 +61,7 @@ async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
 
 
 class Examination:
-    """The single looks at one drive; each raises the `BusError` or `DriveFault` that befell it."""
+    """The parts of the examination of one drive; each raises the `BusError` or `DriveFault` that befell it."""
 
     def __init__(self, bus: Bus, unit: SmartStepAxis) -> None:
         self._bus = bus

@@ -1,6 +1,6 @@
 """How often the EEPROM of each drive was written, kept on disk: as a whole it endures 10,000 writes.
 
-A write is entered before it is sent and taken back only when the drive has proven that it did not carry it out, so a
+A write is entered before it is sent and withdrawn only when the drive has proven that it did not carry it out, so a
 crash in between makes the count too high, never too low.
 Source: manual 2.2, note on EEPROM.
 """
@@ -63,7 +63,7 @@ class EepromLedger:
             )
         await self._set(axis, parameter, self.writes(axis, parameter) + 1)
 
-    async def take_back(self, axis: str, parameter: str) -> None:
+    async def withdraw(self, axis: str, parameter: str) -> None:
         """Forget a write that the drive has not carried out."""
         await self._set(axis, parameter, max(0, self.writes(axis, parameter) - 1))
 

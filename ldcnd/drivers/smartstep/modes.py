@@ -1,8 +1,8 @@
 """Entering, executing and leaving an operating mode on a line that loses replies; clearing a pulse counter by one.
 
 None of the three commands is repeated blindly. Entering and leaving are known by reading 2000H. A lost execute cannot
-be told from a lost reply while a trace waits for its trigger, so the mode is left, entered again and executed anew:
-what ran before has ended then, and nothing is executed twice in one stay.
+be distinguished from a lost reply while a trace waits for its trigger, so the mode is left, entered again and executed
+anew: what ran before has ended then, and nothing is executed twice in one stay.
 Source: manual 2.1 (resending), 4, settings 1 and 2; 5 and 6.
 """
 
@@ -130,7 +130,7 @@ async def execute_mode(words: Words, mode: OperatingMode) -> Execution:
     raise OutcomeUnknown(
         f"axis {words.axis}: no reply to {EXECUTE_ATTEMPTS} attempts to execute operating mode {mode:04X}H",
         axis=words.axis,
-        remedy="look at the line's losses before trying again",
+        remedy="find the cause of the line's losses before trying again",
     )
 
 

@@ -114,7 +114,7 @@ class FunctionSwitch(IntFlag):
 
 
 class DriverType(IntEnum):
-    """Words of 8800H; the manual prints the same word for R7D-APL and R7D-APH, so they cannot be told apart."""
+    """Words of 8800H; the manual prints the same word for R7D-APL and R7D-APH, so they cannot be distinguished."""
 
     R7D_AP = 0x000C
 

@@ -202,7 +202,7 @@ class SmartStepNetwork(Network):
             )
 
     async def _meet(self, unit: SmartStepAxis) -> list[str]:
-        """Learn what a unit is; return what deserves a look."""
+        """Learn what a unit is; return what deserves attention."""
         words, who = unit.words, f"unit {unit.spec.address} (axis {unit.spec.name})"
         remarks = []
         type_word = await words.read(Register.DRIVER_TYPE)

@@ -219,7 +219,7 @@ class UnitParameters(ParameterAccess):
             f"axis {self._axis}: {parameter.label} still holds {old} after {EEPROM_ATTEMPTS} writes",
             axis=self._axis,
             value=value,
-            remedy="look at the line's losses before trying again",
+            remedy="find the cause of the line's losses before trying again",
         )
 
     async def _written_once(self, parameter: Parameter, old: int, value: int) -> bool:
@@ -228,12 +228,12 @@ class UnitParameters(ParameterAccess):
         try:
             await self._words.ask(write_eeprom(self._words.unit, parameter, value))
         except (DriveFault, BusDown, BusBusy):
-            await ledger.take_back(self._axis, parameter.label)  # declined, or never sent
+            await ledger.withdraw(self._axis, parameter.label)  # declined, or never sent
             raise
         except (OutcomeUnknown, BadReply):
             held = await self._words.read_back(parameter.eeprom_address)
             if held == old:
-                await ledger.take_back(self._axis, parameter.label)
+                await ledger.withdraw(self._axis, parameter.label)
             return held != old
         return True
 

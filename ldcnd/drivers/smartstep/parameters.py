@@ -61,7 +61,7 @@ class Parameter:
     Attributes:
         number: as the digits of its name: Pn10A is 010AH.
         name: as the manual gives it; empty for an unlisted parameter.
-        unit: None where it has none or nobody knows.
+        unit: None where it has none or it is not known.
         power_cycle: whether a change takes effect only at the next power-on; a RAM write of such a parameter is
             useless.
         nibbles: four separate settings, shown as hexadecimal digits.

@@ -92,7 +92,7 @@ class UnitWords:
 
 @dataclass(frozen=True, slots=True)
 class Listeners:
-    """Who is told; none of them waits.
+    """Callbacks of a poller; none of them waits.
 
     Attributes:
         read: of an item that was read completely, with all that is known of the drive.
@@ -133,7 +133,7 @@ class UnitPoller(Poller[int | Refusal]):
             profile: how the drive is taken to behave.
             rates_hz: how often each item is read.
             start_at_s: from when on, in loop time.
-            listeners: who is told.
+            listeners: its callbacks.
             wires_checked: that the drive does not hear itself is known; otherwise it is looked for before a word is
                 read that may be zero.
         """

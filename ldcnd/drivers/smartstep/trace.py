@@ -93,9 +93,9 @@ from ldcnd.model.traces import DriveTraceInfo, TakeTrace, TracePhase, TraceSourc
 log = get_logger("smartstep")
 
 LOOK_S = 0.2
-"""Pause between two looks at the operating mode."""
+"""Pause between two readings of the operating mode, seconds."""
 LAST_LOOK_S = 0.02
-"""The same when the trace is about to end: what was ended from elsewhere just before is told from it then."""
+"""The same when the trace is about to end: what was ended from elsewhere just before differs from it then."""
 GRACE_S = 1.0
 SLACK = 1.2
 """A drive's clock may be off, and its recorder may begin late."""
@@ -112,7 +112,7 @@ FULL_SCALE_REGISTERS: Mapping[str, TraceRegister] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class _Setup:
-    """What a drive was told about a trace.
+    """The settings of a trace.
 
     Attributes:
         source: where its trigger comes from.
@@ -313,7 +313,7 @@ class ArmedSmartStep(ArmedTrace):
             bus: the owner of the line.
             words: the drive.
             profile: how it is taken to behave.
-            setup: what it was told.
+            setup: its settings.
             judged: compares its words with the monitors, knowing what earlier traces of the drive have shown.
         """
         request = setup.request
@@ -459,7 +459,7 @@ class ArmedSmartStep(ArmedTrace):
         return self._setup.trigger is None and self._loop.time() >= ends_at_s
 
     def _pause_s(self) -> float:
-        """Return the time to the next look: short around the end, where it can be foreseen."""
+        """Return the time to the next reading of the mode: short around the end, where it can be foreseen."""
         if self._setup.trigger:
             return LOOK_S
         ends_at_s = self._execution.replied_s + POINTS * self._setup.interval_s
@@ -525,7 +525,7 @@ class ArmedSmartStep(ArmedTrace):
         )
 
     def _level(self, trigger: TraceTrigger) -> float:
-        """Return the trigger level as the drive was told, in the unit of the channel."""
+        """Return the trigger level as it was set in the drive, in the unit of the channel."""
         if trigger.channel in SIGNALS:
             return 0.0
         count = signed_word(self._setup.settings[TraceRegister.TRGC2])

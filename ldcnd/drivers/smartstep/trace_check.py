@@ -240,7 +240,7 @@ def trigger_problem(
 
     Args:
         trigger: what the drive waited for.
-        level: as the drive was told, in the unit of the channel.
+        level: as it was set in the drive, in the unit of the channel.
         column: the values of its channel.
         index: of the sample at which the trigger was detected.
         interval_s: between two samples.

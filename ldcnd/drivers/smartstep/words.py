@@ -86,7 +86,7 @@ class Words:
 
         Raises:
             WrongState: the drive hears itself.
-            DriveFault: the drive declined; a setting's address error is told apart from "busy tracing" by the mode.
+            DriveFault: the drive declined; a setting's address error is distinguished from "busy tracing" by the mode.
             BusError: the line failed.
         """
         if self.self_hearing:

@@ -78,7 +78,7 @@ class SimulatedCable:
         return self._last is not None and self._last.end_s - CHARACTER_S / 2 > item.start_s
 
     def _collect(self, to_s: float) -> None:
-        # A drive may answer what it overheard, so this goes on until nobody begins to send any more.
+        # A drive may answer what it overheard, so this goes on until no drive begins to send.
         while begun := [(unit, item) for unit in self.units for item in unit.transmissions(to_s)]:
             for unit, item in sorted(begun, key=lambda pair: pair[1].start_s):
                 self._carry(unit, item, together=[other for who, other in begun if who is not unit])

@@ -301,7 +301,7 @@ class SimulatedDrive:
         self.motor.advance(to_s)
         if not self.motor.servo_on:
             return
-        # Seen at the end of a step: nobody can look in between.
+        # Judged at the end of a step, because nothing is read in between.
         if abs(self._deviation_units) > self.memory.active(PN505) * _DEVIATION_STEP:
             self._raise_alarm(DEVIATION_OVER)
         elif abs(self.motor.rpm(self.motor.speed)) > OVERSPEED_RPM:

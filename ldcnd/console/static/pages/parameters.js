@@ -265,7 +265,7 @@ function Transfer({ axis, file, values, onWritten }) {
   const [chosen, setChosen] = useState(null);
   const [wanted, setWanted] = useState(null);
   const [plan, setPlan] = useState(null);
-  const [told, setTold] = useState([]);
+  const [report, setReport] = useState([]);
   const source = sources.find((each) => each.title === chosen) ?? sources[0];
   const planned = async (request) => (await command(axis, "plan_parameters", request, PATIENCE_MS)).plan;
   const ask = async () => {
@@ -278,7 +278,7 @@ function Transfer({ axis, file, values, onWritten }) {
   async function transfer() {
     const lines = [];
     for (const [place, { parameter, value, memory }] of plan.writes.entries()) {
-      setTold([`${place + 1} of ${plan.writes.length}: ${parameter} to ${memory}`]);
+      setReport([`${place + 1} of ${plan.writes.length}: ${parameter} to ${memory}`]);
       try {
         const reply = await command(axis, "write_parameter", { parameter, value, memory }, PATIENCE_MS);
         onWritten(reply.value);
@@ -290,7 +290,7 @@ function Transfer({ axis, file, values, onWritten }) {
     }
     const left = await planned(wanted);
     setPlan(left);
-    setTold([
+    setReport([
       left.writes.length
         ? "Read back: not all is written. The same again completes it."
         : "Read back: the drive holds the values.",
@@ -316,7 +316,7 @@ function Transfer({ axis, file, values, onWritten }) {
     ${plan?.remarks.map((each) => html`<p class="quiet">${each}</p>`)}
     <p class="row"><${Action} act=${transfer} obstacle=${way}
       kind="main">Write ${plan?.writes.length === 1 ? "1 value" : `${plan?.writes.length ?? 0} values`}<//></p>
-    <div role="status">${told.map((each) => html`<p>${each}</p>`)}</div>
+    <div role="status">${report.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
 }
 
