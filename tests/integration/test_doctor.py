@@ -1,5 +1,6 @@
 """The examination of a line as the command does it, on the jumping clock."""
 
+import asyncio
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ from ldcnd.cli.doctor import examine_line
 from ldcnd.config.rig import load_config
 from ldcnd.errors import BusDown
 from ldcnd.model.health import Finding, Verdict
+from ldcnd.sim.jumping_loop import JumpingLoop
+from tests.support.command_line import run_here
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
 
@@ -31,3 +34,22 @@ async def test_a_port_that_does_not_open_is_told():
         await examine_line(rig, absent, lambda _: None)
 
     assert failure.group_contains(BusDown)
+
+
+def test_what_a_drive_shows_of_its_traces_is_reported_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    config = tmp_path / "mixed.toml"
+    config.write_text(MIXED.read_text())
+    loop = JumpingLoop()
+    monkeypatch.setattr(asyncio, "run", loop.run_until_complete)
+
+    ran = run_here(
+        "doctor", "verify", "--config", str(config), "--bus", "steps", "--axis", "feed", "--write", typed="\n" * 9
+    )  # fmt: skip
+    loop.close()
+
+    report = {line.split()[0]: line.split()[1] for line in ran.printed.splitlines()[:-1]}
+    (feed,) = [axis.smartstep for bus in load_config(config).bus for axis in bus.axis if axis.name == "feed"]
+    assert ran.code == 1  # its pulses are too slow to show their gear
+    assert {key for key, state in report.items() if state == "open"} == {"command_pulse_gear"}
+    assert set(feed.verified) == set(report) - {"command_pulse_gear"}
+    assert feed.trace.string_checksum == "header"
