@@ -50,7 +50,8 @@ def test_a_factory_new_drive_is_made_the_one_that_it_replaces(tmp_path: Path, mo
     old = SimulatedUnit(None, {**CHANGED, PN000: 0x0101})
     new = SimulatedUnit(None, {PN000: 0x0200})
     (tmp_path / "eeprom-writes.json").write_text(json.dumps({"spool": {"Pn100": 8990}}))
-    config = load_config(ROOT / "config" / "mixed.toml").model_copy(update={"state_dir": tmp_path})
+    mixed = load_config(ROOT / "config" / "mixed.toml")
+    config = mixed.model_copy(update={"state_dir": tmp_path, "bus": mixed.bus[1:]})
 
     async def power_cycle() -> None:
         now_s = asyncio.get_running_loop().time()
