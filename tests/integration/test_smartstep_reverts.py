@@ -242,7 +242,7 @@ def test_what_mended_a_finding_stands_once_where_it_is_put_back(each):
 
 
 def test_every_finding_is_put_back_by_the_test_that_the_reference_page_names():
-    page = (ROOT / "docs" / "reference" / "smartstep.md").read_text()
+    page = (ROOT / "docs" / "reference" / "smartstep.md").read_text().partition("## Departures that were mended")[2]
     named = {(int(number), test) for number, test in re.findall(r"^\| (\d+) .*`(test_\w+)` \|$", page, re.MULTILINE)}
 
     assert {(each.finding, each.test.partition("::")[2]) for each in REVERTS} == named
