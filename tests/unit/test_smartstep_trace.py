@@ -4,6 +4,8 @@ import asyncio
 
 import pytest
 
+from ldcnd.bus.queue import Lane
+from ldcnd.drivers.smartstep.commands import reference
 from ldcnd.drivers.smartstep.parameters import PN202, PN203
 from ldcnd.drivers.smartstep.profiles import (
     SMARTSTEP,
@@ -424,3 +426,32 @@ async def test_the_fastest_interval_is_two_time_units_of_the_drive(cyclec_us):
         armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), interval_s="fastest"))
 
     assert armed.granted.interval_s == pytest.approx(2 * cyclec_us * 1e-6)
+
+
+async def test_a_trace_is_not_given_up_because_a_busy_line_answers_late():
+    async with smartstep_line([running()]) as line:
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), interval_s=0.002))
+        busy_until_s = asyncio.get_running_loop().time() + 5.0
+
+        async def others() -> None:
+            while asyncio.get_running_loop().time() < busy_until_s:
+                await line.bus.execute(reference(1, PN202.ram_address), Lane.COMMAND)
+
+        async with asyncio.TaskGroup() as group:
+            for _ in range(3):
+                group.create_task(others())
+            recorded = await armed.record(ignore)
+
+    assert recorded.values[0][250] == pytest.approx(90.0, abs=0.4)
+
+
+async def test_a_drive_that_still_traces_after_its_time_is_given_up_and_put_back():
+    unit = running()
+    async with smartstep_line([unit]) as line:
+        armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), interval_s=0.002))
+        unit.drive.recorder.stop()  # it never finishes
+
+        with pytest.raises(TraceTimedOut, match="did not finish"):
+            await armed.record(ignore)
+
+    assert unit.drive.mode == 0

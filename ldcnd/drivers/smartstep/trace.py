@@ -97,6 +97,8 @@ LOOK_S = 0.2
 LAST_LOOK_S = 0.02
 """The same when the trace is about to end: what was ended from elsewhere just before differs from it then."""
 GRACE_S = 1.0
+LAST_READING_S = 5.0
+"""Longest wait for the reading of the operating mode that decides whether a trace has finished, seconds."""
 SLACK = 1.2
 """A drive's clock may be off, and its recorder may begin late."""
 LARGEST_CYCLEC_US = 0xFFFF
@@ -431,20 +433,26 @@ class ArmedSmartStep(ArmedTrace):
         """Return when the drive was seen in its normal mode; `_running_at_s` is when it was last seen tracing."""
         words, spacing_s = self._words, min(POINTS * self._setup.interval_s / COMPARED_EACH, LONGEST_UNCOMPARED_S)
         compared_at_s = -math.inf
+        deadline_s = self._loop.time() + self._limit_s
         try:
-            async with asyncio.timeout(self._limit_s):
+            # A busy line answers late; only a drive that still traces after its time has not finished.
+            async with asyncio.timeout(self._limit_s + LAST_READING_S):
                 while True:
                     if self._loop.time() >= compared_at_s + spacing_s and not self._is_over():
                         compared_at_s = self._loop.time()
                         await self._compare()
                     asked_at_s = self._loop.time()
+                    overdue = asked_at_s >= deadline_s
+                    lane = Lane.COMMAND if overdue else Lane.BACKGROUND
                     try:
-                        mode = await words.ask(read_operating_mode(words.unit), Lane.BACKGROUND)
+                        mode = await words.ask(read_operating_mode(words.unit), lane)
                     except ReplyTimeout:
                         mode = OperatingMode.DATA_TRACE  # a bad line does not end a trace
                     else:
                         if mode == OperatingMode.NORMAL:
                             return self._loop.time()
+                        if overdue:
+                            raise TimeoutError
                         self._running_at_s = asked_at_s
                     await asyncio.sleep(self._pause_s())
         except TimeoutError:
