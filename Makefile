@@ -45,6 +45,10 @@ dist: .venv/ready
 	$(PY) -m hatchling build -d dist
 	$(PY) deploy/sbom.py > dist/sbom.cdx.json
 
+# the installed package on the kernel's own serial drivers, in a machine under QEMU; skipped with the reason where there is none
+test-drivers: .venv/ready
+	$(PY) -m pytest -m guest tests/guest
+
 # properties on cases that were never tried, for as long as an hour, and what takes minutes
 soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new

@@ -10,20 +10,16 @@ from pathlib import Path
 import click
 
 from ldcnd.bus.bus import Bus
-from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.line import acceptance
-from ldcnd.daemon.line.smartstep_line import build_line
 from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.network import RESET_BAUD
-from ldcnd.drivers.smartstep.commissioning import examine
-from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS as SMARTSTEP_ASSUMPTIONS
 from ldcnd.drivers.transcript import describer
 from ldcnd.errors import BusDown, ConfigError
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.transport.port_url import port_opener
-from ldcnd.wirelog.capture import capture_lines
+from ldcnd.wirelog.capture import Capture, capture_lines
 
 OPEN_TIME_S = 5.0
 HELD_S = 1.0
@@ -71,18 +67,23 @@ def command(  # noqa: PLR0917 - click passes them by name
 
     def show(finding: Finding) -> None:
         findings.append(finding)
-        word = {Verdict.FINE: "confirmed", Verdict.LOOK: "refuted"}.get(finding.verdict, "failed")
+        refuted = "refuted" if finding.verifies else "open"
+        word = {Verdict.FINE: "confirmed", Verdict.LOOK: refuted}.get(finding.verdict, "failed")
         print(f"{finding.axis:8} {word:9} {finding.what:16} {finding.text}", flush=True)
 
     out.mkdir(parents=True, exist_ok=True)
     if family == "smartstep":
-        asyncio.run(_smartstep(port, units, show))
+        asyncio.run(_smartstep(port, units, out, show))
     else:
         asyncio.run(_ldcn(port, move, out, show))
     report = out / "report.jsonl"
     report.write_text("".join(f"{finding.model_dump_json()}\n" for finding in findings), encoding="utf-8")
     print(report)
-    sys.exit(0 if all(finding.verdict is Verdict.FINE for finding in findings) else 1)
+    sys.exit(1 if any(_refutes(finding) for finding in findings) else 0)
+
+
+def _refutes(finding: Finding) -> bool:
+    return finding.verdict is Verdict.WRONG or (finding.verdict is Verdict.LOOK and finding.verifies is not None)
 
 
 def _list() -> None:
@@ -116,32 +117,27 @@ async def _ldcn(port: str, move: acceptance.TrialMove | None, out: Path, show: C
         )
     with _dead_man(wanted=move is not None) as held:
         await _run(bus, port, acceptance.accept(bus, move, held), show)
-    capture = acceptance.capture_of(bus, port, zero_ns)
-    text = "\n".join(capture_lines(capture.header, capture.records, describer("ldcn", {})))
+    _keep(acceptance.capture_of(bus, port, zero_ns), out)
+
+
+def _keep(capture: Capture, out: Path) -> None:
+    text = "\n".join(capture_lines(capture.header, capture.records, describer(capture.header.family, {})))
     (out / "line.capture").write_text(f"{text}\n", encoding="utf-8")
 
 
-async def _smartstep(port: str, units: str, show: Callable[[Finding], None]) -> None:
+async def _smartstep(port: str, units: str, out: Path, show: Callable[[Finding], None]) -> None:
     try:
         numbers = [int(number) for number in units.split(",")]
     except ValueError:
         raise click.UsageError(f"--units: {units!r} is not like 1,2") from None
-    axes = [{"name": f"unit{number}", "address": number, "model": "smartstep", "unit": "rev"} for number in numbers]
-    line = {"name": "accept", "port": port, "family": "smartstep", "axis": axes}
     try:
-        rig = RigConfig.model_validate({"rig": "accept", "bus": [line]})
+        rig = acceptance.smartstep_rig(port, numbers)
     except ValueError as error:
         raise ConfigError(f"{port}, units {units}: {error}") from error
-    bus, network = build_line(rig, rig.bus[0], None, {})
-    bus.resync = network.resync
-
-    async def findings() -> AsyncIterator[Finding]:
-        for axis in network.axes.values():
-            if isinstance(axis, SmartStepAxis):
-                async for finding in examine(bus, axis):
-                    yield finding
-
-    await _run(bus, port, findings(), show)
+    zero_ns = acceptance.zero_ns()
+    bus, findings = acceptance.accept_smartsteps(rig)
+    await _run(bus, port, findings, show)
+    _keep(acceptance.capture_of(bus, port, zero_ns, rig), out)
 
 
 async def _run(bus: Bus, port: str, findings: AsyncIterator[Finding], show: Callable[[Finding], None]) -> None:

@@ -1,7 +1,9 @@
 """The sequence that tries real drives, on simulated ones that are as the documents say, or are not."""
 
 import asyncio
+import threading
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -9,11 +11,14 @@ from click.testing import CliRunner
 from ldcnd.cli.accept import command
 from ldcnd.daemon.line.acceptance import ASSUMPTIONS, TrialMove, accept, capture_of, replayed, trial_bus
 from ldcnd.drivers.driver import Gains
+from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.wirelog.capture import Capture
+from ldcnd.sim.pty import PtyLine
+from ldcnd.sim.smartstep.cable import simulated_units, smartstep_chain
+from ldcnd.wirelog.capture import Capture, parse_capture
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.plugged_rig import MODELS
 from tests.support.serial_adapter import Plug
@@ -114,6 +119,26 @@ def test_capture_of_a_trial_plays_back_to_the_same_findings():
         found, capture = runner.run(trial())
 
     assert list(replayed(capture)) == found
+
+
+@pytest.mark.real_time
+def test_smartsteps_are_tried_and_their_capture_plays_back_to_the_same_findings(tmp_path: Path):
+    units = simulated_units([SimulatedUnitConfig(number=1), SimulatedUnitConfig(number=2)], 0.0)
+    stopped = threading.Event()
+    with PtyLine(smartstep_chain(units)) as line:
+        thread = threading.Thread(target=line.run, args=(stopped.is_set,), name="line")
+        thread.start()
+        arguments = [str(line.path), "--family", "smartstep", "--units", "1,2", "--out", str(tmp_path)]
+        done = CliRunner().invoke(command, arguments)
+        stopped.set()
+        thread.join(5)
+
+    report = (tmp_path / "report.jsonl").read_text(encoding="utf-8").splitlines()
+    found = [Finding.model_validate_json(finding) for finding in report]
+    assert (done.exit_code, {finding.axis for finding in found}) == (0, {"unit1", "unit2"}), done.output
+    assert len(found) > 10
+    capture = parse_capture((tmp_path / "line.capture").read_text(encoding="utf-8"))
+    assert [finding.text for finding in replayed(capture)] == [finding.text for finding in found]
 
 
 def test_assumptions_are_listed_without_a_port():

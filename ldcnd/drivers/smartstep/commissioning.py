@@ -140,7 +140,7 @@ class Examination:
             return self.finding("strings", Verdict.LOOK, "string references are refused", "string_checksum")
         if not any(both.data):
             text = "the trace memory is empty, so a byte in the wrong place would not show: record a trace first"
-            return self.finding("strings", Verdict.LOOK, text, "string_checksum")
+            return self.finding("strings", Verdict.LOOK, text)
         by_bytes = both.data == one.data + second.data
         fits = one.fits & both.fits & second.fits
         names = ", ".join(sorted(fit.value for fit in fits)) or "none in common"

@@ -1,0 +1,66 @@
+"""One guest for all tests of this folder, and the report at the end."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
+from ldcnd.drivers.smartstep.profiles import Framing
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.smartstep.cable import simulated_units, smartstep_chain
+from tests.guest.machine import Adapter, Bench, booted_guest, far_end, why_no_guest
+from tests.guest.rigs import FAST, STEPS, USB
+from tests.support.package import package, why_no_package
+
+FOUND: list[str] = []
+"""What the tests have measured, for the report."""
+
+
+@pytest.fixture(scope="session")
+def found() -> Callable[[str], None]:
+    """Take a line for the report."""
+    return FOUND.append
+
+
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Boot the guest with all adapters plugged in and the package installed; nothing runs yet."""
+    if reason := why_no_guest() or why_no_package():
+        pytest.skip(reason)
+    began_s = time.monotonic()
+    deb = package(tmp_path_factory)
+    FOUND.append(f"package built in {time.monotonic() - began_s:.0f} s")
+    usb = build_chain(
+        ChainSpec(tuple(ModuleSpec(model) for model in ("ls182ap", "ls182ap", "picservo-v4")), baud_check=True)
+    )
+    uart = build_chain(ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("picservo-v4")), baud_check=True))
+    fast = build_chain(ChainSpec((ModuleSpec("picservo-sc"),), baud_check=True))
+    units = simulated_units([SimulatedUnitConfig(number=1), SimulatedUnitConfig(number=2)], 0.0)
+    steps = smartstep_chain(units, framing=Framing.SEVEN_EVEN)
+    with ExitStack() as stack:
+        ends = [stack.enter_context(far_end(chain)) for chain in (usb, fast, uart)]
+        steps_end = stack.enter_context(far_end(steps, baud_check=False))
+        adapters = (Adapter(USB, ends[0]), Adapter(FAST, ends[1]), Adapter(STEPS, steps_end))
+        began_s = time.monotonic()
+        guest = stack.enter_context(booted_guest(deb, adapters, ends[2], (7447, 7448)))
+        FOUND.append(
+            f"image made ready and guest booted in {time.monotonic() - began_s:.0f} s, boot {guest.boot_s:.0f} s"
+        )
+        FOUND.append(f"kernel {guest.must('uname -r')}, systemd {guest.must('systemctl --version').split()[1]}")
+        guest.must(f"head -c {deb.stat().st_size} /dev/vdb > /tmp/ldcnd.deb && dpkg -i /tmp/ldcnd.deb", timeout_s=240)
+        yield Bench(guest, usb, uart)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print what was found, and keep it."""
+    if not FOUND:
+        return
+    terminalreporter.section("kernel drivers")
+    for line in FOUND:
+        terminalreporter.line(line)
+    folder = Path(__file__).parents[2] / "build"
+    folder.mkdir(exist_ok=True)
+    (folder / "drivers-report.txt").write_text("\n".join(FOUND) + "\n", encoding="utf-8")

@@ -1,0 +1,148 @@
+"""Puts faults back that a trial on the kernel's drivers once found, and shows that tests notice each of them.
+
+`python -m tests.guest.put_back [--guest] [F1 F2 F3 F4]` changes a copy of this checkout, never the checkout itself, and
+runs the tests on terminals, or those in the guest, against it. Ends with 1 if one of them stays green.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LONGEST_S = 900.0
+
+
+@dataclass(frozen=True)
+class PutBack:
+    """A fault, and who notices it.
+
+    Attributes:
+        what: it did.
+        path: the file to change.
+        changes: texts that each stand there once, and what they become.
+        terminals: tests on terminals and on the jumping clock.
+        guest: names of tests in the guest, for `-k`.
+    """
+
+    what: str
+    path: str
+    changes: tuple[tuple[str, str], ...]
+    terminals: tuple[str, ...]
+    guest: str
+
+
+FAULTS = {
+    "F1": PutBack(
+        'a stop while the line is down is not sent again under loss.bus = "run_to_target"',
+        "ldcnd/daemon/axis/axis.py",
+        (
+            (
+                "        if self._unconfirmed() is None:\n",
+                "        if self._unconfirmed() is None or self.config.loss.bus == 'run_to_target':\n",
+            ),
+        ),
+        (
+            "tests/drivers/test_terminals.py",
+            "tests/drivers/test_adapters.py",
+            "tests/drivers/test_unplugged_at_random.py",
+        ),
+        "stop_while_the_adapter_is_away",
+    ),
+    "F2": PutBack(
+        "slow motion counts as rest, and is not halted after an outage",
+        "ldcnd/daemon/axis/state.py",
+        (
+            ("runs = reading.enabled and not reading.profile_done", "runs = False"),
+            ("        if self.commanded and reading.enabled:\n", "        if self._quiet_s:\n"),
+        ),
+        (
+            "tests/drivers/test_terminals.py",
+            "tests/drivers/test_adapters.py",
+            "tests/drivers/test_unplugged_at_random.py",
+        ),
+        "halted_when_its_adapter_is_back",
+    ),
+    "F3": PutBack(
+        "the cause of a fault is guessed while it is not known whether the power driver is on",
+        "ldcnd/drivers/ldcn/faults.py",
+        (
+            (
+                "        faults = _power_driver_not_known(status, known)\n",
+                "        faults = _power_driver_off(status, replace(known, latched=None))\n",
+            ),
+        ),
+        ("tests/drivers/test_adapters.py", "tests/integration/test_fault_causes.py"),
+        "killed_daemon",
+    ),
+    "F4": PutBack(
+        "a rate that the UART does not make is accepted",
+        "ldcnd/transport/serial_port.py",
+        (
+            (
+                "        if baud and not makes(baud, made := port.tune(baud)):",
+                "        if baud and not (made := port.tune(baud)):",
+            ),
+            ("        if not makes(baud, made):", "        if not made:"),
+        ),
+        ("tests/drivers/test_port_settings.py",),
+        "rates_are_those",
+    ),
+}
+
+
+def copy_of_checkout(place: Path) -> Path:
+    """Return a copy of what git knows here, with what is not committed yet."""
+    files = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],  # noqa: S607
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    ).stdout
+    copy = place / "checkout"
+    copy.mkdir()
+    subprocess.run(["cpio", "--quiet", "-0pdm", str(copy)], cwd=ROOT, input=files, check=True)  # noqa: S603, S607
+    return copy
+
+
+def noticed(name: str, fault: PutBack, *, guest: bool) -> bool:
+    """Tell whether a test fails once the fault is back."""
+    with tempfile.TemporaryDirectory(prefix="ldcnd-put-back-") as place:
+        copy = copy_of_checkout(Path(place))
+        changed = copy / fault.path
+        text = changed.read_text(encoding="utf-8")
+        for before, after in fault.changes:
+            assert text.count(before) == 1, f"{name}: {fault.path} has {text.count(before)} times {before!r}"
+            text = text.replace(before, after)
+        changed.write_text(text, encoding="utf-8")
+        chosen = ("-m", "guest", "tests/guest", "-k", fault.guest) if guest else fault.terminals
+        done = subprocess.run(  # noqa: S603
+            [sys.executable, "-m", "pytest", "-q", "--tb=line", "--show-capture=no", *chosen],
+            cwd=copy,
+            env=os.environ | {"PYTHONPATH": str(copy)},
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            check=False,
+        )
+        failed = [line for line in done.stdout.splitlines() if line.startswith("FAILED")]
+        print(f"{name}: {fault.what}\n  " + "\n  ".join([*failed, done.stdout.strip().splitlines()[-1]]), flush=True)
+        return done.returncode == 1 and bool(failed)
+
+
+def main() -> int:
+    """Put back what is named, one after another."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--guest", action="store_true", help="by the tests in the guest instead of those on terminals")
+    parser.add_argument("fault", nargs="*", choices=[[], *FAULTS], help="which; all if none is named")
+    options = parser.parse_args()
+    silent = [name for name in options.fault or FAULTS if not noticed(name, FAULTS[name], guest=options.guest)]
+    print(f"not noticed: {', '.join(silent)}" if silent else "each was noticed")
+    return 1 if silent else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
