@@ -2,8 +2,10 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.config.rig import load_config, single_line
+from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.errors import ConfigError
+
+CONFIGURATIONS = Path(__file__).parents[2] / "config"
 
 GOOD = """
 rig = "bench"
@@ -153,3 +155,14 @@ def test_an_unknown_key_names_the_one_that_may_be_meant_and_a_removed_one_says_s
 
     with pytest.raises(ConfigError, match=words):
         load(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "config").glob("*.toml")), ids=lambda path: path.name
+)
+def test_configuration_that_a_capture_carries_is_the_one_that_was_read(path):
+    config = load_config(path)
+
+    carried = config.model_dump(mode="json", exclude_defaults=True)
+
+    assert RigConfig.model_validate(carried) == config

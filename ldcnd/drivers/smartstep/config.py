@@ -252,6 +252,9 @@ class SimulatedSmartStepsConfig(Frozen):
     """How the host makes characters; a pseudo-terminal carries no parity bit unless the host makes it."""
 
 
+FILLED_IN = {"velocity": 1.0, "acceleration": 1.0}
+
+
 def as_axis(document: object) -> object:
     """Return an axis as the file has it, completed where the drive is a SmartStep.
 
@@ -264,8 +267,8 @@ def as_axis(document: object) -> object:
     if not isinstance(document, dict) or document.get("model") != MODEL:
         return document
     for key in MOTION_KEYS:
-        if key in document:
+        if key in document and document[key] != FILLED_IN.get(key):  # a capture's configuration was completed before
             raise ValueError(f"{key}: a SmartStep takes no motion over its line; remove it")
     rates = document.get("rates", {})
     slow = {**SLOW_RATES, **rates} if isinstance(rates, dict) else rates
-    return {**document, "velocity": 1.0, "acceleration": 1.0, "rates": slow}
+    return {**document, **FILLED_IN, "rates": slow}
