@@ -37,7 +37,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=300, help="how many mutants; 0 for all")
     parser.add_argument("--seed", type=int, default=18)
     parser.add_argument("--minutes", type=float, default=240.0, help="no mutant is begun after this time")
-    parser.add_argument("--seconds", type=float, default=30.0, help="of tests for one mutant, quickest first")
+    parser.add_argument("--seconds", type=float, default=30.0, help="of tests for one mutant")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--tests", nargs="+", default=TESTS, help="which tests")
     parser.add_argument("--subjects", nargs="+", default=SUBJECTS, help="which modules are changed")

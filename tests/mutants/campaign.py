@@ -160,7 +160,7 @@ class Campaign:
         return Verdict.SURVIVED, ""
 
     def _affordable(self, tests: Sequence[str]) -> list[str]:
-        """Return the quickest tests, as many as the budget pays for."""
+        """Return the first tests, as many as the budget pays for."""
         chosen: list[str] = []
         took_s = 0.0
         for test in tests:

@@ -67,7 +67,7 @@ def test_a_default_is_changed_where_the_function_is_defined(mutants: Mapping[str
     assert mutants["call removed: check(limit)"].function == "allowed"
 
 
-def test_covering_tests_are_taken_quickest_first_and_lines_are_followed_by_their_text(tmp_path: Path):
+def test_quick_tests_come_first_and_lines_are_followed_by_their_text(tmp_path: Path):
     subject = "tests/mutants/__init__.py"
     text = (ROOT / subject).read_text()
     (tmp_path / "sources").mkdir()
