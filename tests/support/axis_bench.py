@@ -146,12 +146,14 @@ class IdleBus:
 
     Attributes:
         is_open: as of a `Bus`.
+        distrusted: how often late replies were to be looked for.
         withdrawn: the nodes whose waiting exchanges were withdrawn, with the reasons.
         during: what happens while an exchange is under way, once.
     """
 
     def __init__(self) -> None:
         self.is_open = True
+        self.distrusted = 0
         self.withdrawn: list[tuple[int, LdcndError]] = []
         self.during: Happening | None = None
 
@@ -161,6 +163,10 @@ class IdleBus:
         if happening:
             await happening()
         return exchange.decode(b"")
+
+    def distrust(self) -> None:
+        """Take note."""
+        self.distrusted += 1
 
     def withdraw(self, node: int, error: LdcndError) -> None:
         """Take note."""

@@ -232,6 +232,9 @@ async def test_what_may_move_or_changes_a_drive_is_refused_without_a_right_to_it
         with pytest.raises(DuplicateDaemon):
             await rig.send(command.model_copy(update={"lease": mine.lease}))
         rig.dispatcher.rival = None
+        past_ns = round((asyncio.get_running_loop().time() - 0.5) * 1e9)
+        with pytest.raises(CommandExpired, match=r"0\.500 s later"):
+            await rig.send(command.model_copy(update={"lease": mine.lease, "not_after": past_ns}))
         with pytest.raises(CommandExpired, match="another run"):
             await rig.send(command.model_copy(update={"lease": mine.lease, "instance": "run-0"}))
         with pytest.raises(CommandExpired, match="later than its sender allows"):

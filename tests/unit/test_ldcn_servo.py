@@ -1,7 +1,6 @@
 """What a servo drive is told and what is believed of it; exchanges go straight into a simulated drive."""
 
-import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
 from ldcnd.drivers.ldcn.controls import HomingControl
-from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.errors import DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
@@ -17,49 +16,13 @@ from ldcnd.model.commands import HomeMethod, PinMode
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
+from tests.support.direct_bus import DirectBus
 from tests.support.simulated_axis import SimulatedAxis
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
 THERE = Motion(20_000, 20_000.0, 100_000.0)
 JOG = Motion(None, 5000.0, 100_000.0)
 SWITCHES = MotorPlant(reverse_limit_counts=-20_000, forward_limit_counts=20_000)
-
-Interference = Callable[[], object]
-"""What happens instead of the first exchange of a command: it may raise."""
-
-
-class DirectBus:
-    """Takes exchanges as a `Bus` does and carries them to a simulated drive at once.
-
-    Attributes:
-        sent: what was sent, with its lane.
-        instead: what happens in place of the next packet of a command.
-    """
-
-    def __init__(self, host: SimulatedAxis) -> None:
-        self.host = host
-        self.sent: list[tuple[Command, Lane]] = []
-        self.instead: dict[Command, Interference] = {}
-
-    async def execute(self, exchange, lane=Lane.COMMAND, *, once=False):
-        packet = packet_of(exchange.request)
-        command = Command(packet.command)
-        self.sent.append((command, lane))
-        if command in self.instead:
-            answer = self.instead.pop(command)()
-            if asyncio.iscoroutine(answer):
-                answer = await answer
-        self.host.chain.write(self.host.now_s, exchange.request)
-        return exchange.decode(self.host.wait(0.03))
-
-    def commands(self, since: int = 0) -> list[Command]:
-        return [command for command, _ in self.sent[since:]]
-
-
-def packet_of(request: bytes) -> Packet:
-    reader = PacketReader()
-    (received,) = [received for value in request if (received := reader.feed(value))]
-    return received.packet
 
 
 class Drive:
@@ -146,6 +109,22 @@ async def test_a_move_so_short_that_it_is_over_with_its_acknowledgement_has_star
     await drive.axis.start()  # 10 counts off the target is there, started or not
 
     await drive.axis.load(replace(THERE, target_counts=17))
+    ignored(drive.bus)
+    with pytest.raises(OutcomeUnknown):
+        await drive.axis.start()
+
+
+async def test_how_near_the_target_is_counts_from_where_the_axis_is():
+    drive = await powered()
+    await drive.axis.load(replace(THERE, target_counts=5000))
+    await drive.axis.start()
+    drive.host.wait(3.0)
+
+    await drive.axis.load(replace(THERE, target_counts=5010))
+    ignored(drive.bus)
+    await drive.axis.start()
+
+    await drive.axis.load(replace(THERE, target_counts=-5000))
     ignored(drive.bus)
     with pytest.raises(OutcomeUnknown):
         await drive.axis.start()

@@ -62,6 +62,16 @@ def test_a_register_is_unknown_while_it_is_being_written():
     assert (book.value("kp"), book.written("kp")) == (350, True)
 
 
+def test_a_register_that_the_device_lacks_is_on_no_record():
+    book = RegisterBook(LS_182AP)
+
+    book.wrote({"cl": 5})
+    book.doubt(["cl"])
+
+    assert "cl" not in {register.name for register in book.all()}
+    assert (book.value("cl"), book.written("cl")) == (None, False)
+
+
 def test_what_a_drive_was_taken_over_with_is_assumed_and_the_rest_is_unknown():
     book = RegisterBook(LS_182AP)
     book.wrote({"kp": 350, "position": 7})

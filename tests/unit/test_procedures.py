@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import math
 from dataclasses import replace
 
@@ -687,6 +688,7 @@ async def test_an_analog_move_ends_when_the_drive_says_so():
         (2.5, 100, "not there within 2 s"),
         (0.5, 2100, "stopped beyond a software limit"),
         (0.5, -2100, "stopped beyond a software limit"),
+        (0.5, 3000, "not referenced"),
         (0.5, 2000, None),
         (0.5, -2000, None),
     ],
@@ -695,6 +697,7 @@ async def test_an_analog_move_is_stopped_at_each_of_its_bounds(seconds, counts, 
     limits = {"position_min": -2.0, "position_max": 2.0}
     async with axis_bench(analog={"timeout_s": 2.0, "distance": 3.0}, limits=limits) as bench:
         bench.tracker.referenced = failure is None or "limit" in failure
+        failure = None if failure == "not referenced" else failure
         await bench.send(MoveAnalog(target=500), "analog")
         await bench.pass_s(seconds, position_counts=counts, **RUNNING)
         assert ("stop" in bench.drive.calls) is (failure is not None)
@@ -834,6 +837,19 @@ async def test_a_stop_of_a_member_while_the_drives_are_loaded_keeps_all_from_mov
             await joined(one, Meeting(network, frozenset({"x"})))
 
         assert (network.started, one.tracker.command) == ([], None)
+
+
+async def test_a_failure_that_no_member_is_left_to_see_is_no_error_of_the_loop():
+    reported = []
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: reported.append(context))
+    meeting = Meeting(FakeNetwork(), frozenset({"x"}))
+    meeting.fail(LOST)
+    await asyncio.sleep(0)
+
+    del meeting
+    gc.collect()
+
+    assert reported == []
 
 
 @pytest.mark.parametrize("error", [LOST, OutcomeUnknown("not all axes are known to have started")])

@@ -360,15 +360,14 @@ class AxisTracker:
         self._rest.forget(rests=False, commanded=self._rest.commanded)
 
     def cleared(self, now_s: float) -> None:
-        """Reset: latch and first cause are forgotten; the next readings tell what stands."""
+        """Reset of an axis that stands: latch and first cause are forgotten; the next readings tell what holds."""
         self._effective_from_s = now_s
         self.stop_latched = False
         self.position_lost = self._jumped = False
         self.active_faults = ()
         self.first_fault = None
         self.last_error = None
-        if self.state is AxisState.ERROR_STOP:
-            self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
+        self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
 
 
 def _entry(fault: Fault, now_ns: int) -> FaultEntry:

@@ -288,7 +288,6 @@ class HomeSequence(Procedure):
             motion.stopping(turn.command_id, turn.verb, AxisState.HOMING)
             return False
         self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
-        motion.stopping(turn.command_id, turn.verb, AxisState.HOMING, Completion.PROCEDURE)
         return True
 
     async def _move_on(self, turn: Turn) -> bool:

@@ -1,0 +1,69 @@
+"""A line without time: takes exchanges as a `Bus` does and carries them to a simulated chain at once."""
+
+import inspect
+from collections.abc import Awaitable, Callable
+from types import SimpleNamespace
+from typing import TypeVar
+
+from ldcnd.bus.queue import Lane
+from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.exchange import Exchange
+from tests.support.simulated_host import SimulatedHost
+
+ReplyT = TypeVar("ReplyT")
+
+Interference = Callable[[], Awaitable[object] | object]
+"""What happens beside an exchange: it may raise."""
+REPLIED_S = 0.03
+"""Longer than any exchange at 9600 baud."""
+
+
+class DirectBus:
+    """What drivers need of a `Bus`.
+
+    Attributes:
+        packets: what was sent.
+        sent: the commands, each with its lane.
+        instead: what happens before the next packet of a command; if it raises, the packet is not sent.
+        after: what happens after the next packet of a command, before its reply is taken.
+        settings, baud: as of a `Bus`.
+    """
+
+    def __init__(self, host: SimulatedHost) -> None:
+        self.host = host
+        self.packets: list[Packet] = []
+        self.sent: list[tuple[Command, Lane]] = []
+        self.instead: dict[Command, Interference] = {}
+        self.after: dict[Command, Interference] = {}
+        self.settings = SimpleNamespace(name="direct", bits_per_byte=10)
+        self.baud = 19_200
+
+    async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
+        """Carry an exchange out; `once` makes no difference where nothing is repeated."""
+        packet = packet_of(exchange.request)
+        command = Command(packet.command)
+        self.packets.append(packet)
+        self.sent.append((command, lane))
+        await _happen(self.instead, command)
+        self.host.chain.write(self.host.now_s, exchange.request)
+        reply = self.host.wait(REPLIED_S)
+        await _happen(self.after, command)
+        return exchange.decode(reply)
+
+    def commands(self, since: int = 0) -> list[Command]:
+        """Return the commands that were sent."""
+        return [command for command, _ in self.sent[since:]]
+
+
+async def _happen(happenings: dict[Command, Interference], command: Command) -> None:
+    if command in happenings:
+        result = happenings.pop(command)()
+        if inspect.isawaitable(result):
+            await result
+
+
+def packet_of(request: bytes) -> Packet:
+    """Return the packet that is sent."""
+    reader = PacketReader()
+    (received,) = [received for value in request if (received := reader.feed(value))]
+    return received.packet
