@@ -428,7 +428,7 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
         ]
 
         assert verdicts == [False, True, True, True, False]
-        assert bench.bus.distrusted == 3
+        assert bench.bus.distrusted == 4
         assert bench.tracker.link is LinkState.DEGRADED
         assert bench.drive.shown.position_counts == 0
 
