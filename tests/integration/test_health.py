@@ -16,6 +16,7 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import PENDING_QUERIES, SampleKind
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.samples import LinkState
+from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig
 
@@ -194,3 +195,20 @@ async def test_health_can_be_asked_for_as_json():
 
         assert {answer.key for answer in answers} == {KEYS.health, KEYS.bus_health("line0")}
         assert all(json.loads(answer.payload)["t"] > 0 for answer in answers)
+
+
+@pytest.mark.parametrize("frozen_s", [0.9, 4.0])
+async def test_a_daemon_that_was_frozen_goes_on_and_reports_no_sooner_than_after_half_a_period(frozen_s):
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, JumpingLoop)
+    async with running_rig() as rig:
+        taken = []
+        declaration = await rig.session.subscribe(KEYS.health, lambda _: taken.append(loop.time()))
+        for tenth in (0.0, 0.1, 0.3, 0.6):
+            await asyncio.sleep(1.0 + tenth)
+            loop.hold_up(frozen_s)
+        await asyncio.sleep(2.5)
+        await declaration.close()
+
+    assert len(taken) >= 7
+    assert min(later - earlier for earlier, later in pairwise(taken)) > 0.49

@@ -116,9 +116,9 @@ class HealthWatch:
                     await asyncio.sleep(due_s - self._clock.now_s())
                     lag_s = max(lag_s, self._clock.now_s() - due_s)
                 now_s = self._clock.now_s()
-                held_up = int((now_s - due_s) / PERIOD_S)
-                self._missed += held_up
-                due_s += held_up * PERIOD_S
+                left_out = round((now_s - due_s) / PERIOD_S)  # the next one covers half a period at least
+                self._missed += left_out
+                due_s += left_out * PERIOD_S
                 self._report(now_s - last_s, lag_s)
                 last_s = now_s
         finally:
