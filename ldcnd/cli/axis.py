@@ -2,7 +2,7 @@
 
 import click
 
-from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.derived import derived
 from ldcnd.cli.jog import jog
 from ldcnd.cli.quantities import decimals, number, sample_text, seconds, state_word
@@ -71,7 +71,7 @@ def list_axes(target: Target) -> None:
 
 
 @command.command()
-@click.argument("axis", default="*")
+@click.argument("axis", type=AXIS, default="*")
 @click.option("--item", type=click.Choice([item.value for item in TelemetryItem]), help="Only this item.")
 @click.option("--count", type=click.IntRange(min=1), help="End after so many samples.")
 @with_target
@@ -93,7 +93,7 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("switch", type=click.Choice(["on", "off"]))
 @commanding
 def power(sender: Sender, axis: str, switch: str) -> None:
@@ -102,7 +102,7 @@ def power(sender: Sender, axis: str, switch: str) -> None:
 
 
 @command.command(context_settings={"ignore_unknown_options": True})
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("value", type=Finite())
 @click.option("--relative", is_flag=True, help="VALUE is a distance.")
 @click.option("--at-velocity", is_flag=True, help="VALUE is a velocity: run until stopped or to the soft limit.")
@@ -147,7 +147,7 @@ def move(
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.option("--method", type=click.Choice([method.value for method in HomeMethod]), help="What marks the position.")
 @click.option("--velocity", type=Finite(), help="Search velocity, signed; units a second.")
 @click.option("--position", type=Finite(), help="What the position is called there.")
@@ -170,7 +170,7 @@ def home(
 
 
 @command.command()
-@click.argument("axis", required=False)
+@click.argument("axis", type=AXIS, required=False)
 @with_target
 def stop(target: Target, axis: str | None) -> None:
     """Stop AXIS, or the whole rig, and latch: nothing moves again before reset."""
@@ -178,7 +178,7 @@ def stop(target: Target, axis: str | None) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @commanding
 def halt(sender: Sender, axis: str) -> None:
     """Bring AXIS to rest; another command may follow."""
@@ -186,7 +186,7 @@ def halt(sender: Sender, axis: str) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @commanding
 def reset(sender: Sender, axis: str) -> None:
     """Clear the stop latch and the faults of AXIS; nothing moves."""
@@ -207,7 +207,7 @@ for each in (
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.option("--position", type=Finite(), help="A move to this position.")
 @click.option("--distance", type=Finite(), help="A move by this distance.")
 @click.option("--velocity", type=Finite(), help="Speed of the move; alone: a motion at this velocity, signed.")
@@ -232,7 +232,7 @@ def preview(
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def profile(target: Target, axis: str) -> None:
     """Show how the drive of AXIS is taken to behave, with what was verified and what is assumed."""
@@ -251,7 +251,7 @@ def profile(target: Target, axis: str) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def monitors(target: Target, axis: str) -> None:
     """Show the last values of the monitors of AXIS."""
@@ -268,7 +268,7 @@ def monitors(target: Target, axis: str) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def alarms(target: Target, axis: str) -> None:
     """Show the present alarm of AXIS and the history that its drive keeps."""
@@ -283,7 +283,7 @@ def alarms(target: Target, axis: str) -> None:
 
 
 @command.command("read-monitors")
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice([name.value for name in MonitorName]))
 @with_target
 def read_monitors(target: Target, axis: str, names: tuple[str, ...]) -> None:
@@ -297,7 +297,7 @@ def read_monitors(target: Target, axis: str, names: tuple[str, ...]) -> None:
 
 
 @command.command("clear-counter")
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("counter", type=click.Choice([name.value for name in CounterName]))
 @with_target
 def clear_counter(target: Target, axis: str, counter: str) -> None:

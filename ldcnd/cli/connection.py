@@ -1,6 +1,7 @@
 """How commands find a running daemon: Zenoh's usual flags, a session, a rig."""
 
 import asyncio
+import os
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial, wraps
@@ -8,17 +9,21 @@ from pathlib import Path
 from typing import TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
 from ldcnd.cli.output import show_lines
 from ldcnd.client.connecting import open_rig
 from ldcnd.client.rig_client import RigClient
+from ldcnd.errors import LdcndError
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.frozen import Frozen
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+COMPLETION_S = 2.0
+"""Longest time that a shell waits for the names of axes."""
 ResultT = TypeVar("ResultT")
 ModelT = TypeVar("ModelT", bound=Frozen)
 CommandT = TypeVar("CommandT", bound=Callable[..., object])
@@ -38,6 +43,29 @@ def of_options(model: type[ModelT], **values: object) -> ModelT:
         raise click.BadParameter(
             f"{wrong['msg'][:1].lower()}{wrong['msg'][1:]}, not {wrong['input']!r}", param_hint=name.replace("_", "-")
         ) from None
+
+
+class AxisName(click.types.StringParamType):
+    """The name of an axis; the shell completes it with those of the daemon that the line so far names."""
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002
+        """Return the axes that begin so; none when no daemon answers in time."""
+        given = {name: ctx.params.get(name) for name in ("connect", "listen", "config", "rig")}
+        connect = given["connect"] or tuple(filter(None, [os.environ.get("LDCND_CONNECT")]))
+        target = Target(connect, given["listen"] or (), given["config"], given["rig"], as_json=False)
+
+        async def names(client: RigClient) -> list[str]:
+            async with asyncio.timeout(COMPLETION_S):
+                return [info.axis for info in await client.axes()]
+
+        try:
+            found = target.run(names)
+        except (LdcndError, TimeoutError):
+            return []
+        return [CompletionItem(name) for name in found if name.startswith(incomplete)]
+
+
+AXIS = AxisName()
 
 
 class TargetOption(click.Option):

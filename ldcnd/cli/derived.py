@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import click
 
-from ldcnd.cli.connection import of_options
+from ldcnd.cli.connection import AXIS, of_options
 from ldcnd.cli.sending import Sender, Sent, commanding
 from ldcnd.cli.typed import Finite
 from ldcnd.model.commands import AxisCommand
@@ -27,7 +27,7 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
     def callback(sender: Sender, /, axis: str, *, wait: bool = False, **given: Any) -> None:  # noqa: ANN401 - click's own
         sender.send(axis, of_options(command, **given), wait=wait)
 
-    params: list[click.Parameter] = [click.Argument(["axis"])]
+    params: list[click.Parameter] = [click.Argument(["axis"], type=AXIS)]
     for field, described in command.model_fields.items():
         if field in AxisCommand.model_fields:
             continue

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import Finite
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
@@ -30,7 +30,7 @@ def _moving(work: Callable[..., None]) -> Callable[..., None]:
     for option in (
         click.confirmation_option("--yes", prompt="The axis will move. Go on?"),
         click.option("--velocity", type=Finite(), required=True, help="Units a second, signed."),
-        click.argument("axis"),
+        click.argument("axis", type=AXIS),
     ):
         work = option(work)
     return work

@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
@@ -12,7 +12,7 @@ from ldcnd.model.events import ALARM_HISTORY, CommandEvent
 
 
 @click.command()
-@click.option("--axis", help="Only this axis.")
+@click.option("--axis", type=AXIS, help="Only this axis.")
 @click.option("--count", type=click.IntRange(1, 1000), default=50, show_default=True, help="At most so many.")
 @click.option("--follow", is_flag=True, help="Go on with those that come, until Ctrl-C; none is lost silently.")
 @with_target

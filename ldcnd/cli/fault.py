@@ -1,12 +1,21 @@
 """`ldcnd fault`: the page of a fault or an error code, for those who have a terminal and nothing else."""
 
 import click
+from click.shell_completion import CompletionItem
 
 from ldcnd.fault_pages import codes, page_text
 
 
+class Code(click.types.StringParamType):
+    """A code that has a page; the shell completes it."""
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002
+        """Return the codes that begin so."""
+        return [CompletionItem(code) for code in sorted(codes()) if code.startswith(incomplete)]
+
+
 @click.command()
-@click.argument("code", required=False)
+@click.argument("code", required=False, type=Code())
 def command(code: str | None) -> None:
     """Explain CODE, a fault or an error: what to check, how to clear it; without CODE list all of them."""
     if code is None:

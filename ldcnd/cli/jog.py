@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import click
 
-from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import show_lines
 from ldcnd.cli.quantities import rounded
@@ -30,7 +30,7 @@ NEXT_REPEAT_S = 0.25
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("velocity", type=Finite())
 @click.option("--for", "for_s", type=Finite(0, 3600, min_open=True), help="Run for so many seconds.")
 @click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")

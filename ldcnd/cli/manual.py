@@ -15,11 +15,15 @@ EXIT_STATUS = (
     ("2", "Wrong usage."),
     ("3", "No daemon answers."),
     ("78", "The configuration cannot work."),
+    ("130", "Interrupted by Ctrl-C; what was waited for was halted, or the message says how."),
 )
 INTRODUCTION = """# Command line
 
 `ldcnd COMMAND --help` says the same, and so do the man pages of the Debian package. Every command that asks a daemon
 takes the options for finding it besides its own. This page is written by `ldcnd schema cli`.
+
+The shell completes commands, options, axes of the daemon and fault codes once it is told so, in `~/.bashrc`:
+`eval "$(_LDCND_COMPLETE=bash_source ldcnd)"`; zsh and fish likewise, with `zsh_source` and `fish_source`.
 
 | exit code | meaning |
 |---|---|

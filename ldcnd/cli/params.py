@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.parameter_file import LARGEST, ParameterFile, as_toml, load_parameters
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
@@ -44,7 +44,7 @@ def command() -> None:
 
 
 @command.command("list")
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def list_parameters(target: Target, axis: str) -> None:
     """Show what is known of the parameters of AXIS; ranges are hints, the drive decides."""
@@ -58,7 +58,7 @@ def list_parameters(target: Target, axis: str) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("parameter")
 @click.option("--unlisted", is_flag=True, help="Allow a number that the manual does not list.")
 @with_target
@@ -69,7 +69,7 @@ def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
 
 
 @command.command("set")
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("parameter")
 @click.argument("value", callback=_word)
 @click.option("--eeprom", is_flag=True, help="Write for good; the memory endures 10,000 writes.")
@@ -94,7 +94,7 @@ def set_parameter(
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("file", type=click.Path(path_type=Path), required=False)
 @with_target
 def dump(target: Target, axis: str, file: Path | None) -> None:
@@ -133,7 +133,7 @@ def diff(target: Target, left: str, right: str | None) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--ram", is_flag=True, help="Only try out: write RAM, and leave out what takes effect at power-on.")
 @click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
@@ -151,7 +151,7 @@ def restore(target: Target, axis: str, file: Path, *, ram: bool, dry_run: bool, 
 
 @command.command()
 @click.argument("source")
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
 @click.option("--any-type", is_flag=True, help="Take values of another type of drive.")
 @click.option("--yes", is_flag=True, help="Do not ask.")
@@ -165,7 +165,7 @@ def clone(target: Target, source: str, axis: str, *, dry_run: bool, any_type: bo
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @with_target
@@ -177,7 +177,7 @@ def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
 
 
 @command.command("restart-count")
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.option(
     "--writes", type=click.IntRange(0, 10_000), default=0, help="Writes that the new drive has taken already."
 )

@@ -7,7 +7,7 @@ import sys
 
 import click
 
-from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, show_lines
 from ldcnd.cli.quantities import outcome, values_of
@@ -42,7 +42,7 @@ def stop_rig(target: Target, axis: str | None) -> None:
 
 
 @click.command()
-@click.argument("axis", required=False)
+@click.argument("axis", type=AXIS, required=False)
 @with_target
 def stop(target: Target, axis: str | None) -> None:
     """Stop AXIS, or every axis of the rig, and latch: nothing moves again before `ldcnd reset`.
@@ -53,7 +53,7 @@ def stop(target: Target, axis: str | None) -> None:
 
 
 @click.command()
-@click.argument("axes", nargs=-1, metavar="[AXIS]...")
+@click.argument("axes", type=AXIS, nargs=-1, metavar="[AXIS]...")
 @commanding
 def reset(sender: Sender, axes: tuple[str, ...]) -> None:
     """Clear stop latches and faults of each AXIS, or of all axes; nothing moves."""
@@ -62,7 +62,7 @@ def reset(sender: Sender, axes: tuple[str, ...]) -> None:
 
 @click.command()
 @click.argument("switch", type=click.Choice(["on", "off"]))
-@click.argument("axes", nargs=-1, metavar="[AXIS]...")
+@click.argument("axes", type=AXIS, nargs=-1, metavar="[AXIS]...")
 @commanding
 def power(sender: Sender, switch: str, axes: tuple[str, ...]) -> None:
     """Close (on) or open (off) the position loops of each AXIS, or of all axes; nothing moves."""
@@ -136,7 +136,7 @@ def list_holders(target: Target) -> None:
 
 
 @lease.command(context_settings={"allow_interspersed_args": False})
-@click.option("--axis", "axes", multiple=True, help="This axis; may be repeated. All axes when missing.")
+@click.option("--axis", "axes", type=AXIS, multiple=True, help="This axis; may be repeated. All axes when missing.")
 @click.option("--name", default=NAME, show_default=True, help="Who holds it, for people.")
 @click.option(
     "--seconds",

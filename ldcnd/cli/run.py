@@ -8,12 +8,16 @@ from pathlib import Path
 
 import click
 
+from ldcnd.cli.console import DEFAULT_ADDRESS
 from ldcnd.cli.ending import Terminal
+from ldcnd.cli.first_steps import show_first_steps
+from ldcnd.cli.typed import parsed_address
 from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.daemon.process.assembly import open_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.process.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
 from ldcnd.daemon.process.systemd import Notifier
+from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.messaging.zenoh_threads import senders_wait
 from ldcnd.model.frozen import build_models
@@ -27,6 +31,14 @@ log = get_logger("run")
 @click.option("--listen", "-l", multiple=True, help="Listen here instead of the configured endpoints; may be repeated.")
 @click.option("--connect", "-e", multiple=True, help="Connect here too; may be repeated.")
 @click.option("--bus", help="Serve this line only, as the rig RIG_BUS: one process for each line.")
+@click.option(
+    "--console",
+    is_flag=False,
+    flag_value=DEFAULT_ADDRESS,
+    metavar="[HOST:PORT]",
+    callback=parsed_address,
+    help=f"Serve the console beside it, at {DEFAULT_ADDRESS} unless said otherwise, and say what to type next.",
+)
 @click.option("--log-json", is_flag=True, help="Log JSON lines instead of text.")
 @click.option(
     "--log-level",
@@ -36,7 +48,14 @@ log = get_logger("run")
     help="Log nothing below this.",
 )
 def command(
-    config: Path, listen: tuple[str, ...], connect: tuple[str, ...], bus: str | None, *, log_json: bool, log_level: str
+    config: Path,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    bus: str | None,
+    console: ListenAddress | None,
+    *,
+    log_json: bool,
+    log_level: str,
 ) -> None:
     """Own the lines of a rig and serve its drives until SIGTERM or SIGINT; moving axes are stopped first.
 
@@ -62,10 +81,10 @@ def command(
         held_awake(wanted=rig.daemon.hold_cpu_awake),
         asyncio.Runner(loop_factory=loop_factory(uvloop=rig.daemon.uvloop)) as runner,
     ):
-        runner.run(serve(rig, load))
+        runner.run(serve(rig, load, console))
 
 
-async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
+async def serve(rig: RigConfig, load: Callable[[], RigConfig], console: ListenAddress | None = None) -> None:
     """Serve one rig until a signal asks to end; SIGHUP has its configuration read again."""
     async with open_daemon(rig) as daemon:
         service = Service(daemon, Notifier(), load)
@@ -83,11 +102,14 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig]) -> None:
         try:
             with last_words(partial(write_captures, daemon)):
                 async with asyncio.TaskGroup() as group:
-                    arranging = group.create_task(senders_wait(), name="senders wait")
+                    beside = [group.create_task(senders_wait(), name="senders wait")]
+                    if console:
+                        beside.append(group.create_task(show_first_steps(daemon, rig, console), name="console"))
                     try:
                         await service.run()
                     finally:
-                        arranging.cancel()
+                        for task in beside:
+                            task.cancel()
         finally:
             for number in handlers:
                 loop.remove_signal_handler(number)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.trace_plot import plot_trace
 from ldcnd.cli.typed import Finite, axis_of
@@ -81,7 +81,7 @@ def command() -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @click.option("--channel", "-c", "channels", multiple=True, required=True, help="What to record; may be repeated.")
 @click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
 @click.option("--samples", type=click.IntRange(2, MOST_SAMPLES), default=500, help="How many samples [500].")
@@ -127,7 +127,7 @@ def take(
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @out_option
 @with_target
 def last(target: Target, axis: str, out: Path | None) -> None:
@@ -136,7 +136,7 @@ def last(target: Target, axis: str, out: Path | None) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def abort(target: Target, axis: str) -> None:
     """End the trace of AXIS that is under way, or one that was left armed in its drive."""
@@ -145,7 +145,7 @@ def abort(target: Target, axis: str) -> None:
 
 
 @command.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def channels(target: Target, axis: str) -> None:
     """Show what a trace of AXIS can record."""

@@ -51,6 +51,10 @@ class Finite(click.FloatRange):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
 
+    def _describe_range(self) -> str:
+        """Return its limits for help; nothing without limits."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
 
 CommandT = TypeVar("CommandT", bound=Callable[..., object])
 
@@ -59,7 +63,7 @@ def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
     """Return an option of that name, whose value is a `ListenAddress`; anything but HOST:PORT is wrong usage."""
     return click.option(
         name,
-        callback=_parsed,
+        callback=parsed_address,
         default=default,
         show_default=True,
         metavar="HOST:PORT",
@@ -67,7 +71,10 @@ def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
     )
 
 
-def _parsed(_context: click.Context, _parameter: click.Parameter, value: str) -> ListenAddress:
+def parsed_address(_context: click.Context, _parameter: click.Parameter, value: str | None) -> ListenAddress | None:
+    """Return what is written as HOST:PORT; None for nothing."""
+    if value is None:
+        return None
     try:
         return parse_listen_address(value)
     except ConfigError as error:

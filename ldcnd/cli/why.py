@@ -4,7 +4,7 @@ import sys
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.output import in_typed_terms
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
@@ -12,7 +12,7 @@ from ldcnd.model.commands import WhyReply
 
 
 @click.command()
-@click.argument("axis")
+@click.argument("axis", type=AXIS)
 @with_target
 def command(target: Target, axis: str) -> None:
     """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""

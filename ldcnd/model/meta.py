@@ -185,6 +185,8 @@ class AxisInfo(Frozen):
     """forward or reverse: the sign between counts and units."""
     limits: AxisLimits
     """Software limits in axis units."""
+    group: str | None = None
+    """Its group: axes that `move_together` starts in the same servo cycle; null when it is in none."""
     capabilities: tuple[Verb, ...]
     """The commands it takes."""
     items: tuple[str, ...]

@@ -32,6 +32,11 @@ FLAGS = (
 PATIENCE_S = 45.0
 """Pages are waited for, never slept for; a busy machine may take its time."""
 LOOKED_EACH_S = 0.05
+GROUP = """
+[[bus.group]]
+name = "gantry"
+axes = ["x", "y"]
+"""
 
 
 class DaemonUnderTest:
@@ -220,7 +225,10 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
     text = (ROOT / "config" / "mixed.toml").read_text(encoding="utf-8")
     mixed_config = folder / "mixed.toml"
     mixed_config.write_text(text.replace('state_dir = "state"', f'state_dir = "{folder}"'), encoding="utf-8")
-    sim, mixed = DaemonUnderTest(ROOT / "config" / "simulated.toml"), DaemonUnderTest(mixed_config)
+    text = (ROOT / "config" / "simulated.toml").read_text(encoding="utf-8")
+    sim_config = folder / "simulated.toml"
+    sim_config.write_text(text.replace("\n[[sim]]", f"{GROUP}\n[[sim]]", 1), encoding="utf-8")
+    sim, mixed = DaemonUnderTest(sim_config), DaemonUnderTest(mixed_config)
     async with AsyncExitStack() as stack:
         browser = await stack.enter_async_context(open_browser())
         for daemon in (sim, mixed):

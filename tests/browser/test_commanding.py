@@ -1,7 +1,10 @@
 """What can be commanded without typing: all axes of a rig, one of a row, and a jog for as long as it is held."""
 
+import re
+
 import pytest
 
+from ldcnd.model.commands import SetPosition
 from ldcnd.model.rig_commands import ListHolders
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -70,3 +73,54 @@ async def test_a_jog_runs_while_the_button_or_an_arrow_key_is_held(house):
         before = await house.sim.position("x")
         await jog.get_by_role("button", name="+1 mm", exact=True).click()
         await house.sim.reaches("x", before + 1, within=0.05)
+
+
+async def test_a_group_is_moved_together_from_the_rig_page_by_keyboard(house):
+    await house.sim.quiet("x", "y")
+    for axis in ("x", "y"):
+        await house.sim.rig.command(axis, SetPosition(position=0.0))
+    async with house.desk(width=1280) as desk:
+        await desk.open("rig")
+        every = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        group = desk.panel("Group gantry")
+        await expect(group).to_contain_text("x: Take control first.")
+        for name in ("Take control of all", "Enable all"):
+            await every.get_by_role("button", name=name).focus()
+            await desk.page.keyboard.press("Enter")
+            await house.sim.until("x", lambda _: True)
+        for axis in ("x", "y"):
+            await house.sim.until(axis, lambda state: state.enabled)
+
+        await group.get_by_label("x to mm").focus()
+        await desk.page.keyboard.type("3")
+        await desk.page.keyboard.press("Tab")
+        await desk.page.keyboard.type("-2")
+        await expect(desk.button("Move x and y together")).to_be_enabled()
+        await desk.page.keyboard.press("Enter")
+
+        await house.sim.reaches("x", 3, within=0.05)
+        await house.sim.reaches("y", -2, within=0.05)
+
+
+async def test_pins_become_outputs_and_a_slow_velocity_can_be_read(house):
+    await house.sim.quiet("z")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/z")
+        await desk.button("Take control").click()
+        outputs = desk.panel("Outputs")
+        await outputs.get_by_label("Limit 1 (reverse)").select_option("output, high")
+        await outputs.get_by_role("button", name="Set outputs").click()
+        await expect(outputs.get_by_role("alert")).to_be_empty()
+        await expect(outputs.get_by_label("Limit 1 (reverse)")).to_have_value("")
+        await outputs.get_by_label("Limit 1 (reverse)").select_option("input")
+        await outputs.get_by_role("button", name="Set outputs").click()
+        await expect(outputs.get_by_label("Limit 1 (reverse)")).to_have_value("")
+
+        await desk.button("Enable").click()
+        await house.sim.until("z", lambda state: state.enabled)
+        await desk.panel("Move").get_by_label("Move", exact=True).select_option("at a velocity")
+        await desk.panel("Move").get_by_label(re.compile("^Velocity")).fill("0.3")
+        await desk.button("Move").click()
+        await expect(desk.panel("Now")).to_contain_text(re.compile(r"velocity\s*0\.3[0-9]*"))
+        await desk.button("Halt").click()
+        await house.sim.until("z", lambda state: state.moving == "no")

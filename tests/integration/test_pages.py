@@ -17,7 +17,10 @@ NEXT = (
     "docs/tutorials/record-and-export.md",
 )
 BY_THEMSELVES = ("docs/how-to/simulate-a-line.md", "docs/how-to/secure-a-rig.md")
-FOLLOWED = {FIRST_RIG, *NEXT, *BY_THEMSELVES}
+OPERATING = tuple(
+    f"docs/how-to/{name}.md" for name in ("commission-a-first-drive", "jog", "home", "tune", "move-a-group")
+)
+FOLLOWED = {FIRST_RIG, *NEXT, *BY_THEMSELVES, *OPERATING}
 """Pages whose blocks are run here, all of them but those in `NOT_RUN`."""
 ELSEWHERE = {
     "deploy/INSTALL.md": "test_every_command_of_the_guide_works",
@@ -26,16 +29,20 @@ ELSEWHERE = {
 }
 """Pages whose commands another test runs."""
 NOT_RUN = {
-    ("README.md", "make run    # makes the environment, then runs the daemon on the simulated rig"): "CI does it",
+    ("README.md", "make run    # an environment of 80 MB, the simulated rig and its console, and what to type next"): (
+        "test_make_run_says_what_to_type_and_the_first_program_moves"
+    ),
+    ("README.md", "# first.py"): "test_make_run_says_what_to_type_and_the_first_program_moves",
     ("README.md", ".venv/bin/ldcnd axis list"): "test_the_tour_of_the_readme_runs",
     ("README.md", ".venv/bin/python examples/move_and_watch.py"): (
         "test_the_example_follows_a_moving_axis_to_its_target"
     ),
     (FIRST_RIG, "python3 -m venv ldcnd-env"): "fetches packages",
     ("docs/how-to/write-a-client.md", "import asyncio, ldcnd"): "test_the_first_program_runs",
-    ("docs/how-to/console.md", "pip install 'ldcnd[console]'"): (
-        "fetches packages; tests/integration/test_console_server.py runs the console"
-    ),
+    (
+        "docs/how-to/console.md",
+        "pip install '.[console]'    # in a checkout; or the wheel with [console] behind its name",
+    ): ("fetches packages; tests/integration/test_console_server.py runs the console"),
     ("docs/how-to/console.md", "ssh -L 8470:127.0.0.1:8470 bench.example ldcnd console"): "needs another machine",
     ("docs/how-to/console.md", "openssl rand -hex 32 > token; chmod 600 token"): (
         "test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls"
@@ -125,6 +132,16 @@ async def test_the_tutorials_can_be_followed(tmp_path) -> None:
     assert (tmp_path / "move.png").read_bytes().startswith(b"\x89PNG")
     assert " positions, from " in reader.printed
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.real_time
+@pytest.mark.timeout(240)
+async def test_a_first_drive_is_commissioned_jogged_homed_tuned_and_moved_in_a_group(tmp_path) -> None:
+    async with PageReader(tmp_path) as reader:
+        for page in OPERATING:
+            await reader.follow(ROOT / page, NOT_RUN)
+
+    assert (tmp_path / "before.csv").exists()
 
 
 @pytest.mark.real_time

@@ -96,8 +96,9 @@ class Describing:
                 partial(self._bus_source, bus), partial(bus_info, bus)
             )
             for axis in bus.axes:
+                group = next((name for name, axes in rig.groups.items() if axis.config.name in axes), None)
                 self._described[keys.axis(axis.config.name)] = _Encoded(
-                    partial(_axis_source, axis), partial(axis_info, bus, axis)
+                    partial(_axis_source, axis), partial(axis_info, bus, axis, group)
                 )
         self._schemas = {keys.schema(name): text.encode() for name, text in all_schemas().items()}
 
@@ -196,8 +197,8 @@ def bus_info(bus: BusService) -> BusInfo:
     )
 
 
-def axis_info(bus: BusService, axis: AxisService) -> AxisInfo:
-    """Describe one axis."""
+def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> AxisInfo:
+    """Describe one axis, of a group or of none."""
     config, driver = axis.config, axis.driver
     return AxisInfo(
         axis=config.name,
@@ -210,6 +211,7 @@ def axis_info(bus: BusService, axis: AxisService) -> AxisInfo:
         counts_per_unit=config.counts_per_unit,
         direction=config.direction,
         limits=config.limits,
+        group=group,
         capabilities=tuple(sorted(driver.capabilities, key=list(Verb).index)),
         items=tuple(item.value for item in TelemetryItem if item is not TelemetryItem.ADC or driver.adc_full_scale),
         adc_full_scale=driver.adc_full_scale,

@@ -10,6 +10,7 @@ import { LimitsPanel, RegistersPanel } from "./axis_limits.js";
 import { JogPanel } from "./axis_jog.js";
 import { MovePanel } from "./axis_motion.js";
 import { NowPanel } from "./axis_now.js";
+import { OutputsPanel } from "./axis_outputs.js";
 
 const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog"];
 
@@ -40,6 +41,7 @@ export function AxisPage({ at }) {
         ${axis.can("move_velocity") && html`<${JogPanel} key=${axis.name} axis=${axis} />`}
         ${MOTIONS.some((verb) => axis.can(verb)) && html`<${MovePanel} axis=${axis} />`}
         ${axis.can("home") && html`<${HomePanel} axis=${axis} />`}
+        ${axis.can("set_outputs") && html`<${OutputsPanel} key=${axis.name} axis=${axis} />`}
         ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}
       </div>
     </div>`;

@@ -1,7 +1,7 @@
 /** Motions of an axis, each previewed by the daemon before it is commanded. */
 
 import { html, useEffect, useId, useState } from "../html.js";
-import { Action, Choice, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
+import { Action, Choice, enterSends, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
 import { decimalsOf, duration, number } from "../parts/format.js";
 import { command, question } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -81,13 +81,6 @@ export function MovePanel({ axis }) {
       kind="main">Move<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
-}
-
-/** Enter in a field does what the main button of its panel does. */
-function enterSends(event) {
-  if (event.key !== "Enter" || event.target.tagName !== "INPUT") return;
-  event.preventDefault();
-  event.currentTarget.closest(".panel").querySelector("button.main").click();
 }
 
 /** Return what the verb carries, or null while its main value is missing. */

@@ -11,7 +11,7 @@ import { obstacle } from "../session/obstacles.js";
 export function NowPanel({ axis }) {
   const { info, samples, state } = axis;
   const decimals = decimalsOf(info);
-  const { position, velocity, adc } = samples;
+  const { position, adc } = samples;
   const left = state?.command?.target == null || !position ? null : state.command.target - position.value;
   return html`<${Panel} title="Now" data-stale=${axis.rig.worth ? "yes" : "no"}>
     <div class="now">
@@ -20,7 +20,7 @@ export function NowPanel({ axis }) {
       <p class="now-state"><${StateWord} axis=${axis} /> <${QualityWord} axis=${axis} /></p>
     </div>
     <${Facts} of=${[
-      ["velocity", html`${number(velocity?.value, decimals)} <span class="unit">${info.unit}/s</span>`],
+      ["velocity", html`${number(axis.velocity, decimals)} <span class="unit">${info.unit}/s</span>`],
       ["following error", html`${number(position?.following_error, decimals)} <span class="unit">${info.unit}</span>`],
       ["target", html`${number(state?.command?.target, decimals)} <span class="unit">${info.unit}</span>`],
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],

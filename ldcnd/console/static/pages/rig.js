@@ -9,6 +9,7 @@ import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { endpoints, useRigs } from "../session/rigs.js";
+import { GroupMoves } from "./rig_groups.js";
 
 const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Control", "Commands"];
 const FULL = 0.9;
@@ -75,6 +76,7 @@ function RigSection({ rig }) {
     </header>
     ${rig.worth && html`<p class="notice mark" data-level="bad">${rig.worth.why} The values below are the last known ones.</p>`}
     <${RigCommands} rig=${rig} />
+    <${GroupMoves} rig=${rig} />
     ${[...rig.buses.values()].map((bus) => html`<${BusSection} key=${bus.name} rig=${rig} bus=${bus} />`)}
   </section>`;
 }
@@ -113,7 +115,7 @@ function Counter({ bus, counter, label }) {
 function AxisRow({ axis }) {
   const { info, samples, state, health } = axis;
   const decimals = decimalsOf(info);
-  const { position, velocity, adc } = samples;
+  const { position, adc } = samples;
   const cell = (label, content, kind = "") => html`<td role="cell" data-label=${label} class=${kind}>${content}</td>`;
   return html`<tr role="row" data-axis=${axis.name}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
@@ -124,7 +126,7 @@ function AxisRow({ axis }) {
         : state?.stop_latched && html` <${Mark} level="warn">stop latched<//>`
     }`)}
     ${cell("Position", html`<b>${number(position?.value, decimals)}</b> <span class="unit">${info.unit}</span>`, "number main")}
-    ${cell("Velocity", html`${number(velocity?.value, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
+    ${cell("Velocity", html`${number(axis.velocity, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
     ${cell("Target", number(state?.command?.target, decimals), "number")}
     ${cell("A/D", adc ? html`${number(adc.volts, 2)} <span class="unit">V</span>` : html`<span class="quiet">none</span>`, "number")}
     ${cell("Faults", html`<${FaultWords} axis=${axis} />`)}

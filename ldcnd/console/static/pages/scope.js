@@ -40,7 +40,7 @@ export function ScopePage({ at }) {
         </div>
       <//>
       <${Panel} title="Live" class="panel bench-picture">
-        <${ChartView} name="scope" curves=${recording.curves} csv=${() => recording.csv()} height=${460}
+        <${ChartView} name="scope" curves=${recording.curves} height=${460}
           live=${{ now: () => recording.now(), windowS, paused, onPause: setPaused }}
           note=${feed.dropped > 0 && html`<span class="quiet">${feed.dropped} frames dropped: this browser is too slow</span>`} />
       <//>

@@ -4,7 +4,7 @@ import { html, useId, useMemo, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
 import { Action, Choice, Field, Panel, Reason, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
-import { clock, dateAndClock, duration, number, words } from "../parts/format.js";
+import { clock, dateAndClock, duration, words } from "../parts/format.js";
 import { axisPath } from "../session/api.js";
 import { capture, captures, discard, fetchLast, keep } from "../session/captures.js";
 import { look } from "../session/channels.js";
@@ -99,7 +99,7 @@ function Captured() {
   const toggle = (one, on) =>
     setHidden(new Set([...kept.map((each) => each.id)].filter((id) => (id === one.id ? !on : hidden.has(id)))));
   return html`<${Panel} title="Captures">
-    <${ChartView} name="trace" curves=${curves} csv=${() => csvOf(shown)} height=${420} />
+    <${ChartView} name="trace" curves=${curves} height=${420} />
     <ul class="captures">${kept.map(
       (one) => html`<li key=${one.id}>
       <${Tick} label=${`${one.axis.name}, ${dateAndClock(one.header.t)}`} checked=${!hidden.has(one.id)}
@@ -140,18 +140,4 @@ function curvesOf(shown) {
         }),
     ),
   );
-}
-
-function csvOf(shown) {
-  const rows = ["time_s,capture,channel,value,unit"];
-  for (const one of shown) {
-    for (const channel of one.channels) {
-      channel.values.forEach((value, row) =>
-        rows.push(
-          `${number(one.seconds[row], 6).replace("−", "-")},${one.id},${channel.name},${value},${channel.unit}`,
-        ),
-      );
-    }
-  }
-  return `${rows.join("\n")}\n`;
 }

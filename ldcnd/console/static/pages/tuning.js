@@ -111,7 +111,7 @@ function Runs({ axis, onPutBack }) {
     "Gains",
   ];
   return html`<${Panel} title="Runs" note=${`Lengths in ${unit}. Settled is within ${number(all[0].band, decimals)} ${unit}, counted from the end of the profile.`}>
-    <${ChartView} name=${`tuning ${axis.name}`} curves=${curves} csv=${() => csvOf(shown)} height=${440} />
+    <${ChartView} name=${`tuning ${axis.name}`} curves=${curves} height=${440} />
     <${Table} label="Runs and their gains" kind="runs" head=${head} rows=${rows} />
   <//>`;
 }
@@ -163,15 +163,4 @@ function curvesOf(axis, run, nth) {
       ys: flipped(error, 0),
     }),
   ];
-}
-
-function csvOf(shown) {
-  const rows = ["run,time_s,position,following_error"];
-  for (const run of shown) {
-    const [position, error] = ["position", "following_error"].map((name) => run.capture.channel(name).values);
-    run.capture.seconds.forEach((at, row) =>
-      rows.push(`${run.number},${(at - run.result.beganAtS).toFixed(6)},${position[row]},${error[row]}`),
-    );
-  }
-  return `${rows.join("\n")}\n`;
 }

@@ -2,6 +2,7 @@
 
 import { html, useLayoutEffect, useRef, useState } from "../html.js";
 import { Chart } from "./chart.js";
+import { curvesAsCsv } from "./curve.js";
 import { Table } from "./controls.js";
 import { number } from "./format.js";
 
@@ -12,9 +13,9 @@ const COUNTED_MS = 1_000;
 
 /** Show `curves`; with `live` the span follows `live.now()` until the operator zooms.
 
- * `live` is `{now, windowS, paused, onPause}`. `name` is what exported files are called, `csv` returns their text.
+ * `live` is `{now, windowS, paused, onPause}`. `name` is what exported files are called.
  */
-export function ChartView({ curves, live = null, name, csv, height, note }) {
+export function ChartView({ curves, live = null, name, height, note }) {
   const root = useRef();
   const chart = useRef();
   const [cursors, setCursors] = useState({ a: null, b: null });
@@ -90,7 +91,7 @@ export function ChartView({ curves, live = null, name, csv, height, note }) {
       <button type="button" onClick=${() => scale(ZOOM)}>Zoom in</button>
       <button type="button" onClick=${() => scale(1 / ZOOM)}>Zoom out</button>
       <button type="button" onClick=${() => setZoom(live && !live.paused ? null : chart.current.extent())}>Show all</button>
-      <button type="button" onClick=${() => save(new Blob([csv()], { type: "text/csv" }), `${name}.csv`)}>Save CSV</button>
+      <button type="button" onClick=${() => save(new Blob([curvesAsCsv(curves)], { type: "text/csv" }), `${name}.csv`)}>Save CSV</button>
       <button type="button" onClick=${async () => save(await chart.current.png(), `${name}.png`)}>Save PNG</button>
       ${live && !looksBack && redraws !== null && html`<span class="quiet number" data-redraws=${redraws}>${redraws} redraws a second</span>`}
       ${note}

@@ -70,6 +70,13 @@ export function Field({ label, unit, hint, value, onChange, type = "number", ...
   </div>`;
 }
 
+/** Enter in a field does what the main button of its panel does. */
+export function enterSends(event) {
+  if (event.key !== "Enter" || event.target.tagName !== "INPUT") return;
+  event.preventDefault();
+  event.currentTarget.closest(".panel").querySelector("button.main").click();
+}
+
 /** A labelled choice; `options` are pairs of value and text. */
 export function Choice({ label, options, value, onChange, hint }) {
   const id = useId();

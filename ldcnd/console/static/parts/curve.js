@@ -2,6 +2,15 @@
 
 const GAP_S = 1;
 
+/** Return curves as CSV, a row for each point: they need not have been measured at the same instants. */
+export function curvesAsCsv(curves) {
+  const rows = ["time_s,channel,value,unit"];
+  for (const { xs, ys, length, label, unit } of curves) {
+    for (let at = 0; at < length; at += 1) rows.push(`${xs[at].toFixed(6)},"${label.replaceAll('"', '""')}",${ys[at]},${unit}`);
+  }
+  return `${rows.join("\n")}\n`;
+}
+
 /** A quantity against time. */
 export class Curve {
   /** Seconds and values; `length` of them count. */

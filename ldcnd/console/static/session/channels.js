@@ -71,17 +71,6 @@ export class Recording {
     return (feed.nowNs() - this.zeroNs) / 1e9;
   }
 
-  /** Every sample in a row of its own: channels are not sampled at the same instants. */
-  csv() {
-    const rows = ["time_s,channel,value,unit"];
-    for (const curve of this.curves) {
-      for (let index = 0; index < curve.length; index += 1) {
-        rows.push(`${curve.xs[index].toFixed(6)},${curve.label},${curve.ys[index]},${curve.unit}`);
-      }
-    }
-    return `${rows.join("\n")}\n`;
-  }
-
   close() {
     this.#leave();
     feed.stream([]);

@@ -74,6 +74,16 @@ export function command(axis, verb, body = {}, patienceMs = undefined) {
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, { ...given(body), ...envelope }, patienceMs);
 }
 
+/** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
+export function moveTogether(axes, targets, velocity) {
+  for (const axis of axes) noteMoved(axis);
+  const moves = axes.map((axis) => ({
+    ...given({ axis: axis.name, position: targets[axis.name], velocity }),
+    command_id: crypto.randomUUID(),
+  }));
+  return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves });
+}
+
 /** Ask about an axis: `why` and `plan`, which have no effect. */
 export function question(axis, verb, body = {}) {
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, given(body));

@@ -40,6 +40,7 @@ const CHECKS = {
   track: [...toMove, referenced],
   home: toMove,
   set_position: [heard, controlled, reachable, standing],
+  set_outputs: [heard, controlled, reachable],
   set_gains: [heard, controlled, reachable],
   parameters: [heard, reachable],
   write_parameter: [heard, controlled, reachable],

@@ -11,6 +11,9 @@ const DRAWN_EACH_MS = 100;
 const SILENT_AFTER_S = 3;
 const OLD_AFTER_S = 1.5;
 const OLD_AFTER_PERIODS = 4;
+/** A drive reports its velocity in whole counts a servo tick: below this share of the limit, positions say it better. */
+const SLOW_SHARE = 0.1;
+const SLOPE_S = 1;
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
 
@@ -20,6 +23,7 @@ export class Axis {
   monitors = {};
   trace = null;
   holder = null;
+  #positions = [];
   #arrived = new Map();
 
   constructor(rig, name) {
@@ -44,6 +48,15 @@ export class Axis {
     return this.info?.capabilities.includes(capability) ?? false;
   }
 
+  /** Velocity in units a second: of the drive, or while it is slow the slope of the positions of the last second. */
+  get velocity() {
+    const told = this.samples.velocity?.value ?? null;
+    const [first, last] = [this.#positions[0], this.#positions.at(-1)];
+    const limit = this.info?.limits.velocity ?? 0;
+    if (told === null || Math.abs(told) > SLOW_SHARE * limit || !first || last.t === first.t) return told;
+    return ((last.value - first.value) * 1e9) / (last.t - first.t);
+  }
+
   /** The health report of its line says how often it is published, and how often that was wanted. */
   get health() {
     return this.bus?.health?.axes.find((each) => each.axis === this.name) ?? null;
@@ -54,6 +67,7 @@ export class Axis {
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
     else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
+    if (item === "position") this.#remember(sample);
     if (sample) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
   }
 
@@ -73,6 +87,11 @@ export class Axis {
     const rate = this.health?.rate_wanted_hz || 1;
     if (this.ageS(item) > OLD_AFTER_S + OLD_AFTER_PERIODS / rate) return { word: "old", level: "bad" };
     return { word: sample.quality, level: { good: "", uncertain: "warn" }[sample.quality] ?? "bad" };
+  }
+
+  #remember(sample) {
+    const good = sample && sample.quality !== "bad";
+    this.#positions = good ? [...this.#positions, sample].filter(({ t }) => sample.t - t <= SLOPE_S * 1e9) : [];
   }
 
   #keep(where, name, sample) {
