@@ -34,8 +34,6 @@ EXPLAINED = {
     ("rehearse", "console"): "a loss is rehearsed at the machine, with `ldcnd drill`",
     ("move_relative", "documentation"): "`ldcnd axis move --relative`, in the reference of the command line",
     ("read_monitors", "console"): "the page of the axis shows the monitors as they are published",
-    ("move_together", "console"): "answered by the console's server; no page sends it yet: `ldcnd group move`",
-    ("set_outputs", "console"): "not there yet: `ldcnd axis outputs`",
     ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
     ("renew", "command line"): "a command that holds control renews it by itself",
