@@ -4,10 +4,11 @@ Families: `BusError` (the line), `DriveFault` (the drive), `RequestRefused` (the
 configuration). A message says what happened, to whom, with which value and which limit, and what to do.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from ldcnd.fault_pages import page_of
 from ldcnd.printable import printable
@@ -67,6 +68,59 @@ class ErrorCode(StrEnum):
     INTERNAL = "internal"
 
 
+Argument = bool | float | str
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A command that a remedy names; every face says it in its own way: to be typed, or to be pressed.
+
+    Attributes:
+        verb: the command.
+        said: how the text of the remedy names it.
+        arguments: what it is to carry.
+    """
+
+    verb: str
+    said: str
+    arguments: Mapping[str, Argument] = field(default_factory=dict)
+
+
+def step(verb: str, said: str | None = None, **arguments: Argument) -> Step:
+    """Return a step; without words of its own a remedy says "send" and the verb."""
+    return Step(verb, said or f"send {verb}", arguments)
+
+
+class Remedy(str):
+    """What to do about an error: a text that names commands.
+
+    Args:
+        text: with `{}` for each step.
+        steps: the commands, in their order.
+    """
+
+    __slots__ = ("steps",)
+    steps: tuple[Step, ...]
+
+    def __new__(cls, text: str, *steps: Step) -> Self:
+        """Return the text with what the steps are called."""
+        return cls.of(text.format(*(each.said for each in steps)), steps)
+
+    @classmethod
+    def of(cls, text: str, steps: tuple[Step, ...]) -> Self:
+        """Return a text that names the steps already."""
+        made = super().__new__(cls, text)
+        made.steps = steps
+        return made
+
+    def told(self, words: Callable[[Step], str]) -> str:
+        """Return the text with other words for its steps."""
+        text = str(self)
+        for each in self.steps:
+            text = text.replace(each.said, words(each), 1)
+        return text
+
+
 class LdcndError(Exception):
     """Root of all errors that ldcnd raises on purpose.
 
@@ -103,7 +157,8 @@ class LdcndError(Exception):
         self.value = printable(value) if isinstance(value, str) else value
         self.limit = printable(limit) if isinstance(limit, str) else limit
         self.nearest = nearest
-        self.remedy = remedy if remedy is None else printable(remedy, keep="\n")
+        steps = remedy.steps if isinstance(remedy, Remedy) else ()
+        self.remedy = remedy if remedy is None else Remedy.of(printable(remedy, keep="\n"), steps)
 
     @property
     def page(self) -> str | None:

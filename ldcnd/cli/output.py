@@ -1,42 +1,38 @@
 """What commands print, and how they end: nothing from the network steers a terminal, no error shows a traceback."""
 
 import os
-import re
 import sys
 
 import click
 
-from ldcnd.errors import ConfigError, LdcndError, SessionError
+from ldcnd.errors import ConfigError, LdcndError, SessionError, Step
 from ldcnd.printable import printable
 
-_TERMS = (
-    (r'send power \{"on": true\}', "ldcnd axis power {axis} on"),
-    (r"send home or set_position", "ldcnd axis home {axis}, or ldcnd axis set-position {axis} POSITION"),
-    (r'send set_outputs with "input"', "ldcnd axis outputs {axis} --limit1 input --limit2 input"),
-    (r"send at least kp and el", "ldcnd axis gains {axis} --kp KP --el EL, and more as needed"),
-    (r"send set_gains", "ldcnd axis gains {axis} --kp KP --el EL"),
-    (r"send reset", "ldcnd axis reset {axis}"),
-    (r"send halt", "ldcnd axis halt {axis}"),
-    (r"send trace_abort", "ldcnd trace abort {axis}"),
-    (r"send clear_counter", "ldcnd axis clear-counter {axis}"),
-    (r"send restart_eeprom_count", "ldcnd params restart-count {axis}"),
-    (r"send list_parameters", "ldcnd params list {axis}"),
-    (r"or acquire it with force", "or take it with ldcnd lease hold --axis {axis} --force -- COMMAND"),
-    (r"acquire (?:a new one|one first|it again|that axis, too)", "ldcnd lease hold --axis {axis} -- COMMAND"),
-    (r"look at the events", "ldcnd events"),
-)
+TYPED = {
+    "power": "axis power {axis} on",
+    "set_position": "axis set-position {axis} POSITION",
+    "set_gains": "axis gains {axis} --kp KP --el EL",
+    "set_outputs": "axis outputs {axis} --limit1 input --limit2 input",
+    "trace_abort": "trace abort {axis}",
+    "clear_counter": "axis clear-counter {axis} COUNTER",
+    "restart_eeprom_count": "params restart-count {axis}",
+    "list_parameters": "params list {axis}",
+    "acquire": "lease hold --axis {axis} -- COMMAND",
+    "events": "events",
+}
+"""How a command that a remedy names is typed; what is missing is `axis VERB AXIS`."""
 
 
-def in_typed_terms(remedy: str, axis: str | None) -> str:
-    """Return a remedy in the words of the command line.
+def typed(step: Step, axis: str | None) -> str:
+    """Return a step of a remedy as it is typed.
 
     Args:
-        remedy: as the daemon says it.
+        step: the command.
         axis: what it is about; None when it is not about one axis.
     """
-    for term, words in _TERMS:
-        remedy = re.sub(term, words.replace("{axis}", axis or "AXIS"), remedy)
-    return remedy
+    words = TYPED.get(step.verb, f"axis {step.verb.replace('_', '-')} {{axis}}").format(axis=axis or "AXIS")
+    force = words.replace(" -- ", " --force -- ") if step.arguments.get("force") else words
+    return f"ldcnd {force}"
 
 
 DONE = 0
@@ -80,7 +76,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def _remedy(error: LdcndError) -> list[str]:
-    return [f"  {in_typed_terms(error.remedy, error.axis)}"] if error.remedy else []
+    return [f"  {error.remedy.told(lambda step: typed(step, error.axis))}"] if error.remedy else []
 
 
 def _single(group: BaseExceptionGroup[BaseException]) -> BaseException:

@@ -5,9 +5,10 @@ import sys
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.output import in_typed_terms
+from ldcnd.cli.output import typed
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
+from ldcnd.messaging.codec import remedy_of
 from ldcnd.model.commands import WhyReply
 
 
@@ -24,7 +25,9 @@ def command(target: Target, axis: str) -> None:
     reply = target.run(work)
     lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]
     for cause in reply.causes:
-        lines.append(f"  {cause.text}{f': {in_typed_terms(cause.remedy, axis)}' if cause.remedy else ''}")
+        known = remedy_of(cause)
+        remedy = known and known.told(lambda step: typed(step, axis))
+        lines.append(f"  {cause.text}{f': {remedy}' if remedy else ''}")
         if cause.page:
             lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
     if reply.first_fault:

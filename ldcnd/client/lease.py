@@ -7,7 +7,7 @@ from itertools import count
 from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError
+from ldcnd.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, Remedy, SessionError, step
 from ldcnd.model.commands import AxisCommand, CommandReply
 from ldcnd.model.rig_commands import Acquire, LeaseReply, Release, Renew
 
@@ -50,7 +50,11 @@ class Control:
             LeaseExpired: the lease was lost.
         """
         if self.lost:
-            raise LeaseExpired(f"control was lost: {self.lost.message}", axis=axis, remedy="acquire it again")
+            raise LeaseExpired(
+                f"control was lost: {self.lost.message}",
+                axis=axis,
+                remedy=Remedy("{}", step("acquire", "acquire it again")),
+            )
         return request.model_copy(update={"lease": self.lease.lease, "sequence": next(self._sequence)})
 
     async def keep(self) -> None:

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, WrongState
+from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, WrongState, step
 from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 LOOK_S = 0.1
@@ -95,7 +95,9 @@ async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: 
                 await asyncio.sleep(LOOK_S)
     except TimeoutError:
         raise OutcomeUnknown(
-            f"axis {axis}: trace {trace_id} did not end within {within_s:g} s", axis=axis, remedy="send trace_abort"
+            f"axis {axis}: trace {trace_id} did not end within {within_s:g} s",
+            axis=axis,
+            remedy=Remedy("{}", step("trace_abort")),
         ) from None
 
 
@@ -113,7 +115,7 @@ async def fetch_trace(client: RigClient, axis: str, trace_id: str | None = None)
             f"axis {axis}: trace {header.trace_id} is {header.phase.value}: it is not complete yet",
             axis=axis,
             value=header.phase.value,
-            remedy="wait for its end, or send trace_abort",
+            remedy=Remedy("wait for its end, or {}", step("trace_abort")),
         )
     if header.phase is not TracePhase.COMPLETE:
         raise DriveFault(

@@ -17,8 +17,8 @@ import msgpack
 import pydantic
 import pydantic_core
 
-from ldcnd.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge
-from ldcnd.model.commands import ErrorReply, ReceivedError
+from ldcnd.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, Step
+from ldcnd.model.commands import Cause, ErrorReply, ReceivedError, RemedyStep
 from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.printable import is_printable, printable
 
@@ -147,8 +147,21 @@ def error_reply(error: LdcndError) -> ErrorReply:
         limit=_finite(error.limit),
         nearest=error.nearest if error.nearest is None or math.isfinite(error.nearest) else None,
         remedy=error.remedy,
+        steps=remedy_steps(error),
         page=error.page,
     )
+
+
+def remedy_steps(error: LdcndError) -> tuple[RemedyStep, ...]:
+    """Return the commands that the remedy of an error names."""
+    steps = error.remedy.steps if error.remedy is not None else ()
+    return tuple(RemedyStep(verb=each.verb, said=each.said, arguments=dict(each.arguments)) for each in steps)
+
+
+def remedy_of(told: ReceivedError | Cause) -> Remedy | None:
+    """Return the remedy that a reply tells of."""
+    steps = tuple(Step(each.verb, each.said, each.arguments) for each in told.steps)
+    return None if told.remedy is None else Remedy.of(told.remedy, steps)
 
 
 def rebuild_error(reply: ReceivedError) -> LdcndError:
@@ -160,7 +173,7 @@ def rebuild_error(reply: ReceivedError) -> LdcndError:
         value=reply.value,
         limit=reply.limit,
         nearest=reply.nearest,
-        remedy=reply.remedy,
+        remedy=remedy_of(reply),
     )
 
 

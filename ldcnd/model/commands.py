@@ -235,6 +235,17 @@ class StopReply(Frozen):
     """The axes whose drives acknowledged the stop."""
 
 
+class RemedyStep(Frozen):
+    """A command that a remedy names, so that it can be said as what is typed or pressed."""
+
+    verb: str
+    """The command."""
+    said: str
+    """The words of the remedy that name it."""
+    arguments: dict[str, bool | float | str] = Field(default_factory=dict)
+    """What it is to carry."""
+
+
 class ReceivedError(Frozen):
     """Why a query was not carried out, as a client reads it: the daemon may be newer and know more codes."""
 
@@ -246,6 +257,7 @@ class ReceivedError(Frozen):
     limit: float | str | None = Field(default=None, description="the limit that the value broke")
     nearest: float | None = Field(default=None, description="the closest value that would be accepted")
     remedy: str | None = Field(default=None, description="what to do about it")
+    steps: tuple[RemedyStep, ...] = Field(default=(), description="the commands that the remedy names, in their order")
     page: str | None = Field(default=None, description="where its page is, below a console or the documentation")
 
 
@@ -521,6 +533,8 @@ class Cause(Frozen):
     """What is in the way."""
     remedy: str | None
     """The command, or the hand, that clears it."""
+    steps: tuple[RemedyStep, ...] = ()
+    """The commands that the remedy names, in their order."""
     page: str | None = None
     """Where its page is, below a console or the documentation."""
 

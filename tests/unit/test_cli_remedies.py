@@ -1,30 +1,57 @@
-"""Remedies that name commands of the daemon's interface are said as what can be typed, or pressed."""
+"""Commands that remedies name are said as what can be typed, or pressed."""
 
 import re
 from pathlib import Path
 
+import pytest
+
 import ldcnd
-from ldcnd.cli.output import in_typed_terms
+from ldcnd.cli.output import typed
+from ldcnd.errors import LeaseHeld, Remedy, step
+from ldcnd.messaging.codec import error_reply, rebuild_error
 from ldcnd.model.commands import Verb
+from tests.support.pages import require_command_line
 
 SOURCES = Path(ldcnd.__file__).parent
-PAGE_TERMS = SOURCES / "console" / "static" / "parts" / "remedies.js"
+PRESSED = SOURCES / "console" / "static" / "parts" / "remedies.js"
+PLACEHOLDERS = {"AXIS": "x", "POSITION": "1", "KP": "1", "EL": "1", "COUNTER": "input", "COMMAND": "true"}
 
 
-def remedies():
-    """Return all that the daemon and the drivers advise."""
-    found = set()
-    for folder in ("daemon", "drivers", "client"):
-        for path in (SOURCES / folder).rglob("*.py"):
-            found |= set(re.findall(r"""remedy=f?(["'])(.*?)\1""", path.read_text(encoding="utf-8")))
-    return {text for _, text in found}
+def texts():
+    files = (path for part in ("daemon", "drivers", "client") for path in (SOURCES / part).rglob("*.py"))
+    return [path.read_text(encoding="utf-8") for path in files]
 
 
-def test_no_remedy_tells_people_to_send_a_verb():
-    said = {text: in_typed_terms(text, "x") for text in remedies()}
+def named():
+    """Return the verbs that remedies name."""
+    return {verb for text in texts() for verb in re.findall(r'\bstep\(\s*"(\w+)"', text)}
 
-    verbs = "|".join(Verb)
-    left = {text for text in said.values() if re.search(rf"send ({verbs})\b", text)}
-    assert not left
-    assert in_typed_terms('send power {"on": true}', "x") == "ldcnd axis power x on"
-    assert any("ldcnd axis reset x" in text for text in said.values())
+
+@pytest.mark.parametrize("verb", sorted(named()))
+def test_what_a_remedy_names_can_be_typed(verb):
+    words = typed(step(verb), None).split()[1:]
+
+    require_command_line([PLACEHOLDERS.get(word, word) for word in words])
+
+
+def test_what_a_remedy_names_can_be_pressed():
+    pressed = set(re.findall(r"^  (\w+): ", PRESSED.read_text(encoding="utf-8"), re.MULTILINE))
+
+    assert named() <= pressed
+
+
+def test_no_remedy_hides_a_command_in_its_text():
+    hidden = re.compile(rf"""remedy=f?["'][^"']*send ({"|".join(Verb)})\b""")
+
+    assert [text for text in texts() if hidden.search(text)] == []
+
+
+def test_steps_travel_with_an_error_and_are_said_by_each_face():
+    remedy = Remedy("wait until it is released, or {}", step("acquire", "acquire it with force", force=True))
+    received = rebuild_error(error_reply(LeaseHeld("axis x is controlled by ada", axis="x", remedy=remedy)))
+
+    assert received.remedy == "wait until it is released, or acquire it with force"
+    assert received.remedy.told(lambda each: typed(each, "x")) == (
+        "wait until it is released, or ldcnd lease hold --axis x --force -- COMMAND"
+    )
+    assert typed(step("power", on=True), "x") == "ldcnd axis power x on"

@@ -17,10 +17,12 @@ from ldcnd.errors import (
     DriveFault,
     NotSupported,
     OutcomeUnknown,
+    Remedy,
     RequestRefused,
     StopLatched,
     ValueOutOfRange,
     WrongState,
+    step,
 )
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import (
@@ -212,7 +214,7 @@ class AxisCommands:
                 raise WrongState(
                     f"axis {view.name} has no gains: its loop cannot close",
                     axis=view.name,
-                    remedy="configure gains or send set_gains",
+                    remedy=Remedy("configure gains or {}", step("set_gains")),
                 )
         else:
             guards.check_reachable(view)
@@ -246,7 +248,7 @@ class AxisCommands:
                 f"axis {view.name} still moves, or may: a reset would switch its motor off at speed",
                 axis=view.name,
                 value=tracker.moving.value,
-                remedy="send halt, wait until it stands, then send reset",
+                remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
             )
         if tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults):
             await self._driver.reset()
@@ -364,7 +366,9 @@ class AxisCommands:
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name)) is not None}
         if self._gains is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
-                f"axis {self._config.name} has no gains yet", axis=self._config.name, remedy="send at least kp and el"
+                f"axis {self._config.name} has no gains yet",
+                axis=self._config.name,
+                remedy=Remedy("{}", step("set_gains", "send at least kp and el")),
             )
         gains = self._gains or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
         changed = Gains(**{name: asked.get(name, getattr(gains, name)) for name in Gains.__slots__})

@@ -7,9 +7,11 @@ from ldcnd.errors import (
     AxisUnreachable,
     NotReferenced,
     PositionLimit,
+    Remedy,
     StopLatched,
     VelocityLimit,
     WrongState,
+    step,
 )
 from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import AxisState, LinkState
@@ -47,7 +49,7 @@ def check_not_latched(axis: AxisView) -> None:
     """Refuse while a stop is latched, or not confirmed by the drive."""
     check_stop_confirmed(axis)
     if axis.stop_latched:
-        raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy="send reset")
+        raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
 
 
 def check_stop_confirmed(axis: AxisView) -> None:
@@ -70,7 +72,10 @@ def check_enabled(axis: AxisView) -> None:
     """Refuse a motion while the position loop is open."""
     if axis.state is AxisState.DISABLED:
         raise WrongState(
-            f"axis {axis.name} is disabled", axis=axis.name, value=axis.state, remedy='send power {"on": true}'
+            f"axis {axis.name} is disabled",
+            axis=axis.name,
+            value=axis.state,
+            remedy=Remedy("{}", step("power", 'send power {"on": true}', on=True)),
         )
 
 
@@ -97,7 +102,10 @@ def check_stands(axis: AxisView) -> None:
     """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
     if axis.state in MOTION_STATES:
         raise WrongState(
-            f"axis {axis.name} is in {axis.state}", axis=axis.name, value=axis.state, remedy="send halt and wait"
+            f"axis {axis.name} is in {axis.state}",
+            axis=axis.name,
+            value=axis.state,
+            remedy=Remedy("{} and wait", step("halt")),
         )
 
 
@@ -107,7 +115,7 @@ def check_referenced(axis: AxisView) -> None:
         raise NotReferenced(
             f"axis {axis.name} is not referenced: its position means nothing",
             axis=axis.name,
-            remedy="send home or set_position",
+            remedy=Remedy("{} or {}", step("home"), step("set_position", "set_position")),
         )
 
 
@@ -117,7 +125,7 @@ def check_position_kept(axis: AxisView) -> None:
         raise WrongState(
             f"axis {axis.name}: its position is lost: {'; '.join(axis.faults)}",
             axis=axis.name,
-            remedy="send reset first",
+            remedy=Remedy("{} first", step("reset")),
         )
 
 
@@ -170,5 +178,5 @@ def _faulted(axis: AxisView) -> WrongState:
         f"axis {axis.name} is in error_stop: {causes}",
         axis=axis.name,
         value=axis.state,
-        remedy="remove the cause, then send reset",
+        remedy=Remedy("remove the cause, then {}", step("reset")),
     )

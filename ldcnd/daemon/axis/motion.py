@@ -19,7 +19,16 @@ from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
 from ldcnd.drivers.driver import AxisReading, Motion
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import BusError, MalformedRequest, OutcomeUnknown, RequestRefused, ValueOutOfRange, WrongState
+from ldcnd.errors import (
+    BusError,
+    MalformedRequest,
+    OutcomeUnknown,
+    Remedy,
+    RequestRefused,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
 from ldcnd.messaging.codec import error_reply
 from ldcnd.model.commands import CommandReply, Preview, PreviewReply, Verb
 from ldcnd.model.samples import AxisState
@@ -105,7 +114,10 @@ class MotionPlanner:
         """
         if velocity == 0:
             raise ValueOutOfRange(
-                f"axis {view.name}: a velocity of 0 is not a motion", axis=view.name, value=0.0, remedy="send halt"
+                f"axis {view.name}: a velocity of 0 is not a motion",
+                axis=view.name,
+                value=0.0,
+                remedy=Remedy("{}", step("halt")),
             )
         _, rate = self._checked(view, velocity, acceleration)
         motion = self._driver.quantise(

@@ -24,7 +24,7 @@ from ldcnd.drivers.driver import (
     StopMode,
 )
 from ldcnd.drivers.network import Network
-from ldcnd.errors import RequestRefused, ShuttingDown, StopLatched
+from ldcnd.errors import Remedy, RequestRefused, ShuttingDown, StopLatched, step
 from ldcnd.exchange import Condition, Exchange, only_while
 from ldcnd.model.commands import HomeMethod, PinMode
 
@@ -214,7 +214,9 @@ class Gate:
     def overtaken(self, what: str) -> StopLatched:
         """Return the refusal of what a stop has overtaken."""
         name = self.tracker.name
-        return StopLatched(f"axis {name}: {what} was overtaken by a stop", axis=name, remedy="send reset")
+        return StopLatched(
+            f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
+        )
 
 
 async def start_together(

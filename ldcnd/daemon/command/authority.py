@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, StaleSequence, UnknownAxis
+from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, Remedy, StaleSequence, UnknownAxis, step
 
 REMEMBERED = 256
 """So many ended leases are remembered, to tell a stale command from a made-up one."""
@@ -88,7 +88,7 @@ class Authority:
                 f"axis {axis} is controlled by {foreign[0].client}",
                 axis=axis,
                 value=foreign[0].client,
-                remedy="wait until it is released, or acquire it with force",
+                remedy=Remedy("wait until it is released, or {}", step("acquire", "acquire it with force", force=True)),
             )
         for lease in displaced:
             self._end(lease)
@@ -139,7 +139,9 @@ class Authority:
         lease = self._living(token, now_s)
         if axis not in lease.axes:
             raise LeaseHeld(
-                f"the lease of {lease.client} does not cover axis {axis}", axis=axis, remedy="acquire that axis, too"
+                f"the lease of {lease.client} does not cover axis {axis}",
+                axis=axis,
+                remedy=Remedy("{}", step("acquire", "acquire that axis, too")),
             )
         if sequence is not None:
             if sequence <= lease.sequence:
@@ -173,7 +175,7 @@ class Authority:
                 f"axis {axis}: the lease of this command has ended before its motion began",
                 axis=axis,
                 value=token,
-                remedy="acquire a new one",
+                remedy=Remedy("{}", step("acquire", "acquire a new one")),
             )
 
     def _admit_without(self, axis: str, now_s: float) -> None:
@@ -183,10 +185,14 @@ class Authority:
                 f"axis {axis} is controlled by {holder.client}",
                 axis=axis,
                 value=holder.client,
-                remedy="wait until it is released, or acquire it with force",
+                remedy=Remedy("wait until it is released, or {}", step("acquire", "acquire it with force", force=True)),
             )
         if self.required:
-            raise LeaseRequired(f"axis {axis} moves only under a lease", axis=axis, remedy="acquire one first")
+            raise LeaseRequired(
+                f"axis {axis} moves only under a lease",
+                axis=axis,
+                remedy=Remedy("{}", step("acquire", "acquire one first")),
+            )
 
     def _living(self, token: str, now_s: float) -> Lease:
         lease = self._leases.get(token)
@@ -194,9 +200,13 @@ class Authority:
             return lease
         if lease or token in self._ended:
             raise LeaseExpired(
-                "the lease has ended: what was sent under it is stale", value=token, remedy="acquire a new one"
+                "the lease has ended: what was sent under it is stale",
+                value=token,
+                remedy=Remedy("{}", step("acquire", "acquire a new one")),
             )
-        raise LeaseUnknown("there was never such a lease", value=token, remedy="acquire one first")
+        raise LeaseUnknown(
+            "there was never such a lease", value=token, remedy=Remedy("{}", step("acquire", "acquire one first"))
+        )
 
     def _end(self, lease: Lease) -> None:
         del self._leases[lease.token]

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ldcnd.daemon.axis.state import ActiveCommand
-from ldcnd.errors import CommandIdReused, LdcndError, TooManyRequests, UnknownCommand
+from ldcnd.errors import CommandIdReused, LdcndError, Remedy, TooManyRequests, UnknownCommand, step
 from ldcnd.model.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Effect, Verb
 from ldcnd.model.events import FINAL, CommandStatus
 
@@ -83,7 +83,7 @@ class Ledger:
                 f"command id {command_id!r} was taken before and its answer is forgotten; it is not carried out again",
                 axis=axis,
                 value=command_id,
-                remedy="look at the events; give every command an id of its own",
+                remedy=Remedy("{}; give every command an id of its own", step("events", "look at the events")),
             )
         if entry and (entry.axis, entry.verb, _content(entry.command)) != (axis, command.verb, _content(command)):
             raise CommandIdReused(
@@ -102,7 +102,11 @@ class Ledger:
         """
         entry = self._entries.get(command_id)
         if entry is None:
-            raise UnknownCommand(f"no command {command_id!r} is known", value=command_id, remedy="look at the events")
+            raise UnknownCommand(
+                f"no command {command_id!r} is known",
+                value=command_id,
+                remedy=Remedy("{}", step("events", "look at the events")),
+            )
         return entry
 
     def open(self, entry: Entry) -> None:

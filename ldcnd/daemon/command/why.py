@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.state import AxisTracker
-from ldcnd.errors import DriveFault, LdcndError
+from ldcnd.errors import DriveFault, LdcndError, Remedy, step
+from ldcnd.messaging.codec import remedy_steps
 from ldcnd.model.commands import Cause, WhyReply
 from ldcnd.model.samples import FaultEntry
 
@@ -34,7 +35,15 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         try:
             check()
         except LdcndError as error:
-            causes.append(Cause(code=error.code.value, text=error.message, remedy=error.remedy, page=error.page))
+            causes.append(
+                Cause(
+                    code=error.code.value,
+                    text=error.message,
+                    remedy=error.remedy,
+                    steps=remedy_steps(error),
+                    page=error.page,
+                )
+            )
     first = tracker.first_fault
     return WhyReply(
         axis=view.name,
@@ -47,7 +56,10 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
 def _fault(axis: str, fault: FaultEntry) -> Callable[[], None]:
     def check() -> None:
         raise DriveFault(
-            f"axis {axis}: {fault.text}", axis=axis, value=fault.code, remedy="remove the cause, then send reset"
+            f"axis {axis}: {fault.text}",
+            axis=axis,
+            value=fault.code,
+            remedy=Remedy("remove the cause, then {}", step("reset")),
         )
 
     return check

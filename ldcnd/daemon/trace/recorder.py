@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.tracer import ArmedTrace, Recorded, Tracer, TraceTimedOut
-from ldcnd.errors import BusyTracing, InternalError, LdcndError, NotSupported, OutcomeUnknown, WrongState
+from ldcnd.errors import BusyTracing, InternalError, LdcndError, NotSupported, OutcomeUnknown, Remedy, WrongState, step
 from ldcnd.log import get_logger
 from ldcnd.model.commands import AxisCommand, CommandReply, Verb
 from ldcnd.model.samples import Quality
@@ -101,7 +101,7 @@ class TraceRecorder:
                 f"axis {self._axis}: trace {self._current.header.trace_id} is {self._current.header.phase.value}",
                 axis=self._axis,
                 value=self._current.header.trace_id,
-                remedy="wait for its end, or send trace_abort",
+                remedy=Remedy("wait for its end, or {}", step("trace_abort")),
             )
         armed = await self._tracer.arm(request)
         granted = armed.granted
@@ -153,7 +153,7 @@ class TraceRecorder:
                 raise OutcomeUnknown(
                     f"axis {self._axis}: the drive did not leave its trace within {ABORT_S:g} s",
                     axis=self._axis,
-                    remedy="send trace_abort again",
+                    remedy=Remedy("{} again", step("trace_abort")),
                 ) from None
         return TraceAbortReply(
             command_id=command_id,

@@ -37,7 +37,7 @@ from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
 from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, SERVO_CYCLE_S, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
-from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, WrongState
+from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, Remedy, WrongState, step
 from ldcnd.exchange import Exchange
 from ldcnd.model.catalogue import verbs_for
 from ldcnd.model.commands import Capability, HomeMethod, PinMode, Verb
@@ -246,7 +246,7 @@ class LdcnAxis(AxisDriver):
             raise DriveFault(
                 f"axis {self.spec.name}: the drive did not close its loop: {causes}",
                 axis=self.spec.name,
-                remedy="remove the cause, then send reset",
+                remedy=Remedy("remove the cause, then {}", step("reset")),
             )
 
     async def _check_without_power_driver(self) -> None:
@@ -270,7 +270,7 @@ class LdcnAxis(AxisDriver):
                 f"axis {self.spec.name}: {refusal} {'; '.join(fault.text for fault in standing)}",
                 axis=self.spec.name,
                 value=standing[0].code,
-                remedy=f"remove the cause, then send reset{again}",
+                remedy=Remedy(f"remove the cause, then {{}}{again}", step("reset")),
             )
 
     async def _stop_motor(self, control: StopControl, lane: Lane = Lane.COMMAND) -> None:
@@ -438,7 +438,9 @@ class LdcnAxis(AxisDriver):
                 f"axis {self.spec.name}: the {method} pin is an output",
                 axis=self.spec.name,
                 value=method.value,
-                remedy='send set_outputs with "input"',
+                remedy=Remedy(
+                    "{}", step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
+                ),
             )
 
     async def start(self) -> None:

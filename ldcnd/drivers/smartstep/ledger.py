@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from ldcnd.errors import ConfigError, EepromBudgetSpent
+from ldcnd.errors import ConfigError, EepromBudgetSpent, Remedy, step
 
 EEPROM_LIFE = 10_000
 WARNING_WRITES = 1000
@@ -58,8 +58,11 @@ class EepromLedger:
                 axis=axis,
                 value=total,
                 limit=budget,
-                remedy=f"write RAM, raise eeprom_budget (the memory endures {EEPROM_LIFE} writes), or, if the drive was"
-                " replaced, send restart_eeprom_count",
+                remedy=Remedy(
+                    f"write RAM, raise eeprom_budget (the memory endures {EEPROM_LIFE} writes), or, if the drive was"
+                    " replaced, {}",
+                    step("restart_eeprom_count"),
+                ),
             )
         await self._set(axis, parameter, self.writes(axis, parameter) + 1)
 

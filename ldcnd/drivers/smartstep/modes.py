@@ -21,7 +21,7 @@ from ldcnd.drivers.smartstep.monitors import (
     CounterValue,
 )
 from ldcnd.drivers.smartstep.words import Words
-from ldcnd.errors import BadReply, BusyTracing, LdcndError, OutcomeUnknown, ReplyTimeout, WrongState
+from ldcnd.errors import BadReply, BusyTracing, LdcndError, OutcomeUnknown, Remedy, ReplyTimeout, WrongState, step
 from ldcnd.log import get_logger
 
 log = get_logger("smartstep")
@@ -48,7 +48,7 @@ async def require_idle(words: Words) -> None:
         raise BusyTracing(
             f"axis {words.axis}: busy tracing",
             axis=words.axis,
-            remedy="wait for the end of the trace, or send trace_abort",
+            remedy=Remedy("wait for the end of the trace, or {}", step("trace_abort")),
         )
     if mode in CLEAR_MODES:
         # Leaving clears nothing (manual 5 (2), 6 (2)), and the axis carries out one command at a time: it is not ours.
@@ -228,6 +228,6 @@ async def _wait_until_done(words: Words) -> None:
             raise OutcomeUnknown(
                 f"axis {words.axis}: the counter was not cleared within {CLEAR_S:g} s",
                 axis=words.axis,
-                remedy="send clear_counter again",
+                remedy=Remedy("{} again", step("clear_counter")),
             )
         await asyncio.sleep(CLEAR_LOOK_S)

@@ -47,8 +47,10 @@ from ldcnd.errors import (
     DriveFault,
     NotSupported,
     OutcomeUnknown,
+    Remedy,
     ValueOutOfRange,
     WrongState,
+    step,
 )
 from ldcnd.log import get_logger
 from ldcnd.model.parameters import (
@@ -132,7 +134,7 @@ class UnitParameters(ParameterAccess):
             f"axis {self._axis}: the manual lists no parameter {text!r}",
             axis=self._axis,
             value=text,
-            remedy="send list_parameters, or allow unlisted ones",
+            remedy=Remedy("{}, or allow unlisted ones", step("list_parameters")),
         )
 
     @property

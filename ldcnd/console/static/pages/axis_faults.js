@@ -82,7 +82,7 @@ export function WhyPanel({ axis }) {
           : html`<p>Not now. Clear in this order:</p><ol class="causes">${why.causes.map(
               (cause) => html`<li>
             <a href=${faultPage(cause.code)}>${words(cause.code)}</a> <span>${cause.text}.</span>
-            ${cause.remedy && html`<p class="quiet">To clear it: ${inPageTerms(cause.remedy)}.</p>`}</li>`,
+            ${cause.remedy && html`<p class="quiet">To clear it: ${inPageTerms(cause)}.</p>`}</li>`,
             )}</ol>`)
       }
       ${why?.first_fault && html`<p class="quiet">First fault since the last reset: ${why.first_fault}.</p>`}

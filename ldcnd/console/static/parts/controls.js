@@ -49,7 +49,7 @@ export function RefusalText({ refusal }) {
   return html`<span class="refusal" role="alert">
     ${
       refusal &&
-      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${inPageTerms(refusal.remedy)}.</span>`}
+      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${inPageTerms(refusal)}.</span>`}
       ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`
     }
   </span>`;

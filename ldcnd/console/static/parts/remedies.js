@@ -1,19 +1,25 @@
-/** Remedies as the daemon says them name commands of its interface; on a page they name buttons. */
+/** A remedy names commands; on a page they are buttons. */
 
-const TERMS = [
-  [/send power \{"on": true\}/g, "press Enable"],
-  [/send home or set_position/g, "home the axis, or set its current position"],
-  [/send reset/g, "press Reset"],
-  [/send halt/g, "press Halt"],
-  [/send set_gains|send at least kp and el/g, "write gains, at least kp and el"],
-  [/send trace_abort/g, "press Abort on the trace page"],
-  [/send clear_counter/g, "clear the counter"],
-  [/send restart_eeprom_count/g, "press Count anew on the parameters page"],
-  [/or acquire it with force/g, "or take it from there by the tick"],
-  [/acquire (a new one|one first|it again|that axis, too)/g, "press Take control"],
-];
+const PRESSED = {
+  power: "press Enable",
+  home: "home the axis",
+  set_position: "set its current position",
+  reset: "press Reset",
+  halt: "press Halt",
+  set_gains: "write gains, at least kp and el",
+  set_outputs: "make the pin an input again, under Outputs",
+  trace_abort: "press Abort on the trace page",
+  clear_counter: "clear the counter",
+  restart_eeprom_count: "press Count anew on the parameters page",
+  list_parameters: "look at the list of parameters",
+  acquire: "press Take control",
+  events: "look at the events",
+};
 
-/** Return a remedy in the words of the pages. */
-export function inPageTerms(remedy) {
-  return TERMS.reduce((text, [term, words]) => text.replace(term, words), remedy);
+/** Return a remedy in the words of the pages; `told` is an error reply or a cause. */
+export function inPageTerms({ remedy, steps = [] }) {
+  return steps.reduce((text, { verb, said, arguments: given }) => {
+    const words = verb === "acquire" && given?.force ? "take it from there by the tick" : (PRESSED[verb] ?? said);
+    return text.replace(said, words);
+  }, remedy);
 }

@@ -17,6 +17,7 @@ export class Refusal extends Error {
     super(reply.message);
     this.code = reply.code ?? null; // one of the daemon's, each has a page
     this.remedy = reply.remedy ?? null;
+    this.steps = reply.steps ?? [];
     this.nearest = reply.nearest ?? null;
     this.retryable = reply.retryable ?? false;
     this.status = status;

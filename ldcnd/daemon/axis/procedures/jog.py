@@ -11,7 +11,7 @@ from ldcnd.daemon.axis.motion import AxisMotion
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, StopMode
-from ldcnd.errors import PositionLimit
+from ldcnd.errors import PositionLimit, Remedy, step
 from ldcnd.model.commands import CommandReply, MoveVelocity, Verb
 from ldcnd.model.samples import AxisState
 
@@ -57,7 +57,7 @@ class Jog(Procedure):
                 axis=view.name,
                 value=plan.velocity,
                 limit=self._end,
-                remedy="send halt",
+                remedy=Remedy("{}", step("halt")),
             )
         await self.turn.permit.load(plan.motion)
         self.deadline_s = motion.clock.now_s() + motion.config.jog_horizon_s
