@@ -89,7 +89,8 @@ def _found(command: type[Command[Frozen]], place: str) -> str:
         case "console":
             sources = [*ROOT.glob("ldcnd/console/static/**/*.js"), *ROOT.glob("ldcnd/console/*.py")]
             return _in_sources(
-                rf"""["'`/]{command.verb}["'`]""", (each for each in sources if "vendor" not in str(each))
+                rf"""["'`/]{command.verb}["'`]""",
+                (each for each in sources if "vendor" not in str(each) and each.name != "remedies.js"),
             )
         case _:
             pages = [*ROOT.glob("docs/*/*.md"), *ROOT.glob("ldcnd/fault_pages/*.md")]
