@@ -11,6 +11,7 @@ import pydantic
 
 from ldcnd.client.lease import Control
 from ldcnd.client.motion import Motion, Position, State, Watched
+from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
 from ldcnd.client.verbs import AxisVerbs
@@ -259,6 +260,20 @@ class Axis(AxisVerbs, Watched):
 
     def _silent(self) -> SessionError:
         return SessionError(f"axis {self.name}: nothing was heard of it yet", axis=self.name)
+
+    def _repr_html_(self) -> str:
+        """Return what is known of it as a table, for notebooks."""
+        if self._state is None or self._position is None:
+            return table(f"axis {self.name}", [("not heard of yet",)])
+        state, position = self.state, self.position
+        rows = [
+            ("position", position),
+            ("state", state),
+            ("enabled", "yes" if state.enabled else "no"),
+            ("homed", "yes" if state.referenced else "no"),
+            ("control", self._who or "none"),
+        ]
+        return table(f"axis {self.name}", rows)
 
     def __repr__(self) -> str:
         if self._state is None or self._position is None:

@@ -10,13 +10,13 @@ import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, contextmanager
 from functools import wraps
-from html import escape
 from pathlib import Path
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from ldcnd.client import axis as asynchronous
 from ldcnd.client import motion, rig
 from ldcnd.client.fleet import RigReport, survey
+from ldcnd.client.notebook import table
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.events import CommandEvent
@@ -84,6 +84,9 @@ class Facade(Generic[WrappedT]):
         self._loop = loop
         self._wrapped = wrapped
 
+    def __repr__(self) -> str:
+        return repr(self._wrapped)
+
 
 def _waiting(
     method: Callable[Concatenate[WrappedT, P], Coroutine[Any, Any, ResultT]],
@@ -117,9 +120,6 @@ class Motion(Facade[motion.Motion]):
     def __iter__(self) -> Iterator[motion.Progress]:
         """Yield the progress with each value that arrives until the command has ended."""
         return self._loop.each(aiter(self._wrapped))
-
-    def __repr__(self) -> str:
-        return repr(self._wrapped)
 
 
 class Axis(Facade[asynchronous.Axis]):
@@ -178,8 +178,9 @@ class Axis(Facade[asynchronous.Axis]):
         """Iterate over the positions that come from now on."""
         return self._loop.each(self._wrapped.positions())
 
-    def __repr__(self) -> str:
-        return repr(self._wrapped)
+    def _repr_html_(self) -> str:
+        """Return what is known of it as a table, for notebooks."""
+        return self._wrapped._repr_html_()
 
 
 class Rig(Facade[rig.Rig]):
@@ -255,17 +256,10 @@ class Rig(Facade[rig.Rig]):
         with self._loop.inside(context) as axes:
             yield tuple(Axis(self._loop, axis) for axis in axes)
 
-    def __repr__(self) -> str:
-        return repr(self._wrapped)
-
     def _repr_html_(self) -> str:
         """Return the axes as a table, for notebooks."""
-        rows = "".join(
-            f"<tr><td>{escape(axis.axis)}</td><td>{escape(axis.model)}</td><td>{escape(axis.unit)}</td></tr>"
-            for axis in self.describe()
-        )
-        head = "<tr><th>axis</th><th>drive</th><th>unit</th></tr>"
-        return f"<table><caption>rig {escape(self.name)}</caption>{head}{rows}</table>"
+        rows = [(axis.axis, axis.model, axis.unit) for axis in self.describe()]
+        return table(f"rig {self.name}", rows, ("axis", "drive", "unit"))
 
 
 @contextmanager

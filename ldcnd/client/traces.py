@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
+from ldcnd.client.notebook import panes
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, WrongState, step
 from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
@@ -31,6 +32,13 @@ class Trace:
     offsets_ns: tuple[int, ...]
     values: tuple[tuple[float | None, ...], ...]
     raw: tuple[tuple[int | float | None, ...], ...]
+
+    def _repr_html_(self) -> str:
+        """Return its channels as curves, for notebooks."""
+        seconds = [offset / 1e9 for offset in self.offsets_ns]
+        titles = (f"{each.name.replace('_', ' ')} [{each.unit}]" for each in self.header.channels)
+        span = f"{len(seconds)} samples in {seconds[-1] - seconds[0]:.3g} s" if seconds else "no samples"
+        return panes(span, seconds, zip(titles, self.values, strict=True))
 
 
 async def take_trace(client: RigClient, axis: str, request: TakeTrace, within_s: float) -> Trace:

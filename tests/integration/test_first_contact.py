@@ -1,4 +1,4 @@
-"""What a newcomer does first: `make run`, and the first program of the README."""
+"""What a newcomer does first: `make run`, the first program of the README, the tour in a notebook."""
 
 import asyncio
 import os
@@ -14,7 +14,22 @@ from tests.support.browser import WebQuestion, ask_over_tcp, path_of
 from tests.support.pages import blocks_of
 from tests.support.process import ROOT, free_port
 
-UP_S = 50.0
+UP_S = 60.0
+TOUR = ROOT / "examples" / "tour.ipynb"
+RUN_CELLS = """
+import ast, json, sys
+
+names = {}
+for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
+    if cell["cell_type"] == "code":
+        tree = ast.parse("".join(cell["source"]))
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, "cell", "exec"), names)
+        if last is not None:
+            shown = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+            print(shown._repr_html_() if hasattr(shown, "_repr_html_") else repr(shown))
+"""
+"""Runs a notebook as Jupyter does: the last expression of each cell is shown."""
 LINES = 8
 
 
@@ -47,6 +62,10 @@ async def test_make_run_says_what_to_type_and_the_first_program_moves(tmp_path):
                 sys.executable, "first.py", stdout=PIPE, cwd=tmp_path, env={**os.environ, "LDCND_CONNECT": endpoint}
             )
             printed, _ = await first.communicate()
+            tour = await asyncio.create_subprocess_exec(
+                sys.executable, "-c", RUN_CELLS, str(TOUR), stdout=PIPE, env={**os.environ, "LDCND_CONNECT": endpoint}
+            )
+            toured, _ = await tour.communicate()
     finally:
         os.killpg(make.pid, signal.SIGINT)
         await make.communicate()
@@ -59,4 +78,8 @@ async def test_make_run_says_what_to_type_and_the_first_program_moves(tmp_path):
     assert f"ldcnd axis move x 10 --wait -e {endpoint}" in said
     assert answer.status == 303
     assert first.returncode == 0
+    assert tour.returncode == 0
+    assert "rig sim" in toured.decode()
+    assert "<polyline" in toured.decode()
+    assert "above the limit" in toured.decode()
     assert float(printed.split()[0]) == pytest.approx(5, abs=0.05)
