@@ -14,7 +14,7 @@ from tests.support.browser import WebQuestion, ask_over_tcp, path_of
 from tests.support.pages import blocks_of
 from tests.support.process import ROOT, free_port
 
-UP_S = 60.0
+UP_S = 180.0
 TOUR = ROOT / "examples" / "tour.ipynb"
 RUN_CELLS = """
 import ast, json, sys
@@ -33,7 +33,7 @@ for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
 LINES = 8
 
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.timeout(240)]
 
 
 async def test_make_run_says_what_to_type_and_the_first_program_moves(tmp_path):

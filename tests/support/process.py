@@ -20,7 +20,7 @@ from ldcnd.model.samples import LinkState
 
 ROOT = Path(__file__).parents[2]
 LDCND = (sys.executable, "-m", "ldcnd")
-START_TIME_S = 30.0
+START_TIME_S = 90.0
 END_TIME_S = 15.0
 
 
