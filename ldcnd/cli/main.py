@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import click
 
-from ldcnd.cli.output import DONE, exit_code
+from ldcnd.cli.output import DONE, EXIT_CODES, exit_code
 from ldcnd.errors import LdcndError
 
 COMMANDS = {
@@ -66,13 +66,18 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+HELP = f"""Own RS-485 servo lines and expose their drives over Zenoh.
+
+Exit codes:
+
+\b
+{"".join(f"{code:4}  {meaning}{chr(10)}" for code, meaning in EXIT_CODES.items())}"""
+
+
+@click.group(cls=LazyGroup, help=HELP, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="ldcnd")
 def cli() -> None:
-    """Own RS-485 servo lines and expose their drives over Zenoh.
-
-    Exit codes: 0 done; 1 refused or failed; 2 wrong usage; 3 no daemon answers; 78 wrong configuration; 130 Ctrl-C.
-    """
+    """Find a command."""
 
 
 def main() -> NoReturn:

@@ -7,16 +7,10 @@ import click
 
 from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import COMMANDS, cli
+from ldcnd.cli.output import EXIT_CODES
 from ldcnd.version import version
 
-EXIT_STATUS = (
-    ("0", "Done."),
-    ("1", "Refused or failed; the message says why."),
-    ("2", "Wrong usage."),
-    ("3", "No daemon answers."),
-    ("78", "The configuration cannot work."),
-    ("130", "Interrupted by Ctrl-C; what was waited for was halted, or the message says how."),
-)
+EXIT_STATUS = tuple((str(code), f"{meaning[:1].upper()}{meaning[1:]}.") for code, meaning in EXIT_CODES.items())
 INTRODUCTION = """# Command line
 
 `ldcnd COMMAND --help` says the same, and so do the man pages of the Debian package. Every command that asks a daemon

@@ -44,6 +44,17 @@ WRONG_CONFIG = 78
 """The configuration cannot work (EX_CONFIG)."""
 INTERRUPTED = 130
 """By Ctrl-C."""
+WRONG_USAGE = 2
+"""As click has it."""
+EXIT_CODES = {
+    DONE: "done",
+    FAILED: "refused or failed; the message says why",
+    WRONG_USAGE: "wrong usage",
+    UNREACHABLE: "no daemon answers",
+    WRONG_CONFIG: "the configuration cannot work",
+    INTERRUPTED: "interrupted by Ctrl-C; what was waited for was halted, or the message says how to halt it",
+}
+"""All of them, with what they mean."""
 
 
 def show_lines(*lines: str, err: bool = False) -> None:

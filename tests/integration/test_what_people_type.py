@@ -12,10 +12,11 @@ import pytest
 from ldcnd.cli import connection
 from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import COMMANDS, cli, main
+from ldcnd.cli.output import EXIT_CODES
 from ldcnd.messaging.memory_session import MemoryBroker
 
 VALUES = ("nan", "inf", "0", "-1", "", "9" * 30, "\x1b[2J", "no/such")
-DOCUMENTED = {0, 1, 2, 3, 78, 130}
+DOCUMENTED = set(EXIT_CODES)
 SERVES = {"run", "sim", "console", "metrics", "foxglove"}
 """These run until they are ended when all they are given can be used; what they refuse has tests of its own."""
 HERE = {"schema", "pki"}
