@@ -250,7 +250,8 @@ def five_percent(seed: int) -> FaultPlan:
     return FaultPlan((*(Fault(kind, 0.05) for kind in kinds), delayed), seed=seed)
 
 
-async def test_a_thousand_writes_and_reads_on_a_bad_line_keep_ledger_and_values_true(tmp_path):
+@pytest.mark.parametrize("times", [200, pytest.param(2000, marks=pytest.mark.soak)])
+async def test_writes_and_reads_on_a_bad_line_keep_ledger_and_values_true(tmp_path, times):
     dice = random.Random(182)
     drive = simulated(1)
     memory = drive.drive.memory
@@ -258,7 +259,7 @@ async def test_a_thousand_writes_and_reads_on_a_bad_line_keep_ledger_and_values_
     wrong, failed = [], 0
     async with smartstep_line([drive], ledger=tmp_path / "ledger.json", faults=five_percent(9)) as line:
         access = line.axis("u1").parameters
-        for _ in range(1000):
+        for _ in range(times):
             label = dice.choice(list(parameters))
             parameter = parameters[label]
             value = dice.randrange(1, 700)
@@ -281,9 +282,9 @@ async def test_a_thousand_writes_and_reads_on_a_bad_line_keep_ledger_and_values_
     assert wrong == []
     assert unread_repetitions(log) == []
     assert ledger == {label: memory.writes[parameter.number] for label, parameter in parameters.items()}
-    assert sum(memory.writes.values()) > 250
-    assert statistics.timeouts > 200
-    assert failed < 100
+    assert sum(memory.writes.values()) > 0.25 * times
+    assert statistics.timeouts > 0.2 * times
+    assert failed < 0.1 * times
 
 
 def unread_repetitions(log: list[WireRecord]) -> list[WireRecord]:
