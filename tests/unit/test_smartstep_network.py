@@ -250,7 +250,8 @@ async def test_motion_is_refused_whatever_it_is():
                 await refused
 
 
-async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_only():
+@pytest.mark.parametrize("late_s", [0.0, 20.0], ids=["at once", "late"])
+async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_only(late_s):
     drive = simulated(2, SimulatedVariant(hears_itself=True))
     drive.power_off(0.0)
     async with smartstep_line([simulated(1), drive]) as line:
@@ -258,7 +259,7 @@ async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_on
         axis = line.axis("u2")
         ignore = ReadingListeners(lambda *_: None, lambda *_: None, lambda *_: None, lambda _: None)
         line.bus.add_poller(axis.own_poller(asyncio.get_running_loop().time(), ignore))
-        await asyncio.sleep(20.0)
+        await asyncio.sleep(late_s)
         now_s = asyncio.get_running_loop().time()
         drive.power_on(now_s)
         await asyncio.sleep(30.0)
