@@ -12,7 +12,7 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Job, PollTurn, StopProbe, Turn
 from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
-from ldcnd.exchange import Exchange, condition_in_force
+from ldcnd.exchange import Exchange, Timing, condition_in_force
 from ldcnd.log import get_logger
 from ldcnd.transport.adapter import LineErrors
 from ldcnd.transport.transport import Opener, Transport
@@ -128,6 +128,18 @@ class Bus:
             LdcndError: as the condition refused it; nothing was sent.
         """
         return await self._submit(exchange, lane, once=once)
+
+    async def execute_timed(self, exchange: Exchange[ReplyT]) -> tuple[ReplyT, Timing]:
+        """Run one command exchange; return the decoded reply, and when it happened.
+
+        Raises:
+            As `execute`.
+        """
+        job = self._job(exchange, Lane.COMMAND)
+        reply: ReplyT = await self._queued(job)
+        if job.timing is None:
+            raise AssertionError("a reply without the instant at which it came")
+        return reply, job.timing
 
     async def change_baud(self, exchange: Exchange[ReplyT], baud: int) -> ReplyT:
         """Run the exchange that tells the nodes to change their rate, then change ours before anything else is sent.
@@ -280,16 +292,23 @@ class Bus:
         at_baud: int | None = None,
         once: bool = False,
     ) -> ReplyT:
+        job = self._job(exchange, lane, once=once)
+        job.then_baud, job.at_baud = then_baud, at_baud
+        reply: ReplyT = await self._queued(job)
+        return reply
+
+    def _job(self, exchange: Exchange[Any], lane: Lane, *, once: bool = False) -> Job:
+        attempts = 1 if once else self.settings.attempts
+        condition = condition_in_force() if exchange.moves and lane is not Lane.STOP else None
+        future: asyncio.Future[Any] = self._loop.create_future()
+        return Job(exchange, lane, self._loop.time(), future, attempts=attempts, condition=condition)
+
+    def _queued(self, job: Job) -> "asyncio.Future[Any]":
         if self._line is None:
             raise self._down()
-        future: asyncio.Future[ReplyT] = self._loop.create_future()
-        condition = condition_in_force() if exchange.moves and lane is not Lane.STOP else None
-        attempts = 1 if once else self.settings.attempts
-        job = Job(exchange, lane, self._loop.time(), future, attempts=attempts, condition=condition)
-        job.then_baud, job.at_baud = then_baud, at_baud
-        self._queue.push(job, lane)
+        self._queue.push(job, job.lane)
         self._kick()
-        return await future
+        return job.future
 
     def _kick(self) -> None:
         if self._line:

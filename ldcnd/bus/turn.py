@@ -103,9 +103,9 @@ class PollTurn(Turn):
 
 
 class Job(Turn):
-    """An exchange that a caller waits for; its future gets exactly one outcome."""
+    """An exchange that a caller waits for; its future gets exactly one outcome, `timing` says when that was."""
 
-    __slots__ = ("attempts", "attempts_left", "condition", "future")
+    __slots__ = ("attempts", "attempts_left", "condition", "future", "timing")
 
     def __init__(
         self,
@@ -120,6 +120,7 @@ class Job(Turn):
         super().__init__(exchange, lane, wanted_at_s)
         self.condition = condition
         self.future = future
+        self.timing: Timing | None = None
         self.attempts = attempts
         self.attempts_left = attempts
 
@@ -153,6 +154,7 @@ class Job(Turn):
         except BadReply as error:
             self.fail(error)
             return
+        self.timing = timing
         self.future.set_result(value)
 
     @override

@@ -12,7 +12,7 @@ import click
 from ldcnd.bus.bus import Bus
 from ldcnd.daemon.line import acceptance
 from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.network import RESET_BAUD
+from ldcnd.drivers.ldcn.registers import RESET_BAUD
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS as SMARTSTEP_ASSUMPTIONS
 from ldcnd.drivers.transcript import describer
 from ldcnd.errors import BusDown, ConfigError

@@ -13,9 +13,11 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import NotSupported
 from ldcnd.model.commands import (
     BufferMode,
+    Direction,
     Halt,
     Home,
     HomeMethod,
+    HomeStop,
     MoveAbsolute,
     MoveAnalog,
     MoveRelative,
@@ -23,6 +25,9 @@ from ldcnd.model.commands import (
     Power,
     Preview,
     PreviewReply,
+    Probe,
+    ProbeSource,
+    ProbeStop,
     QuickStop,
     Reset,
     SetGains,
@@ -109,6 +114,11 @@ def power(sender: Sender, axis: str, switch: str) -> None:
 @click.option("--velocity", type=Finite(), help="Units a second; the axis default when missing.")
 @click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
 @click.option(
+    "--direction",
+    type=click.Choice([direction.value for direction in Direction]),
+    help="Which way to turn, on an axis with a modulo; the shortest when missing.",
+)
+@click.option(
     "--buffer-mode",
     type=click.Choice([mode.value for mode in BufferMode]),
     default=BufferMode.REFUSE.value,
@@ -123,6 +133,7 @@ def move(
     value: float,
     velocity: float | None,
     acceleration: float | None,
+    direction: str | None,
     buffer_mode: str,
     *,
     relative: bool,
@@ -135,6 +146,8 @@ def move(
         raise click.UsageError("--relative and --at-velocity exclude each other")
     given = {"acceleration": acceleration, "buffer_mode": buffer_mode}
     request: MoveVelocity | MoveRelative | MoveAbsolute
+    if direction and (relative or at_velocity):
+        raise click.UsageError("--direction goes with a position")
     if at_velocity:
         if velocity is not None:
             raise click.UsageError("with --at-velocity, VALUE is the velocity; leave --velocity out")
@@ -142,7 +155,7 @@ def move(
     elif relative:
         request = of_options(MoveRelative, distance=value, velocity=velocity, **given)
     else:
-        request = of_options(MoveAbsolute, position=value, velocity=velocity, **given)
+        request = of_options(MoveAbsolute, position=value, velocity=velocity, direction=direction, **given)
     sender.send(axis, request, wait=wait, leave_running=leave_running)
 
 
@@ -150,23 +163,46 @@ def move(
 @click.argument("axis", type=AXIS)
 @click.option("--method", type=click.Choice([method.value for method in HomeMethod]), help="What marks the position.")
 @click.option("--velocity", type=Finite(), help="Search velocity, signed; units a second.")
+@click.option("--find-velocity", type=Finite(), help="Speed at which a limit switch is found first; units a second.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
 @click.option("--position", type=Finite(), help="What the position is called there.")
+@click.option("--timeout", "timeout_s", type=Finite(), help="Longest search, in seconds.")
+@click.option("--distance", type=Finite(), help="Longest search, in axis units.")
+@click.option("--stop", type=click.Choice([stop.value for stop in HomeStop]), help="How the motor stops there.")
+@click.option("--move-to", type=Finite(), help="Where to go afterwards.")
 @WAIT
 @LEAVE
 @commanding
-def home(
-    sender: Sender,
-    axis: str,
-    method: str | None,
-    velocity: float | None,
-    position: float | None,
-    *,
-    wait: bool,
-    leave_running: bool,
-) -> None:
+def home(sender: Sender, axis: str, *, wait: bool, leave_running: bool, **given: object) -> None:
     """Search the reference position of AXIS, as configured unless said otherwise."""
-    request = of_options(Home, method=method, velocity=velocity, position=position)
-    sender.send(axis, request, wait=wait, leave_running=leave_running)
+    sender.send(axis, of_options(Home, **given), wait=wait, leave_running=leave_running)
+
+
+@command.command(context_settings={"ignore_unknown_options": True})
+@click.argument("axis")
+@click.option(
+    "--source",
+    "sources",
+    multiple=True,
+    required=True,
+    type=click.Choice([source.value for source in ProbeSource]),
+    help="What latches; several may be named, the first that comes counts.",
+)
+@click.option("--position", type=Finite(), help="Where the move ends when no input comes.")
+@click.option("--distance", type=Finite(), help="How far it goes when no input comes, signed.")
+@click.option("--velocity", type=Finite(), help="Units a second; the axis default when missing.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
+@click.option("--stop", type=click.Choice([stop.value for stop in ProbeStop]), help="How the motor stops there.")
+@WAIT
+@LEAVE
+@commanding
+def probe(sender: Sender, axis: str, *, wait: bool, leave_running: bool, **given: object) -> None:
+    """Move AXIS until an input changes and latch the position there; with --wait show it."""
+    sender.send(axis, of_options(Probe, **given), wait=wait, leave_running=leave_running)
+    if wait:
+        latch = sender.target.run(lambda client: client.last(axis, TelemetryItem.LATCH))
+        if latch is not None:
+            sender.target.show(latch, f"{axis}: {sample_text(latch)}")
 
 
 @command.command()

@@ -14,6 +14,7 @@ from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
 from ldcnd.drivers.dissector import install
 from ldcnd.drivers.transcript import Describe, describer
+from ldcnd.model.rig_commands import Snapshot
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.wirelog.pcapng import encode_pcapng
 from ldcnd.wirelog.recorder import WireEvent, WireRecord, parse_records
@@ -48,6 +49,20 @@ def command() -> None:
 
 
 command.add_command(replay.command)
+
+
+@command.command()
+@click.argument("bus")
+@with_target
+def snapshot(target: Target, bus: str) -> None:
+    """Show the positions of all axes of the line BUS at one instant; nothing moves."""
+    reply = target.run(lambda client: client.ask(Snapshot(bus=bus)))
+    lines = [
+        f"{each.axis:8} {each.position:14.6f} {each.unit:8} {each.counts:12d} counts"
+        f"{'' if each.referenced else '  not referenced'}"
+        for each in reply.positions
+    ]
+    target.show(reply, *lines, f"all within {reply.t_error_ns / 1e6:.2f} ms of {reply.t / 1e9:.6f} s UTC")
 
 
 @command.command("list")

@@ -8,6 +8,8 @@ from ldcnd.model.samples import (
     AdcSample,
     AxisState,
     FaultSample,
+    InputsSample,
+    LatchSample,
     Moving,
     PositionSample,
     Sample,
@@ -89,6 +91,16 @@ def sample_text(sample: Sample) -> str:
             return f"velocity {sample.value:14.4f} {sample.unit}{_worth(sample)}"
         case AdcSample():
             return f"adc      {sample.volts:10.3f} V ({sample.counts} of {sample.full_scale}){_worth(sample)}"
+        case InputsSample():
+            words = ("off", "on")
+            levels = (
+                f"{name.replace('_', ' ')} {'?' if (level := getattr(sample, name)) is None else words[level]}"
+                for name in ("reverse_limit", "forward_limit", "index", "stop_input", "amplifier_enable")
+            )
+            return f"inputs   {', '.join(levels)}{_worth(sample)}"
+        case LatchSample():
+            at = f"{sample.value:14.4f} {sample.unit}, up to {sample.error:.2g} {sample.unit} behind the edge"
+            return f"latch    {at}{_worth(sample)}"
         case StateSample():
             moving = "" if sample.moving is not Moving.UNKNOWN else ", moving: unknown"
             link = "" if sample.link == "up" else f", link {sample.link}"

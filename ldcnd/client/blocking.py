@@ -133,6 +133,7 @@ class Axis(Facade[asynchronous.Axis]):
     halt = _moving(asynchronous.Axis.halt)
     quick_stop = _waiting(asynchronous.Axis.quick_stop)
     home = _moving(asynchronous.Axis.home)
+    probe = _moving(asynchronous.Axis.probe)
     reset = _waiting(asynchronous.Axis.reset)
     set_position = _waiting(asynchronous.Axis.set_position)
     set_gains = _waiting(asynchronous.Axis.set_gains)

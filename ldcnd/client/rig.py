@@ -19,7 +19,7 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.commands import StopReply
 from ldcnd.model.events import CommandOutcome, ReadOutcome
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
-from ldcnd.model.rig_commands import Acquire, AxisMove, HolderList, ListHolders, MoveTogether
+from ldcnd.model.rig_commands import Acquire, AxisMove, HolderList, ListHolders, MoveTogether, Snapshot, SnapshotReply
 from ldcnd.model.samples import FaultSample
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -178,6 +178,14 @@ class Rig:
     async def holders(self) -> HolderList:
         """Return who controls what."""
         return await self._client.ask(ListHolders())
+
+    async def snapshot(self, bus: str) -> SnapshotReply:
+        """Return the positions of all axes of a line at one instant, and how sure that instant is.
+
+        Raises:
+            NotSupported: the line is not configured for it.
+        """
+        return await self._client.ask(Snapshot(bus=bus))
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Return what became of a command."""

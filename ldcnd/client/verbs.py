@@ -10,6 +10,7 @@ from ldcnd.model.commands import (
     BufferMode,
     Command,
     CommandReply,
+    Direction,
     Halt,
     Home,
     HomeMethod,
@@ -22,6 +23,9 @@ from ldcnd.model.commands import (
     Power,
     Preview,
     PreviewReply,
+    Probe,
+    ProbeSource,
+    ProbeStop,
     QuickStop,
     Reset,
     SetGains,
@@ -93,19 +97,25 @@ class AxisVerbs(ABC):
         buffer_mode: BufferMode = BufferMode.REFUSE,
         velocity: float | None = None,
         acceleration: float | None = None,
+        direction: Direction | None = None,
     ) -> Motion:
         """Move to a position on a trapezoidal profile.
 
         Args:
             buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
                 new move.
-            position: Target in axis units.
+            position: Target in axis units; on an axis with a modulo any turn of it is meant.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
+            direction: Which way to turn, on an axis with a modulo only; the shortest when missing.
         """
         return await self._start(
             lambda: MoveAbsolute(
-                buffer_mode=buffer_mode, position=position, velocity=velocity, acceleration=acceleration
+                buffer_mode=buffer_mode,
+                position=position,
+                velocity=velocity,
+                acceleration=acceleration,
+                direction=direction,
             )
         )
 
@@ -195,6 +205,39 @@ class AxisVerbs(ABC):
                 distance=distance,
                 stop=stop,
                 move_to=move_to,
+            )
+        )
+
+    async def probe(
+        self,
+        sources: tuple[ProbeSource, ...],
+        *,
+        position: float | None = None,
+        distance: float | None = None,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        stop: ProbeStop = ProbeStop.SMOOTH,
+    ) -> Motion:
+        """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
+
+        Args:
+            sources: What latches: any change of a limit switch input, an index pulse, the current limit; the first of
+                them counts.
+            position: Where the move ends at the latest, in axis units; needs a referenced axis.
+            distance: How far it goes at most, in axis units, signed.
+            velocity: Speed in units a second; the axis default when missing. On the index at most 0.75 of an index
+                width in a servo cycle. The latched position is surer the slower it is.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
+            stop: How the motor stops there.
+        """
+        return await self._start(
+            lambda: Probe(
+                sources=sources,
+                position=position,
+                distance=distance,
+                velocity=velocity,
+                acceleration=acceleration,
+                stop=stop,
             )
         )
 
@@ -403,6 +446,7 @@ class AxisVerbs(ABC):
         self,
         *,
         position: float | None = None,
+        direction: Direction | None = None,
         distance: float | None = None,
         velocity: float | None = None,
         acceleration: float | None = None,
@@ -411,10 +455,13 @@ class AxisVerbs(ABC):
 
         Args:
             position: A move to this position, in axis units.
+            direction: With a position on an axis with a modulo: which way to turn.
             distance: A move by this distance, in axis units.
             velocity: Speed of the move; alone: a motion at this velocity, signed. Units a second.
             acceleration: Units a second squared; the axis default when missing.
         """
         return await self._ask(
-            lambda: Preview(position=position, distance=distance, velocity=velocity, acceleration=acceleration)
+            lambda: Preview(
+                position=position, direction=direction, distance=distance, velocity=velocity, acceleration=acceleration
+            )
         )

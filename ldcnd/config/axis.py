@@ -15,6 +15,9 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisLimits
 from ldcnd.model.plan import PollPriority
 
+LEAST_TURN_COUNTS = 4
+"""Of a rotary axis: one count must be no larger than the way to the other side."""
+
 
 def _known_model(model: str) -> str:
     if model == smartstep_config.MODEL:
@@ -153,6 +156,9 @@ class AxisConfig(Frozen):
     the axis works in counts and says so."""
     direction: Literal["forward", "reverse"] = "forward"
     """reverse: forward in axis units is backward in encoder counts."""
+    modulo: float | None = Field(default=None, gt=0)
+    """A rotary axis: positions repeat after so many axis units, such as 360. It turns without an end, and takes no
+    position limits."""
     velocity: float = Field(gt=0)
     """Velocity of moves that do not name one, units a second."""
     acceleration: float = Field(gt=0)
@@ -220,6 +226,10 @@ moving off a switch stays possible. Not for `track`, nor on drives that do not s
             raise ValueError(
                 f"limits: position_min {limits.position_min} is not below position_max {limits.position_max}"
             )
+        if self.modulo is not None and (limits.position_min, limits.position_max) != (None, None):
+            raise ValueError("modulo: an axis that turns without an end has no position limits")
+        if self.modulo is not None and self.modulo * (self.counts_per_unit or 1.0) < LEAST_TURN_COUNTS:
+            raise ValueError(f"modulo {self.modulo:g} is less than {LEAST_TURN_COUNTS} encoder counts")
         if limits.velocity is not None and self.velocity > limits.velocity:
             raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
         if limits.acceleration is not None and self.acceleration > limits.acceleration:

@@ -6,11 +6,13 @@ from pydantic import AfterValidator, Field, model_validator
 
 from ldcnd.config.axis import AxisConfig
 from ldcnd.config.toml import DeviceIdentity, Name, refuse_duplicates
-from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PROFILES, at_clock
+from ldcnd.drivers.ldcn.registers import BaudCodes, baud_divisor
 from ldcnd.drivers.line import AdoptFallback, StartPolicy
 from ldcnd.drivers.smartstep import config as smartstep_config
 from ldcnd.drivers.smartstep.config import SmartStepLineConfig
 from ldcnd.drivers.smartstep.profiles import Wiring
+from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.frozen import Frozen
 from ldcnd.transport.line_discipline import LONGEST_RTS_DELAY_MS, Rs485
 
@@ -21,12 +23,6 @@ def _known_module(model: str) -> str:
     if model not in PROFILES:
         raise ValueError(f"no such module; known are {', '.join(PROFILES)}")
     return model
-
-
-def _known_baud(baud: int) -> int:
-    if baud not in BAUDS:
-        raise ValueError(f"no drive has this rate; known are {', '.join(map(str, BAUDS))}")
-    return baud
 
 
 def _known_port(port: str) -> str:
@@ -92,8 +88,11 @@ class BusConfig(Frozen):
     """The drive family on it."""
     smartstep: SmartStepLineConfig = SmartStepLineConfig()
     """How a line of the smartstep family is wired; its rate is always 9600."""
-    baud: Annotated[int, AfterValidator(_known_baud)] = 19_200
-    """The working rate."""
+    baud: int = Field(default=19_200, gt=0, le=BAUDS[-1])
+    """The working rate: 9600, 19200, 57600, 115200, 230400, or on LDCN and NMC drives another that a divisor of their
+    clock makes, such as 125000; the port has to make it, too."""
+    clock_mhz: float = Field(default=20.0, ge=10.0, le=20.0)
+    """Clock of the drives; PIC-SERVO up to version 5 only, all with the same. Servo cycle and rates follow it."""
     margin_ms: float = Field(default=5.0, gt=0, le=1000)
     """Added to every reply's deadline: host scheduling and adapter latency."""
     rs485: Rs485Config | None = None
@@ -175,12 +174,32 @@ None where polls would miss their turns for it."""
             raise ValueError('rs485: on two wires receive_own = true goes with echo = "expect", false with "none"')
         return self
 
+    @property
+    def clock_hz(self) -> int:
+        """Clock of the drives, in Hz."""
+        return round(self.clock_mhz * 1e6)
+
     @model_validator(mode="after")
     def _reachable_rate(self) -> Self:
+        printed = self.baud in BAUDS
+        if self.family != "ldcn" and not printed:
+            raise ValueError(f"baud {self.baud}: no drive has this rate; known are {', '.join(map(str, BAUDS))}")
         for address, model in self._models.items():
             profile = PROFILES.get(model)
-            if profile and self.baud > profile.top_baud:
-                raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {profile.top_baud} at most")
+            if profile is None:
+                continue
+            if self.clock_hz != CLOCK_HZ and not profile.any_clock:
+                raise ValueError(f"clock_mhz {self.clock_mhz:g}: {model} at address {address} has a clock of its own")
+            top = at_clock(profile, self.clock_hz).top_baud
+            if self.baud > top:
+                raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {top} at most")
+            if profile.baud_keys and not printed:
+                raise ValueError(f"baud {self.baud}: {model} at address {address} knows {', '.join(map(str, BAUDS))}")
+        if self.family == "ldcn":
+            try:
+                baud_divisor(self.baud, BaudCodes(self.divisors), self.clock_hz)
+            except ValueOutOfRange as error:
+                raise ValueError(f"baud {self.baud}: {error.message}") from None
         return self
 
     @model_validator(mode="after")

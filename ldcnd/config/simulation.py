@@ -89,6 +89,8 @@ class Quirks(Frozen):
 
     version: int | None = Field(default=None, ge=0, le=255)
     """Second byte of its identity."""
+    clock_hz: int | None = Field(default=None, ge=10_000_000, le=20_000_000)
+    """Its clock, PIC-SERVO up to version 5; servo cycle and rates follow it. 20 MHz when left out."""
     phase_s: float | None = Field(default=None, ge=0, lt=SERVO_CYCLE_S)
     """Where its servo cycles lie; drawn from the seed when left out."""
     drift_ppm: float | None = Field(default=None, ge=-10_000, le=10_000)

@@ -20,6 +20,9 @@ from ldcnd.model.commands import HomeMethod, PinMode, Verb
 from ldcnd.model.meta import Provenance
 from ldcnd.model.samples import MonitorName, TelemetryItem
 
+LARGEST_COUNT = 0x7FFF_FFFF
+"""Of a position counter of 32 bits, in either direction."""
+
 
 class StopMode(Enum):
     """How a motor is brought to rest."""
@@ -64,6 +67,9 @@ class AxisReading:
         homing: armed for a home capture that has not come yet.
         faults: what the drive complains about.
         reverse_limit: level of that limit switch input, `forward_limit` of the other; None while it is not shown.
+        index: level of the encoder's index; None while it is not shown.
+        stop_input: the drive's stop input is open; None while it is not shown.
+        amplifier_enable: what the drive holds; None while that is not known.
         asked: the items that this poll was for; the line may have asked for others since.
         cut_short: why the drive ended the motion before its end, by itself; empty when it did not.
     """
@@ -79,6 +85,9 @@ class AxisReading:
     faults: tuple[Fault, ...]
     reverse_limit: bool | None = None
     forward_limit: bool | None = None
+    index: bool | None = None
+    stop_input: bool | None = None
+    amplifier_enable: bool | None = None
     asked: frozenset[TelemetryItem] = frozenset()
     cut_short: str = ""
 
@@ -131,10 +140,18 @@ class HomeCapture:
     """What captures the home position on the way, and how the motor stops then.
 
     A drive that cannot stop by itself runs on until it is stopped.
+
+    Attributes:
+        method: what captures.
+        stop: how the motor stops.
+        also: what else does; the first that comes counts.
+        guarded: the limit switch ahead captures and stops, too, where the configuration has the drive stop on it.
     """
 
     method: HomeMethod
     stop: StopMode = StopMode.SMOOTH
+    also: frozenset[HomeMethod] = frozenset()
+    guarded: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +229,9 @@ class AxisDriver(ABC):
         adc_full_scale: counts of the A/D converter at full scale; None without one.
         home_methods: what can mark the reference position.
         retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
-        index_sample_s: how often the drive looks at its index input: a shorter pulse can be missed.
+        capture_s: how often the drive looks at the inputs that capture: a shorter pulse can be missed, and what is
+            captured is up to the way of so long behind the edge.
+        shows_inputs: its readings carry the levels of its inputs.
         monitors: what is published beside the common items.
         tracer: the drive's own recorder; None where the host has to sample.
     """
@@ -222,8 +241,9 @@ class AxisDriver(ABC):
     capabilities: frozenset[Verb]
     adc_full_scale: int | None
     home_methods: frozenset[HomeMethod]
-    index_sample_s: float = 0.0
+    capture_s: float = 0.0
     retargets: bool = False
+    shows_inputs: bool = False
     monitors: tuple[MonitorName, ...] = ()
     tracer: Tracer | None = None
 
@@ -278,6 +298,14 @@ class AxisDriver(ABC):
         """Load the position loop's registers; they act at once."""
 
     # -- what only some drives have: refused by default, announced by a capability -----------------------------------
+
+    def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
+        """Return how far the position counter reaches in a direction, from where the axis was last."""
+        return LARGEST_COUNT
+
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:  # noqa: ARG002 - part of the contract
+        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
+        return False
 
     async def clear_warnings(self) -> None:  # noqa: B027 - a drive without warnings has nothing to do
         """Clear what is remembered without having stopped anything; the loop stays as it is."""

@@ -60,6 +60,7 @@ class LineSpec:
         start: see `StartPolicy`.
         adopt_fallback: see `AdoptFallback`.
         alternate_divisors: use the other family of baud rate divisors.
+        clock_hz: of the modules.
         snapshot: positions may be frozen at one instant, which overwrites the drives' home registers.
         modules: what is on the line besides the axes.
         groups: at most one for each axis.
@@ -68,6 +69,7 @@ class LineSpec:
     start: StartPolicy = StartPolicy.RESET
     adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
     alternate_divisors: bool = False
+    clock_hz: int = 20_000_000
     snapshot: bool = False
     modules: tuple[ModuleEntry, ...] = ()
     groups: tuple[GroupSpec, ...] = ()

@@ -35,6 +35,21 @@ class BringUpReport:
     restarted: frozenset[str] = frozenset()
 
 
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """Positions of several drives, frozen together.
+
+    Attributes:
+        counts: by axis name.
+        from_s: the earliest instant at which any of them can have been frozen, on the bus's clock.
+        until_s: the latest.
+    """
+
+    counts: Mapping[str, int]
+    from_s: float
+    until_s: float
+
+
 class Network(ABC):
     """All drives of one line.
 
@@ -100,8 +115,11 @@ class Network(ABC):
         """
         raise NotSupported("this family cannot start several drives together")
 
-    async def snapshot(self) -> Mapping[str, int]:
-        """Return the positions of all axes at one instant, in counts by axis name.
+    async def snapshot(self, still_free: Callable[[], None]) -> Instant:  # noqa: ARG002 - part of the contract
+        """Return the positions of all axes at one instant.
+
+        Args:
+            still_free: raises while a command needs the registers; asked again directly before the packet that freezes.
 
         Raises:
             NotSupported: the family cannot, or the configuration forbids it.

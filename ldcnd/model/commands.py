@@ -37,6 +37,7 @@ class Verb(StrEnum):
     STOP = "stop"
     QUICK_STOP = "quick_stop"
     HOME = "home"
+    PROBE = "probe"
     RESET = "reset"
     SET_POSITION = "set_position"
     SET_GAINS = "set_gains"
@@ -285,7 +286,8 @@ class BufferMode(StrEnum):
     REFUSE = "refuse"
     """It is refused: whoever sends it did not know."""
     ABORTING = "aborting"
-    """The axis is halted first; what it was doing ends as aborted."""
+    """What it was doing ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that drive
+    goes on to the new goal within the new velocity and acceleration, without a halt."""
     BUFFERED = "buffered"
     """It waits until what the axis is doing has ended."""
 
@@ -300,17 +302,27 @@ class Move(AxisCommand[CommandReply]):
     """What happens if the axis moves already; the answer comes when the drive has acknowledged the new move."""
 
 
+class Direction(StrEnum):
+    """Which way an axis with a modulo turns to a position; PLCopen's directions."""
+
+    SHORTEST_WAY = "shortest_way"
+    POSITIVE = "positive"
+    NEGATIVE = "negative"
+
+
 class MoveAbsolute(Move):
     """Move to a position on a trapezoidal profile."""
 
     verb = Verb.MOVE_ABSOLUTE
 
     position: float
-    """Target in axis units."""
+    """Target in axis units; on an axis with a modulo any turn of it is meant."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
+    direction: Direction | None = None
+    """Which way to turn, on an axis with a modulo only; the shortest when missing."""
 
 
 class MoveRelative(Move):
@@ -416,6 +428,49 @@ servo cycle: a faster search is refused with the nearest velocity."""
     """How the motor stops there."""
     move_to: float | None = None
     """Where to go afterwards, in axis units; a missing one stays where the motor stopped."""
+
+
+class ProbeSource(StrEnum):
+    """What latches the position of a probe."""
+
+    INDEX = "index"
+    FORWARD_LIMIT = "forward_limit"
+    REVERSE_LIMIT = "reverse_limit"
+    CURRENT = "current"
+
+
+class ProbeStop(StrEnum):
+    """How the motor stops when something was latched."""
+
+    SMOOTH = "smooth"
+    """Decelerate, then hold."""
+    ABRUPT = "abrupt"
+    """Hold at once."""
+
+
+class Probe(AxisCommand[CommandReply]):
+    """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
+
+    Exactly one of position and distance says where the move ends when no input comes; then the command has failed.
+    """
+
+    verb = Verb.PROBE
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    sources: tuple[ProbeSource, ...] = Field(min_length=1, max_length=4)
+    """What latches: any change of a limit switch input, an index pulse, the current limit; the first of them counts."""
+    position: float | None = None
+    """Where the move ends at the latest, in axis units; needs a referenced axis."""
+    distance: float | None = None
+    """How far it goes at most, in axis units, signed."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing. On the index at most 0.75 of an index width in a servo \
+cycle. The latched position is surer the slower it is."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+    stop: ProbeStop = ProbeStop.SMOOTH
+    """How the motor stops there."""
 
 
 class Reset(AxisCommand[CommandReply]):
@@ -601,6 +656,8 @@ class Preview(Command[PreviewReply]):
 
     position: float | None = None
     """A move to this position, in axis units."""
+    direction: Direction | None = None
+    """With a position on an axis with a modulo: which way to turn."""
     distance: float | None = None
     """A move by this distance, in axis units."""
     velocity: float | None = None
@@ -618,6 +675,7 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Stop,
     QuickStop,
     Home,
+    Probe,
     Reset,
     SetPosition,
     SetGains,

@@ -183,6 +183,8 @@ class AxisInfo(Frozen):
     """Encoder counts per unit; null when no scale is configured and the axis works in counts."""
     direction: str
     """forward or reverse: the sign between counts and units."""
+    modulo: float | None = None
+    """A rotary axis: positions repeat after so many axis units; null for others."""
     limits: AxisLimits
     """Software limits in axis units."""
     group: str | None = None

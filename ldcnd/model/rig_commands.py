@@ -124,6 +124,47 @@ class MoveTogether(Command[MoveTogetherReply]):
     """Exactly the members of a group, each once."""
 
 
+class FrozenPosition(Frozen):
+    """Where one axis was at the instant of a snapshot."""
+
+    axis: str
+    """The axis."""
+    position: float
+    """In axis units."""
+    counts: int
+    """Raw encoder counts of the drive."""
+    unit: str
+    """The axis unit."""
+    referenced: bool
+    """The position means something; see the state of the axis."""
+
+
+class SnapshotReply(Frozen):
+    """Positions of all axes of a line, frozen by one packet: the reply to `@cmd/_/snapshot`."""
+
+    bus: str
+    """The line."""
+    t: int
+    """When all of them were true, UTC in ns since 1970."""
+    t_error_ns: int = Field(ge=0)
+    """Every one of the true instants lies within this many ns of `t`."""
+    positions: tuple[FrozenPosition, ...]
+    """One for each axis."""
+
+
+class Snapshot(Command[SnapshotReply]):
+    """Freeze the positions of all axes of a line at one instant; the line must be configured for it.
+
+    Nothing moves or stops. The drives' home registers are overwritten, so no axis may be homing.
+    """
+
+    verb = "snapshot"
+    about = About.RIG
+
+    bus: str
+    """Which line; it needs `snapshot = true`."""
+
+
 class Rehearsal(StrEnum):
     """Who is to disappear."""
 
@@ -209,5 +250,6 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Rehearse,
     MoveTogether,
     ReadWireLog,
+    Snapshot,
 )
 """The commands about the rig, those about events included."""

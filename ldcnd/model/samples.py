@@ -52,6 +52,8 @@ class TelemetryItem(StrEnum):
     POSITION = "position"
     VELOCITY = "velocity"
     ADC = "adc"
+    INPUTS = "inputs"
+    LATCH = "latch"
     FAULT = "fault"
     STATE = "state"
 
@@ -73,11 +75,13 @@ class PositionSample(Sample):
     """Where the axis is."""
 
     value: float
-    """Position in axis units."""
+    """Position in axis units; on an axis with a modulo from 0 up to it."""
     unit: str
     """The axis unit."""
+    turns: int | None = None
+    """Whole turns below `value` since the axis was referenced; null without a modulo."""
     counts: int
-    """Raw encoder counts of the drive."""
+    """Encoder counts since the drive was reset, also beyond the 32 bits of its counter."""
     following_error: float | None
     """Commanded minus actual position in axis units; null when the drive does not report it."""
 
@@ -102,6 +106,39 @@ class AdcSample(Sample):
     """Raw value at full scale."""
     volts: float
     """Voltage at the input, as configured for full scale."""
+
+
+class InputsSample(Sample):
+    """The inputs of a drive and its amplifier enable, which every poll carries; null while one is not shown."""
+
+    reverse_limit: bool | None
+    """Level of the reverse limit switch input; true is high. A Logosol drive shows it while its power driver is on."""
+    forward_limit: bool | None
+    """Level of the forward limit switch input; likewise."""
+    index: bool | None
+    """Level of the encoder's index; true is high."""
+    stop_input: bool | None
+    """The stop input is open, which keeps the motor off; a Logosol drive shows it while its power driver is off."""
+    amplifier_enable: bool | None
+    """The amplifier enable that the drive holds; null when it is not known, such as after a lost acknowledgement."""
+
+
+class LatchSample(Sample):
+    """What a probe has latched; published once for each probe that found something."""
+
+    value: float
+    """Position in axis units."""
+    unit: str
+    """The axis unit."""
+    counts: int
+    """Raw encoder counts of the drive."""
+    error: float = Field(ge=0)
+    """The edge lies up to this far before `value`, in axis units: the way of a servo cycle at the probe's velocity, and
+    a count. What the input circuit delays comes on top."""
+    sources: tuple[str, ...]
+    """What it can have been."""
+    command_id: str
+    """Of the probe."""
 
 
 class FaultEntry(Frozen):
@@ -210,6 +247,8 @@ SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {
     TelemetryItem.POSITION: PositionSample,
     TelemetryItem.VELOCITY: VelocitySample,
     TelemetryItem.ADC: AdcSample,
+    TelemetryItem.INPUTS: InputsSample,
+    TelemetryItem.LATCH: LatchSample,
     TelemetryItem.FAULT: FaultSample,
     TelemetryItem.STATE: StateSample,
 }

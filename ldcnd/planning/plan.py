@@ -14,8 +14,8 @@ from ldcnd.config.axis import AxisConfig, RatesConfig
 from ldcnd.config.bus import BAUDS, BusConfig
 from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.costs import price_list
-from ldcnd.drivers.ldcn.network import RESET_BAUD
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, actual_baud, baud_divisor
+from ldcnd.drivers.ldcn.profiles import CYCLE_CLOCKS
+from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.errors import ConfigError, ValueOutOfRange
 from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigBudget
@@ -89,7 +89,8 @@ def servo_cycle(bus: BusConfig) -> ServoCycle | None:
     """Return the cycle that polls of the line are ordered by; None where they are not."""
     if bus.family != "ldcn" or bus.order != "phase":
         return None
-    return ServoCycle(SERVO_CYCLE_S, bus.baud / actual_baud(baud_divisor(bus.baud, BaudCodes(bus.divisors))))
+    divisor = baud_divisor(bus.baud, BaudCodes(bus.divisors), bus.clock_hz)
+    return ServoCycle(CYCLE_CLOCKS / bus.clock_hz, bus.baud / actual_baud(divisor, bus.clock_hz))
 
 
 def with_probes_that_fit(bus: BusConfig) -> BusConfig:
@@ -135,7 +136,7 @@ def _line(bus: BusConfig) -> _Line:
 def _prices(bus: BusConfig, baud: int) -> Mapping[str, PriceList]:
     codes = BaudCodes(bus.divisors)
     models = {axis.model for axis in bus.axis}
-    return MappingProxyType({model: price_list(model, baud, codes) for model in sorted(models)})
+    return MappingProxyType({model: price_list(model, baud, codes, bus.clock_hz) for model in sorted(models)})
 
 
 def _timing(bus: BusConfig, baud: int, prices: Mapping[str, PriceList]) -> LineTiming:
@@ -167,12 +168,13 @@ def _urgent(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList])
     commands = [cost_of(exchange, timing) for price in prices.values() for exchange in price.commands.values()]
     stops = [cost_of(price.stop, timing) for price in prices.values() if price.stop]
     byte_s = timing.bits_per_byte / timing.host_baud
+    at_reset = baud_at_reset(bus.clock_hz)
     return Urgent(
         command_s=max(command.longest_s for command in commands),
         stop_s=max((stop.longest_s for stop in stops), default=0.0),
         recovery_s=max(len(price.flush) * byte_s + price.settle_s for price in prices.values()),
         margin_s=bus.margin_ms / 1000,
-        search_s=cost_of(_slowest(prices).probe, replace(timing, host_baud=RESET_BAUD, node_baud=RESET_BAUD)).longest_s,
+        search_s=cost_of(_slowest(prices).probe, replace(timing, host_baud=at_reset, node_baud=at_reset)).longest_s,
         probe=_probe(bus, timing, prices),
     )
 

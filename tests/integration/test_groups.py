@@ -247,8 +247,10 @@ async def test_a_snapshot_shows_one_instant_of_moving_axes():
         await line.network.start_group(dict.fromkeys(line.network.axes, THERE), wanted)
         await asyncio.sleep(0.5)
 
-        frozen = await line.network.snapshot()
+        frozen = await line.network.snapshot(wanted)
 
+    assert frozen.until_s - frozen.from_s < 0.004
+    frozen = frozen.counts
     assert frozen.keys() == {"a1", "a2", "a3", "a4"}
     assert min(frozen.values()) > 5000
     # at 20000 counts a second two servo cycles are 20 counts; five packets in between would be hundreds
@@ -261,7 +263,7 @@ async def test_no_snapshot_unless_configured():
         await up(line)
 
         with pytest.raises(NotSupported, match="not configured"):
-            await line.network.snapshot()
+            await line.network.snapshot(wanted)
 
 
 async def test_no_snapshot_while_a_homing_runs():
@@ -271,7 +273,7 @@ async def test_no_snapshot_while_a_homing_runs():
         await line.network.axes["a2"].load(Motion(None, 100.0, 1000.0), home=HomeCapture(HomeMethod.INDEX))
 
         with pytest.raises(WrongState, match="a2 is homing"):
-            await line.network.snapshot()
+            await line.network.snapshot(wanted)
 
         assert Command.SAVE_CURRENT_POSITION_AS_HOME not in {packet.command for packet in line.sent()}
 

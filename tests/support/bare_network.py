@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec, Gains
-from ldcnd.drivers.ldcn.network import RESET_BAUD, LdcnNetwork
+from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
+from ldcnd.drivers.ldcn.registers import RESET_BAUD
 from ldcnd.drivers.line import LineSpec
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line

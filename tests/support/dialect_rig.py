@@ -1,9 +1,10 @@
 """A whole daemon with one simulated drive of any LDCN/NMC dialect, and the drive itself to look at and to hurt."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TypeVar
 
 from ldcnd.config.rig import RigConfig
@@ -14,6 +15,7 @@ from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.rig import RunningRig, running_rig
 
@@ -102,6 +104,8 @@ async def dialect_rig(
     plant: MotorPlant = PLANT,
     start_counts: float = 0.0,
     faults: FaultPlan = FaultPlan(),  # noqa: B008 - immutable
+    line: Mapping[str, object] = MappingProxyType({}),
+    settings: ModuleSettings | None = None,
     **axis: object,
 ) -> AsyncIterator[DialectRig]:
     """Run a daemon with one axis of this dialect.
@@ -111,15 +115,17 @@ async def dialect_rig(
         plant: the machine on its shaft.
         start_counts: where the shaft stands at power-up; the drive counts from 0 there.
         faults: of the line.
+        line: overrides and additions to the configuration of the line.
+        settings: quirks of the simulated drive; those of the model when missing.
         axis: overrides and additions to the axis's configuration.
     """
-    settings = replace(model(dialect.module)[1], version=dialect.version)
+    settings = settings or replace(model(dialect.module)[1], version=dialect.version)
     chain = build_chain(ChainSpec((ModuleSpec(dialect.module, plant, settings),), faults=faults))
     drive = chain.modules[0]
     assert isinstance(drive, SimulatedDrive)
     drive.shaft.position_counts = start_counts
     drive.restart()
-    async with running_rig(_config(dialect, axis), {"line": chain}) as rig:
+    async with running_rig(_config(dialect, axis, line=line), {"line": chain}) as rig:
         yield DialectRig(rig, chain, drive)
 
 
@@ -131,7 +137,12 @@ async def adopting_rig(dialect: Dialect, before: DialectRig, **axis: object) -> 
         yield DialectRig(rig, before.chain, before.drive)
 
 
-def _config(dialect: Dialect, axis: dict[str, object], start: str = "reset") -> RigConfig:
+def _config(
+    dialect: Dialect,
+    axis: dict[str, object],
+    start: str = "reset",
+    line: Mapping[str, object] = MappingProxyType({}),
+) -> RigConfig:
     return RigConfig.model_validate(
         {
             "rig": "dialect",
@@ -158,6 +169,7 @@ def _config(dialect: Dialect, axis: dict[str, object], start: str = "reset") -> 
                         | axis
                     ],
                 }
+                | dict(line)
             ],
         }
     )

@@ -24,7 +24,7 @@ class _Drive:
     """All that planning asks of a driver."""
 
     home_methods = frozenset({HomeMethod.INDEX, HomeMethod.REVERSE_LIMIT})
-    index_sample_s = 0.000512
+    capture_s = 0.000512
 
 
 def axis(**more):

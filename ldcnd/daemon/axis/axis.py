@@ -30,7 +30,7 @@ from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.driver import AxisDriver, AxisReading, Fault, StopMode
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, TooManyRequests
+from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.commands import (
@@ -46,6 +46,7 @@ from ldcnd.model.commands import (
     Verb,
 )
 from ldcnd.model.events import ALARM_HISTORY, CommandStatus
+from ldcnd.model.rig_commands import FrozenPosition
 from ldcnd.model.samples import LinkState, Moving, TelemetryItem
 
 log = get_logger("axis")
@@ -190,6 +191,8 @@ class AxisService:
             self.scale,
             adc_full_scale=driver.adc_full_scale,
             adc_volts=config.adc_volts,
+            shows_inputs=driver.shows_inputs,
+            modulo=config.modulo,
         )
         self._gate = Gate(driver, self.tracker)
         self._bus = bus
@@ -315,6 +318,16 @@ class AxisService:
         reason = f"{alarm.text}: new in the alarm history of the drive"
         self._note(self.config.name, ALARM_HISTORY, CommandStatus.FAILED, reason, alarm.code)
 
+    def frozen_at(self, counts: int) -> FrozenPosition:
+        """Return a position that was frozen in the drive, as the reply to a snapshot has it."""
+        return FrozenPosition(
+            axis=self.config.name,
+            position=self.telemetry.within_turn(self.telemetry.position(counts))[0],
+            counts=counts,
+            unit=self.config.unit,
+            referenced=self.tracker.referenced,
+        )
+
     @property
     def at_work(self) -> bool:
         """Whether it carries out a command, moves, or may move for all that is known."""
@@ -376,6 +389,9 @@ class AxisService:
         if move.buffer_mode is BufferMode.ABORTING and self.tracker.command:
             permit.ask_to_move()
             self._commands.check(move)
+            if self._commands.retargets(move):
+                self._overtake(permit)
+                return await execute()
             await self.bring_to_rest(StopMode.SMOOTH, by=permit)
         async with self._successors:  # those who wait are served in the order in which they came
             while self.tracker.command:
@@ -411,10 +427,7 @@ class AxisService:
         """
         if not self.stoppable:
             return False
-        self._gate.overtake(by)
-        self._changed.set()
-        overtaken = self._gate.overtaken("a queued command")
-        self._turns.refuse(overtaken)
+        overtaken = self._overtake(by)
         if self._pending is None or STRENGTH[mode] > STRENGTH[self._pending]:
             self._pending = mode
         try:
@@ -426,6 +439,14 @@ class AxisService:
             if self._pending is not None:
                 self._not_confirmed()
             self.telemetry.state(self._clock.now_ns())
+
+    def _overtake(self, by: Permit | None) -> StopLatched:
+        """Make void what is queued and what was permitted, but to the one that asks for it; return the refusal."""
+        self._gate.overtake(by)
+        self._changed.set()
+        overtaken = self._gate.overtaken("a queued command")
+        self._turns.refuse(overtaken)
+        return overtaken
 
     @property
     def stop_is_pending(self) -> bool:

@@ -8,11 +8,12 @@ from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
 from ldcnd.daemon.axis.procedures.home import HomeSequence
-from ldcnd.daemon.axis.procedures.jog import Jog, jogs
+from ldcnd.daemon.axis.procedures.jog import COUNTER_SHARE, Jog, jogs
+from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import AxisReading, Gains, StopMode
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, StopMode
 from ldcnd.errors import (
     DriveFault,
     NotSupported,
@@ -27,6 +28,7 @@ from ldcnd.errors import (
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import (
     AxisCommand,
+    BufferMode,
     CommandReply,
     Halt,
     Home,
@@ -36,6 +38,7 @@ from ldcnd.model.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
+    Probe,
     Reset,
     SetGains,
     SetOutputs,
@@ -50,6 +53,8 @@ STEP_RETRY_S = 0.2
 """A step whose packets were lost is taken again so much later,"""
 BLIND_RETRY_S = 1.0
 """or so much later while the drive does not answer at all."""
+MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
+"""Trapezoids in the drive."""
 
 
 class AxisCommands:
@@ -108,6 +113,8 @@ class AxisCommands:
                 return GroupMember(self._motion, turn, request)
             case Home():
                 return HomeSequence(self._motion, turn, request)
+            case Probe():
+                return ProbeMove(self._motion, turn, request)
             case MoveAnalog():
                 return AnalogMove(self._motion, turn, request)
             case SetPwm():
@@ -266,6 +273,27 @@ class AxisCommands:
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
+    def retargets(self, request: Move) -> bool:
+        """Tell whether the drive goes on from the motion under way to this one, without a halt in between.
+
+        PIC-SERVO SC takes goal, velocity and acceleration of a trapezoid at any time and keeps both limits (later
+        vendor data sheets); on other drives a trapezoid loaded in mid-move is erratic (PIC-SERVO manual, 4.4).
+        """
+        tracker = self._tracker
+        return (
+            self._driver.retargets
+            and request.buffer_mode is BufferMode.ABORTING
+            and tracker.command is not None
+            and tracker.command.verb in MOVES
+            and tracker.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
+        )
+
+    def _check_may_start(self, request: Move) -> None:
+        if self.retargets(request) or (isinstance(request, MoveVelocity) and jogs(self._tracker)):
+            guards.check_may_follow(self._tracker.view())
+        else:
+            guards.check_may_move(self._tracker.view())
+
     def check(self, request: Move) -> None:
         """Refuse a move that could not follow what the axis is doing now; nothing is halted for it.
 
@@ -282,30 +310,28 @@ class AxisCommands:
                 self._plan_velocity(request)
 
     async def _move_absolute(self, turn: Turn, request: MoveAbsolute) -> CommandReply:
-        guards.check_may_move(self._tracker.view())
+        self._check_may_start(request)
         return await self._move(turn, self._plan_absolute(request), AxisState.DISCRETE_MOTION)
 
     async def _move_relative(self, turn: Turn, request: MoveRelative) -> CommandReply:
-        guards.check_may_move(self._tracker.view())
+        self._check_may_start(request)
         if self._motion.target_counts is None:
             here = (await self._motion.read()).position_counts  # one reading alone may be wrong
             turn.still_wanted()
-            guards.check_may_move(self._tracker.view())
+            self._check_may_start(request)
             return await self._move(turn, self._plan_relative(request, here), AxisState.DISCRETE_MOTION)
         return await self._move(turn, self._plan_relative(request), AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
-        if jogs(self._tracker):  # on a drive that takes a new trapezoid in mid-move
-            guards.check_may_follow(self._tracker.view())
-        else:
-            guards.check_may_move(self._tracker.view())
+        self._check_may_start(request)
         velocity, bounded = self._plan_velocity(request)
         reply = await self._move(turn, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity})
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
         guards.check_referenced(self._tracker.view())
-        return self._motion.plan_to(request.position, request.velocity, request.acceleration)
+        position = self._motion.unwrapped(request.position, request.direction)
+        return self._motion.plan_to(position, request.velocity, request.acceleration)
 
     def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
         motion = self._motion
@@ -322,7 +348,8 @@ class AxisCommands:
         end = planner.limit_ahead(request.velocity) if view.referenced else None
         if end is None:
             here = self._motion.telemetry.position(self._motion.latest().position_counts)
-            end = here + request.velocity * self._motion.config.jog_horizon_s
+            longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(plan.motion.velocity_counts_per_s)
+            end = here + request.velocity * min(self._motion.config.jog_horizon_s, longest_s)
         return plan.velocity, self._motion.plan_to(end, abs(request.velocity), request.acceleration)
 
     async def _move(
@@ -337,7 +364,7 @@ class AxisCommands:
         self._motion.target_counts = plan.motion.target_counts
         return self._motion.reply(turn).model_copy(
             update={
-                "position": plan.position,
+                "position": self._motion.shown(plan.position),
                 "velocity": plan.velocity,
                 "acceleration": plan.acceleration,
                 "duration_s": plan.duration_s,

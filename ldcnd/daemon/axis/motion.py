@@ -17,23 +17,29 @@ from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
-from ldcnd.drivers.driver import AxisReading, Motion
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Motion
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import (
     BusError,
     MalformedRequest,
+<<<<<<< HEAD
     OutcomeUnknown,
     Remedy,
     RequestRefused,
     ValueOutOfRange,
     WrongState,
     step,
+=======
+    NotSupported,
+    OutcomeUnknown,
+    RequestRefused,
+    ValueOutOfRange,
+    WrongState,
+>>>>>>> 88b1ee1 (Add snapshot, probe, inputs, new goals on the fly, rotary axes, clocks and baud divisors)
 )
 from ldcnd.messaging.codec import error_reply
-from ldcnd.model.commands import CommandReply, Preview, PreviewReply, Verb
+from ldcnd.model.commands import CommandReply, Direction, Preview, PreviewReply, Verb
 from ldcnd.model.samples import AxisState
-
-LARGEST_COUNT = 0x7FFFFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +89,16 @@ class MotionPlanner:
         if view.referenced:
             check_position(view, self._config.limits, position)
         target = round(self._scale.to_counts(position) + origin_counts)
-        if abs(target) > LARGEST_COUNT or abs(target - from_counts) > LARGEST_COUNT:
+        if abs(target - from_counts) > LARGEST_COUNT:
+            nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
             raise ValueOutOfRange(
-                f"axis {view.name}: target {position:g} {view.unit} is {target} counts, beyond the drive's"
-                " 32-bit counter",
+                f"axis {view.name}: target {position:g} {view.unit} is {abs(target - from_counts)} counts away, farther"
+                " than the drive's 32-bit counter reaches",
                 axis=view.name,
                 value=position,
                 limit=LARGEST_COUNT,
-                remedy="move the other way, or switch the drive off and on, which sets its counter to 0, and home",
+                nearest=self._scale.to_units(nearest - origin_counts),
+                remedy="move there in parts",
             )
         counts_per_unit = self._scale.counts_per_unit
         motion = self._driver.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
@@ -212,11 +220,47 @@ class AxisMotion:
         return self.reading
 
     def counts_of(self, position: float) -> int:
-        """Return the count of the drive that a position in axis units stands for."""
+        """Return the count of the drive that a position stands for; on an axis with a modulo the nearest of them."""
+        position = self.unwrapped(position)
         return round(self.scale.to_counts(position) + self.telemetry.origin_counts)
 
+    def unwrapped(self, position: float, direction: Direction | None = None) -> float:
+        """Return the position, counted through all turns, to which a request means to go.
+
+        Without a modulo that is the position itself. With one it is counted from where the axis is told to be: a
+        position where it already is, to a count, is no way to go in any direction.
+
+        Raises:
+            NotSupported: a direction, and the axis has no modulo.
+        """
+        modulo = self.config.modulo
+        if modulo is None:
+            if direction is not None:
+                raise NotSupported(
+                    f"axis {self.config.name} has no modulo: its positions have no direction",
+                    axis=self.config.name,
+                    value=direction.value,
+                    remedy="leave direction out, or configure modulo",
+                )
+            return position
+        here_counts = self.latest().position_counts if self.target_counts is None else self.target_counts
+        here = self.telemetry.position(here_counts)
+        forward = (position - here) % modulo
+        count = 1.0 / self.scale.counts_per_unit
+        if forward < count or modulo - forward < count:
+            way = forward if forward < count else forward - modulo
+        elif direction is Direction.NEGATIVE or (direction is not Direction.POSITIVE and forward > modulo / 2):
+            way = forward - modulo
+        else:
+            way = forward
+        return here + way
+
+    def shown(self, position: float | None) -> float | None:
+        """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
+        return None if position is None else self.telemetry.within_turn(position)[0]
+
     def plan_to(self, position: float, velocity: float | None, acceleration: float | None) -> MotionPlan:
-        """Plan a trapezoid from where the axis is to a position in axis units; raises as `MotionPlanner`."""
+        """Plan a trapezoid from where the axis is to a position (through all turns); raises as `MotionPlanner`."""
         return self.planner.to_position(
             self.tracker.view(),
             position,
@@ -261,7 +305,7 @@ class AxisMotion:
     ) -> None:
         """Say what the axis is about to do; readings count again once `AxisTracker.started` was called."""
         self.target_counts = None
-        target, duration_s = (plan.position, plan.duration_s) if plan else (None, None)
+        target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
         now_ns = self.clock.now_ns()
         command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s)
         self.tracker.begin(command, float("inf"))
@@ -318,7 +362,7 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
         axis=name,
         refusal=None,
         obstacles=obstacles,
-        position=plan.position,
+        position=motion.shown(plan.position),
         velocity=plan.velocity,
         velocity_error=plan.velocity - asked_velocity,
         acceleration=plan.acceleration,
@@ -332,7 +376,7 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
 def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
     match request.position, request.distance, request.velocity:
         case float() as position, None, velocity:
-            return motion.plan_to(position, velocity, request.acceleration)
+            return motion.plan_to(motion.unwrapped(position, request.direction), velocity, request.acceleration)
         case None, float() as distance, velocity:
             here = motion.telemetry.position(motion.latest().position_counts)
             return motion.plan_to(here + distance, velocity, request.acceleration)

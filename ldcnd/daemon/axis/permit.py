@@ -16,6 +16,7 @@ from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.driver import (
     AnalogMotion,
     AxisDriver,
+    AxisReading,
     AxisSpec,
     Gains,
     HomeCapture,
@@ -59,11 +60,13 @@ class QuietDrive(Protocol):
     retargets: bool
 
     @property
-    def index_sample_s(self) -> float: ...  # noqa: D102 - of `AxisDriver`, as all of these
+    def capture_s(self) -> float: ...  # noqa: D102 - of `AxisDriver`, as all of these
     def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `AxisDriver`, as all of these
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
     async def stop(self, mode: StopMode) -> None: ...  # noqa: D102
     async def captured_home(self) -> int: ...  # noqa: D102
+    def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool: ...  # noqa: D102
     async def reset(self) -> None: ...  # noqa: D102
     async def clear_warnings(self) -> None: ...  # noqa: D102
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None: ...  # noqa: D102

@@ -12,6 +12,8 @@ from ldcnd.model.samples import (
     CurrentCommand,
     FaultEntry,
     FaultSample,
+    InputsSample,
+    LatchSample,
     LinkState,
     MonitorSample,
     Moving,
@@ -23,6 +25,8 @@ from ldcnd.model.samples import (
 )
 
 StateKey = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None]
+Inputs = tuple[bool | None, bool | None, bool | None, bool | None, bool | None]
+"""Reverse limit, forward limit, index, stop input, amplifier enable."""
 FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
 
 # five of each poll, of values that are checked when they come off the wire
@@ -31,13 +35,22 @@ _velocity_sample = unchecked(VelocitySample)
 _adc_sample = unchecked(AdcSample)
 _state_sample = unchecked(StateSample)
 _fault_sample = unchecked(FaultSample)
+_inputs_sample = unchecked(InputsSample)
 
 
 class AxisTelemetry:
     """Publishes one axis; states and faults go out when they change and at their own rate in between."""
 
     def __init__(
-        self, publisher: Publisher, tracker: AxisTracker, scale: Scale, *, adc_full_scale: int | None, adc_volts: float
+        self,
+        publisher: Publisher,
+        tracker: AxisTracker,
+        scale: Scale,
+        *,
+        adc_full_scale: int | None,
+        adc_volts: float,
+        shows_inputs: bool,
+        modulo: float | None,
     ) -> None:
         self.origin_counts = 0.0
         self._publisher = publisher
@@ -46,22 +59,36 @@ class AxisTelemetry:
         self._adc_full_scale = adc_full_scale
         self._adc_volts = adc_volts
         self._velocity_unit = f"{tracker.unit}/s"
-        self._position, self._velocity, self._adc, self._state, self._faults = (
+        self._position, self._velocity, self._adc, self._inputs, self._state, self._faults = (
             publisher.item(tracker.name, item)
             for item in (
                 TelemetryItem.POSITION,
                 TelemetryItem.VELOCITY,
                 TelemetryItem.ADC,
+                TelemetryItem.INPUTS,
                 TelemetryItem.STATE,
                 TelemetryItem.FAULT,
             )
         )
         self._last_state: StateKey | None = None
         self._last_faults: FaultKey | None = None
+        self._shows_inputs = shows_inputs
+        self._modulo = modulo
+        self._last_inputs: Inputs | None = None
 
     def position(self, counts: float) -> float:
-        """Return the position in axis units that a count of the drive stands for."""
+        """Return the position that a count of the drive stands for, in axis units, counted through all turns."""
         return self._scale.to_units(counts - self.origin_counts)
+
+    def within_turn(self, position: float) -> tuple[float, int | None]:
+        """Return a position as clients see it, and how many whole turns lie below it; None without a modulo."""
+        modulo = self._modulo
+        if modulo is None:
+            return position, None
+        turns, value = divmod(position, modulo)
+        if value >= modulo:  # so rounds what lies less than a hair below a turn
+            turns, value = turns + 1, 0.0
+        return value, int(turns)
 
     def reading(self, reading: AxisReading, asked: frozenset[TelemetryItem], t: int, t_error_ns: int) -> None:
         """Publish what was asked for, and the state if it changed."""
@@ -69,7 +96,9 @@ class AxisTelemetry:
         quality = tracker.quality
         counts, velocity, adc = reading.position_counts, reading.velocity_counts_per_s, reading.adc_counts
         if TelemetryItem.POSITION in asked:
-            lag = reading.following_error_counts
+            lag, value, turns = reading.following_error_counts, self.position(counts), None
+            if self._modulo is not None:
+                value, turns = self.within_turn(value)
             topic = self._position
             topic.publish(
                 _position_sample(
@@ -77,8 +106,9 @@ class AxisTelemetry:
                     t_error_ns=t_error_ns,
                     seq=topic.seq,
                     quality=quality,
-                    value=self.position(counts),
+                    value=value,
                     unit=tracker.unit,
+                    turns=turns,
                     counts=counts,
                     following_error=None if lag is None else scale.to_units(lag),
                 )
@@ -110,7 +140,32 @@ class AxisTelemetry:
                     volts=adc / full_scale * self._adc_volts,
                 )
             )
-        self.state(t, t_error_ns, due=TelemetryItem.STATE in asked)
+        due = TelemetryItem.STATE in asked
+        inputs = (
+            reading.reverse_limit,
+            reading.forward_limit,
+            reading.index,
+            reading.stop_input,
+            reading.amplifier_enable,
+        )
+        if self._shows_inputs and (due or inputs != self._last_inputs):
+            self._last_inputs = inputs
+            reverse, forward, index, stop_input, amplifier_enable = inputs
+            topic = self._inputs
+            topic.publish(
+                _inputs_sample(
+                    t=t,
+                    t_error_ns=t_error_ns,
+                    seq=topic.seq,
+                    quality=quality,
+                    reverse_limit=reverse,
+                    forward_limit=forward,
+                    index=index,
+                    stop_input=stop_input,
+                    amplifier_enable=amplifier_enable,
+                )
+            )
+        self.state(t, t_error_ns, due=due)
 
     def state(self, t: int, t_error_ns: int = 0, *, due: bool = False) -> None:
         """Publish state and faults if they changed, or if they are due anyway."""
@@ -153,9 +208,14 @@ class AxisTelemetry:
             )
         )
 
+    def latched(self, sample: LatchSample) -> None:
+        """Publish what a probe has latched, with the next number of its topic."""
+        topic = self._publisher.item(self._tracker.name, TelemetryItem.LATCH)
+        topic.publish(sample.model_copy(update={"seq": topic.seq}))
+
     def stale(self, t: int) -> None:
         """Publish the last values once more as what they are now: not measurements any more."""
-        for topic in (self._position, self._velocity, self._adc):
+        for topic in (self._position, self._velocity, self._adc, self._inputs):
             topic.publish_again(self._tracker.quality)
         self.state(t)
 

@@ -54,6 +54,7 @@ from ldcnd.model.rig_commands import (
     Rehearse,
     Release,
     Renew,
+    Snapshot,
 )
 
 
@@ -114,6 +115,8 @@ class Dispatcher:
                 return self._rig.axis(axis).preview(command, tuple(cause.text for cause in why.causes))
             case MoveTogether():
                 return MoveTogetherReply(replies=await self._move_together(command, login))
+            case Snapshot():
+                return await self._rig.line(command.bus).snapshot(self._clock)
             case Rehearse():
                 self._admit_rehearsal(command)
                 return await rehearse(self._rig, command)

@@ -21,7 +21,6 @@ from ldcnd.drivers.ldcn.addressing import (
     EVERYBODY,
     NULLS,
     NULLS_SETTLE_S,
-    RESET_BAUD,
     UNADDRESSED,
     Identity,
     LineRate,
@@ -30,7 +29,7 @@ from ldcnd.drivers.ldcn.addressing import (
 )
 from ldcnd.drivers.ldcn.commands import Node, unanswered
 from ldcnd.drivers.ldcn.profiles import Profile, Support
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes
+from ldcnd.drivers.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem
 from ldcnd.drivers.smartstep.commissioning import examine

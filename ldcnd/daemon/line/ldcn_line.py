@@ -9,7 +9,8 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.config.bus import BusConfig
 from ldcnd.config.rig import RigConfig, SimulatedLineConfig
 from ldcnd.drivers.driver import AxisSpec, Gains
-from ldcnd.drivers.ldcn.network import RESET_BAUD, LdcnNetwork
+from ldcnd.drivers.ldcn.network import LdcnNetwork
+from ldcnd.drivers.ldcn.registers import baud_at_reset
 from ldcnd.drivers.line import GroupSpec, LineSpec, ModuleEntry
 from ldcnd.planning.plan import servo_cycle
 from ldcnd.sim.chain import Chain
@@ -33,7 +34,7 @@ def build_ldcn_line(
         chains: simulated lines that exist already, by name.
         opener: opens the line instead of its port.
     """
-    opening_baud = settings.baud if settings.port.startswith(SOCKET) else RESET_BAUD
+    opening_baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
     bus = Bus(
         BusSettings(
             settings.name,
@@ -59,6 +60,7 @@ def _line(settings: BusConfig) -> LineSpec:
         start=settings.start,
         adopt_fallback=settings.adopt_fallback,
         alternate_divisors=settings.divisors == "alternate",
+        clock_hz=settings.clock_hz,
         snapshot=settings.snapshot,
         modules=tuple(ModuleEntry(module.address, module.model, module.identity) for module in settings.module),
         groups=tuple(GroupSpec(group.name, group.axes, group.leader) for group in settings.group),

@@ -9,10 +9,13 @@ from ldcnd.bus.poller import Poller, Priority
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.polling import AxisPoller
+from ldcnd.daemon.clock import Clock
 from ldcnd.drivers.driver import ReadingListeners, StopMode
 from ldcnd.drivers.network import BringUpReport, Network
-from ldcnd.errors import BusError, LdcndError
+from ldcnd.errors import BusDown, BusError, LdcndError, WrongState
 from ldcnd.log import get_logger
+from ldcnd.model.commands import Verb
+from ldcnd.model.rig_commands import SnapshotReply
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.planning.plan import wanted_rates_hz
 from ldcnd.wirelog.recorder import WireEvent
@@ -24,6 +27,8 @@ LONGEST_RETRY_S = 10.0
 FIRST_LOOK_S = 0.25
 LONGEST_LOOK_S = 2.0
 """Longest pause between two looks for drives that have gone: what powers up must be back within 3 s."""
+CAPTURING = frozenset({Verb.HOME, Verb.PROBE})
+"""Commands that wait for a capture in the drive's home register."""
 LOOK_SHARE = 0.01
 """Of the line's time, for these looks; more where the longest pause is too short for that."""
 
@@ -95,6 +100,37 @@ class BusService:
             await self.network.stop_together(mode, names)
         except BusError as error:
             log.warning("group stop not sent", bus=self.bus.settings.name, reason=error.message)
+
+    async def snapshot(self, clock: Clock) -> SnapshotReply:
+        """Return the positions of all axes at one instant; moves nothing.
+
+        Raises:
+            NotSupported, WrongState, BusError: as `Network.snapshot`; BusDown while the line is not up.
+        """
+        name = self.bus.settings.name
+        if self.report is None:
+            raise BusDown(f"bus {name} is not up: {self.problem}", value=name, remedy="see `ldcnd bus list`")
+        instant = await self.network.snapshot(self._check_registers)
+        t, t_error_ns = clock.stamp_between(instant.from_s, instant.until_s)
+        positions = tuple(axis.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
+        return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions)
+
+    def _check_registers(self) -> None:
+        """Refuse to overwrite a register in which a command waits for a capture.
+
+        Raises:
+            WrongState: an axis is homing or probing.
+        """
+        for axis in self.axes:
+            command = axis.tracker.command
+            if command and command.verb in CAPTURING:
+                name = axis.config.name
+                raise WrongState(
+                    f"axis {name} carries out {command.verb}: its home register is in use",
+                    axis=name,
+                    value=command.verb.value,
+                    remedy="wait until it has ended",
+                )
 
     def reconfigure(self, configs: Mapping[str, AxisConfig]) -> None:
         """Take other limits, speeds, rates and priorities of axes, by name."""

@@ -12,6 +12,7 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.contract import all_schemas
 from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.drivers.driver import AxisDriver
 from ldcnd.errors import ErrorCode, MalformedRequest
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
@@ -210,10 +211,11 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         unit=config.unit,
         counts_per_unit=config.counts_per_unit,
         direction=config.direction,
+        modulo=config.modulo,
         limits=config.limits,
         group=group,
         capabilities=tuple(sorted(driver.capabilities, key=list(Verb).index)),
-        items=tuple(item.value for item in TelemetryItem if item is not TelemetryItem.ADC or driver.adc_full_scale),
+        items=tuple(item.value for item in TelemetryItem if _publishes(driver, item)),
         adc_full_scale=driver.adc_full_scale,
         monitors=tuple(name.value for name in driver.monitors),
         trace_channels=axis.traces.channels,
@@ -223,6 +225,18 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
             for register in driver.registers()
         ),
     )
+
+
+def _publishes(driver: AxisDriver, item: TelemetryItem) -> bool:
+    match item:
+        case TelemetryItem.ADC:
+            return bool(driver.adc_full_scale)
+        case TelemetryItem.INPUTS:
+            return driver.shows_inputs
+        case TelemetryItem.LATCH:
+            return Verb.PROBE in driver.capabilities
+        case _:
+            return True
 
 
 def command_list() -> CommandList:

@@ -12,6 +12,8 @@ QOS = {
     TelemetryItem.POSITION: Qos.TELEMETRY,
     TelemetryItem.VELOCITY: Qos.TELEMETRY,
     TelemetryItem.ADC: Qos.TELEMETRY,
+    TelemetryItem.INPUTS: Qos.EVENT,
+    TelemetryItem.LATCH: Qos.EVENT,
     TelemetryItem.FAULT: Qos.EVENT,
     TelemetryItem.STATE: Qos.EVENT,
 }

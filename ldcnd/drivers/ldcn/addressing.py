@@ -15,8 +15,8 @@ from typing import TypeVar
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
-from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
-from ldcnd.drivers.ldcn.registers import BaudCodes
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
+from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset
 from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
 from ldcnd.drivers.line import GroupSpec
 from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
@@ -169,10 +169,9 @@ class GroupPlan:
         return tuple(group for group in self.groups if group.members <= names)
 
 
-RESET_BAUD = 19_200
-"""The rate after power-up and Hard Reset."""
-COMMON_BAUDS = (115_200, 57_600, 9600, RESET_BAUD)
-"""Where a crashed host may have left the drives; the last one is where a reset puts them."""
+COMMON_CODES = (0x0A, 0x14, 0x81)
+"""Of the rates at which a crashed host may have left the drives: 115200, 57600 and 9600 baud with the usual clock."""
+COMMON_BAUDS = (115_200, 57_600, 9600)
 FASTEST_BAUD = 230_400
 """PIC-SERVO SC only: it looks the code up and sets exactly this rate."""
 EVERYBODY = 0xFF
@@ -193,20 +192,37 @@ class LineRate:
     Attributes:
         working: where all modules should be.
         groups: the group addresses in use.
+        at_reset: the rate after power-up and Hard Reset.
+        cycle_s: the servo cycle of the modules.
     """
 
-    def __init__(self, bus: Bus, working: int, codes: BaudCodes, groups: tuple[int, ...], *, fastest: bool) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        working: int,
+        codes: BaudCodes,
+        groups: tuple[int, ...],
+        *,
+        fastest: bool,
+        clock_hz: int = CLOCK_HZ,
+    ) -> None:
         self.working = working
-        self._possible: tuple[int, ...] = COMMON_BAUDS
-        if fastest or working == FASTEST_BAUD:
-            self._possible = (FASTEST_BAUD, *COMMON_BAUDS)
+        self.at_reset = baud_at_reset(clock_hz)
+        self.cycle_s = CYCLE_CLOCKS / clock_hz
+        usual = clock_hz == CLOCK_HZ
+        common = COMMON_BAUDS if usual else tuple(round(actual_baud(code, clock_hz)) for code in COMMON_CODES)
+        top = (FASTEST_BAUD,) if fastest or working == FASTEST_BAUD else ()
+        others = dict.fromkeys((*top, *common, working))
+        others.pop(self.at_reset, None)
+        self._possible = (*others, self.at_reset)
+        self._clock_hz = clock_hz
         self.groups = groups
         self._bus = bus
         self._codes = codes
 
     @property
     def candidates(self) -> tuple[int, ...]:
-        """Where they may be and the port can go, the most unlikely first, `RESET_BAUD` last."""
+        """Where they may be and the port can go, the most unlikely first, `at_reset` last."""
         return tuple(baud for baud in self._possible if self._bus.fixed_baud or self._bus.offers(baud))
 
     @property
@@ -234,10 +250,15 @@ class LineRate:
             return
         profile = PIC_SERVO_SC if baud == FASTEST_BAUD else None
         packets = [
-            commands.set_baud(commands.Group(address, profile), baud, self._codes).request for address in self.groups
+            commands.set_baud(commands.Group(address, profile), baud, self._codes, self._clock_hz).request
+            for address in self.groups
         ]
-        burst = spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
-        await self._bus.change_baud(unanswered(EVERYBODY, burst, commands.GROUP_QUIET_S, repeatable=False), baud)
+        quiet_s = commands.group_quiet_s(self.cycle_s)
+        await self._bus.change_baud(unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False), baud)
+
+    def spaced(self, packets: list[bytes]) -> bytes:
+        """Return group packets as one piece, a servo cycle apart at the present rate."""
+        return spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud, self.cycle_s)
 
     async def who_is(self, address: int, *, patient: bool = False) -> Identity | None:
         """Ask an address who it is at the host's rate; None when nobody answers.
@@ -281,13 +302,14 @@ class Addressing:
     """Gives modules their addresses; neither of the procedures moves a motor.
 
     Attributes:
+        rate: who is at which rate.
         had_address: addresses of modules that may have had theirs already, as they did not acknowledge getting it.
     """
 
     def __init__(self, bus: Bus, rate: LineRate, plan: GroupPlan) -> None:
         self.had_address: set[int] = set()
         self._bus = bus
-        self._rate = rate
+        self.rate = rate
         self._plan = plan
 
     async def reset_all(self) -> None:
@@ -300,19 +322,19 @@ class Addressing:
         all are called to one rate first, which leaves their address outputs as they are. PIC-SERVO version 4 obeys only
         a reset of the group it is in, so every known group address is reset.
         """
-        for baud in self._rate.candidates:
-            if baud != RESET_BAUD and await self._rate.host_to(baud):
+        for baud in self.rate.candidates:
+            if baud != self.rate.at_reset and await self.rate.host_to(baud):
                 await self.without_leaders()
-                await self._rate.everybody_to(RESET_BAUD)
-        for baud in self._rate.candidates:
-            await self._reset_at(baud, commands.RESET_SETTLE_S if baud == RESET_BAUD else NULLS_SETTLE_S)
+                await self.rate.everybody_to(self.rate.at_reset)
+        for baud in self.rate.candidates:
+            await self._reset_at(baud, commands.RESET_SETTLE_S if baud == self.rate.at_reset else NULLS_SETTLE_S)
         await self._bus.execute(nulls(DRAIN_S))
 
     async def _reset_at(self, baud: int, settle_s: float) -> None:
-        if not await self._rate.host_to(baud):
+        if not await self.rate.host_to(baud):
             return
         packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
-        burst = spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
+        burst = self.rate.spaced(packets)
         for _ in range(2):
             await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
 
@@ -326,7 +348,7 @@ class Addressing:
         for address in range(1, MOST_MODULES + 1):
             if not await (self.address_next(address) if address <= expected else self._address_unexpected(address)):
                 break
-            identity = await self._rate.who_is(address, patient=True)
+            identity = await self.rate.who_is(address, patient=True)
             if identity is None:
                 break
             modules[address] = identity
@@ -349,7 +371,7 @@ class Addressing:
         for _ in range(ADDRESSING_ATTEMPTS):
             if await self._set_address(UNADDRESSED, address):
                 return True
-            if await self._rate.who_is(address, patient=True):
+            if await self.rate.who_is(address, patient=True):
                 self.had_address.add(address)
                 return True
         return False
@@ -357,7 +379,7 @@ class Addressing:
     async def _address_unexpected(self, address: int) -> bool:
         """Address a module that nobody described; tell whether there was one."""
         for _ in range(END_ATTEMPTS):
-            if await self._set_address(UNADDRESSED, address) or await self._rate.who_is(address):
+            if await self._set_address(UNADDRESSED, address) or await self.rate.who_is(address):
                 return True
         return False
 
@@ -370,7 +392,7 @@ class Addressing:
         for _ in range(ADDRESSING_ATTEMPTS):
             if await self._set_address(node, address, leader=self._plan.leads(address)):
                 return True
-            if not await self._rate.who_is(address, patient=True):
+            if not await self.rate.who_is(address, patient=True):
                 return False
         return False
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.addressing import RESET_BAUD, Addressing, Expected, Identity, LineRate, differences
+from ldcnd.drivers.ldcn.addressing import Addressing, Expected, Identity, LineRate, differences
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
@@ -138,7 +138,10 @@ class Adoption:
 
     async def _newcomer(self) -> bool:
         """Tell whether a module waits for its address."""
-        return await self._rate.host_to(RESET_BAUD) and await self._rate.who_is(UNADDRESSED, patient=True) is not None
+        return (
+            await self._rate.host_to(self._rate.at_reset)
+            and await self._rate.who_is(UNADDRESSED, patient=True) is not None
+        )
 
     async def _motion_states(self, watched: Mapping[int, tuple[Found, Profile]]) -> dict[int, Status | None]:
         states: dict[int, Status | None] = dict.fromkeys(watched)
@@ -229,7 +232,7 @@ class Rejoin:
         Raises:
             BusError: the line failed meanwhile.
         """
-        if self._bus.baud != RESET_BAUD and not self._rate.changeable:
+        if self._bus.baud != self._rate.at_reset and not self._rate.changeable:
             return frozenset()  # a newcomer could not hear this port
         if not mute or not await self._anybody_there(mute):
             return frozenset()
@@ -270,7 +273,7 @@ class Rejoin:
 
     async def _anybody_there(self, mute: tuple[Expected, ...]) -> bool:
         """Ask for a newcomer at 19200 baud, and for one of those that may have strayed."""
-        found = await self._rate.who_is_at(RESET_BAUD, UNADDRESSED)
+        found = await self._rate.who_is_at(self._rate.at_reset, UNADDRESSED)
         if found and (found != self._foreign or mute[0].accepts(found)):
             return True
         if self._strays:
@@ -280,14 +283,14 @@ class Rejoin:
         return False
 
     def _suspect(self, missing: Iterable[int]) -> None:
-        strays = [(RESET_BAUD, address) for address in missing]
+        strays = [(self._rate.at_reset, address) for address in missing]
         self._strays = deque([(self._rate.working, UNADDRESSED), *strays] * LOOKS_FOR_STRAYS if strays else [])
 
     async def _at_reset_baud(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
         """Address newcomers at the rate of power-up; everybody who hears is at the working rate again afterwards."""
         self._suspect(each.address for each in self._expected)
         await self._addressing.without_leaders()
-        await self._rate.everybody_to(RESET_BAUD)
+        await self._rate.everybody_to(self._rate.at_reset)
         try:
             await self._address_newcomers(lost, addressing)
         except LdcndError:

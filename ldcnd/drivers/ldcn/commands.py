@@ -37,7 +37,7 @@ from ldcnd.drivers.ldcn.packet import (
     encode_packet,
 )
 from ldcnd.drivers.ldcn.path import PathPoint, encode_points
-from ldcnd.drivers.ldcn.profiles import Profile, Support
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, Profile, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, Gains, baud_divisor, encode_gains
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusItem, check_status, status_bytes, status_decoder
 from ldcnd.drivers.ldcn.trajectory import Trajectory, encode_trajectory
@@ -107,7 +107,7 @@ class Node(Destination[Status]):
             reply_bytes=reply_bytes,
             check=check_status,
             decode=status_decoder(self.profile, asked),
-            response_s=SERVO_CYCLE_S,
+            response_s=self.profile.servo_cycle_s,
             repeatable=repeatable,
             total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),
             moves=moves,
@@ -121,10 +121,12 @@ class Group(Destination[None]):
     Attributes:
         address: 0x80 to 0xFF.
         profile: the dialect that all members share; needed only for what not every dialect has alike.
+        cycle_s: their servo cycle.
     """
 
     address: int
     profile: Profile | None = None
+    cycle_s: float = SERVO_CYCLE_S
 
     def __post_init__(self) -> None:
         """Refuse what is not a group address."""
@@ -139,7 +141,7 @@ class Group(Destination[None]):
         moves: bool = False,
     ) -> Exchange[None]:
         """See `Destination`; the manuals ask for 0.51 ms of quiet."""
-        return unanswered(self.address, request, GROUP_QUIET_S, repeatable=repeatable, moves=moves)
+        return unanswered(self.address, request, group_quiet_s(self.cycle_s), repeatable=repeatable, moves=moves)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
@@ -163,14 +165,14 @@ def unanswered(
     )
 
 
-def spaced(packets: Sequence[bytes], byte_s: float) -> bytes:
+def spaced(packets: Sequence[bytes], byte_s: float, cycle_s: float = SERVO_CYCLE_S) -> bytes:
     """Return group packets as one piece in which each is executed before the next one comes.
 
     "The host should wait for at least 0.51 milliseconds before sending another command to keep from overwriting the
     previous command" (PIC-SERVO manual, 4.1). Nulls fill the time: outside a packet modules skip them, and they keep
     the distance whatever an adapter does to the piece as a whole.
     """
-    gap = bytes(math.ceil(SERVO_CYCLE_S / byte_s))
+    gap = bytes(math.ceil(cycle_s / byte_s))
     return gap.join(packets)
 
 
@@ -182,11 +184,17 @@ def _nothing(_data: bytes) -> None:
     return None
 
 
-GROUP_QUIET_S = SERVO_CYCLE_S + HOST_LATE_S
-"""Pause behind a packet to a silent group: 0.51 ms (PIC-SERVO manual, 4.1) from when an adapter has sent it."""
+def group_quiet_s(cycle_s: float = SERVO_CYCLE_S) -> float:
+    """Return the pause behind a packet to a silent group.
+
+    0.51 ms (PIC-SERVO manual, 4.1), which is a servo cycle, from when an adapter has sent it.
+    """
+    return cycle_s + HOST_LATE_S
+
+
 RESET_SETTLE_S = 0.1
 """What a module gets to restart after Hard Reset; the manuals name no time."""
-COMMON_TOP_BAUD = 115_200
+COMMON_TOP_BAUD = 125_000
 """The rate that every dialect reaches."""
 EEPROM_SETTLE_S = 0.3
 """What PIC-SERVO SC gets to write its EEPROM and to restart; the data sheet names no time."""
@@ -382,7 +390,7 @@ def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[Repl
     return _exchange(to, Command.SET_HOMING_MODE, bytes((control,)))
 
 
-def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> Exchange[None]:
+def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> Exchange[None]:
     """Change the rate of all modules; the host changes its own before it sends anything else.
 
     Only for a group without a leader, as the manuals insist: a reply would come at the new rate.
@@ -393,7 +401,7 @@ def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> Excha
     top = to.profile.top_baud if to.profile else COMMON_TOP_BAUD
     if baud > top:
         raise ValueOutOfRange(f"{baud} baud is above {top}", value=baud, limit=top, nearest=top)
-    return _exchange(to, Command.SET_BAUD_RATE, bytes((baud_divisor(baud, codes),)), repeatable=False)
+    return _exchange(to, Command.SET_BAUD_RATE, bytes((baud_divisor(baud, codes, clock_hz),)), repeatable=False)
 
 
 def clear_sticky_bits(to: Destination[ReplyT]) -> Exchange[ReplyT]:

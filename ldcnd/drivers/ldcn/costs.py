@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import NULLS, NULLS_SETTLE_S, read_identity
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.profiles import PROFILES, Support
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PROFILES, Support, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, actual_baud, baud_divisor
 from ldcnd.drivers.ldcn.servo import reading_items
 from ldcnd.drivers.ldcn.status import StatusItem
@@ -25,18 +25,19 @@ ANY_ADDRESS = 1
 """The price is the same at every address."""
 
 
-def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> PriceList:
+def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> PriceList:
     """Return the exchanges of a module at a rate.
 
     Args:
         model: a key of `PROFILES`.
         baud: nominal rate.
         codes: the family of baud rate divisors in use.
+        clock_hz: of the module.
 
     Raises:
         ValueOutOfRange: no divisor makes this rate.
     """
-    profile = PROFILES[model]
+    profile = at_clock(PROFILES[model], clock_hz)
     node = Node(ANY_ADDRESS, profile)
     everything = StatusItem.POSITION | StatusItem.ADC | StatusItem.VELOCITY | StatusItem.AUX | StatusItem.HOME
     common = {
@@ -45,7 +46,7 @@ def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> Pr
     }
     full = profile.support is Support.FULL
     return PriceList(
-        node_baud=actual_baud(baud_divisor(baud, codes)),
+        node_baud=actual_baud(baud_divisor(baud, codes, clock_hz), clock_hz),
         reading=partial(_reading, node),
         commands=MappingProxyType(common | (_servo_commands(node) if full else {})),
         probe=read_identity(ANY_ADDRESS),

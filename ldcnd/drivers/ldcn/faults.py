@@ -17,7 +17,6 @@ from types import MappingProxyType
 from ldcnd.drivers import driver
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 from ldcnd.errors import BadReply
 from ldcnd.model.samples import TelemetryItem
@@ -285,7 +284,7 @@ _MOVE_DONE, _POWER_ON, _LIMIT1, _LIMIT2, _HOMING = map(
         StatusFlag.HOME_IN_PROGRESS,
     ),
 )
-_SERVO_ON, _MOTION_LOCKED = map(int, (AuxFlag.SERVO_ON, AuxFlag.MOTION_LOCKED))
+_SERVO_ON, _MOTION_LOCKED, _INDEX = map(int, (AuxFlag.SERVO_ON, AuxFlag.MOTION_LOCKED, AuxFlag.INDEX))
 """As numbers: arithmetic with flags costs ten times as much, and every reply needs it."""
 
 
@@ -301,11 +300,16 @@ class DriveState:
         servo_divisor: servo rate divisor in force.
         guard: the limit switch at which the drive stops the present motion by itself; empty without one.
         guard_hit: it has.
+        offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
+            set it back so far.
+        setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
+        counts: the latest position, in counts since the reset of the drive.
     """
 
     def __init__(self, name: str, profile: Profile) -> None:
         self._name = name
         self._profile = profile
+        self._cycle_s = profile.servo_cycle_s
         self._diagnosed: tuple[object, tuple[driver.Fault, ...]] = ((), ())  # the latest question, and the answer to it
         self.restarted()
 
@@ -320,6 +324,7 @@ class DriveState:
         self.servo_divisor = 1
         self.guard = ""
         self.guard_hit = False
+        self.offset_counts = self.setting_back = self.counts = 0
 
     def taken_over(self, status: Status) -> None:
         """The drive is adopted as it is, and this host has never known it; the status packet has the auxiliary byte."""
@@ -367,16 +372,26 @@ class DriveState:
         if status.position is None or status.velocity is None or status.aux is None:
             raise BadReply(f"axis {self._name}: the status packet lacks position, velocity or aux")
         flags, aux = int(status.flags), int(status.aux)
+        counter = status.position
+        if self.setting_back and abs(counter) < abs(self.setting_back) / 2:
+            self.offset_counts += self.setting_back
+            self.setting_back = 0
+        self.counts = counts = counter + self.offset_counts
         if not flags & _HOMING:
             self.homing_armed = False
             self.guard_hit = bool(self.guard)
         self.motion_locked = self._profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED)
         faults = self.faults(status)
         shows_limits = self._shows_limits(flags)
+        logosol, known = self._profile.pic_ae_diagnostics, self.known
+        powered, closed = flags & _POWER_ON, aux & _SERVO_ON
+        stop_input = None
+        if logosol and (closed or (known.pic_ae is False and powered)):
+            stop_input = not (closed or flags & _LIMIT1)
         reverse, forward = (_LIMIT2, _LIMIT1) if self._profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
-        tick_s = SERVO_CYCLE_S * (self.servo_divisor if self._profile.divisor_slows_profile else 1)
+        tick_s = self._cycle_s * (self.servo_divisor if self._profile.divisor_slows_profile else 1)
         return AxisReading(
-            position_counts=status.position,
+            position_counts=counts,
             following_error_counts=status.position_error,
             velocity_counts_per_s=status.velocity / tick_s,
             velocity_resolution_counts_per_s=1.0 / tick_s,
@@ -387,6 +402,9 @@ class DriveState:
             faults=faults,
             reverse_limit=bool(flags & reverse) if shows_limits else None,
             forward_limit=bool(flags & forward) if shows_limits else None,
+            index=None if logosol and not powered else bool(aux & _INDEX) is self._profile.live_aux,
+            stop_input=stop_input,
+            amplifier_enable=known.pic_ae,
             asked=asked,
             cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
         )

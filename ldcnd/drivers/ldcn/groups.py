@@ -13,9 +13,10 @@ from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
-from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
+from ldcnd.drivers.ldcn.commands import Node, unanswered
 from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
+from ldcnd.drivers.network import Instant
 from ldcnd.errors import (
     BusError,
     DriveFault,
@@ -50,6 +51,7 @@ class Groups:
         self._bus = bus
         self._plan = plan
         self._addressing = addressing
+        self._rate = addressing.rate
         self._drives = drives
         self._snapshots = snapshots
 
@@ -64,7 +66,7 @@ class Groups:
             return
         control = STOP_CONTROLS[mode]
         packets = [commands.stop_motor(commands.Group(group.address), control).request for group in groups]
-        stop = unanswered(groups[0].address, self._spaced(packets), self._quiet_s(groups), repeatable=True)
+        stop = unanswered(groups[0].address, self._rate.spaced(packets), self._quiet_s(groups), repeatable=True)
         try:
             await self._bus.execute(stop, Lane.STOP)
         finally:
@@ -86,9 +88,9 @@ class Groups:
                 remedy="configure a [[bus.group]] of these axes",
             )
         await self._prove()
-        before: dict[str, Status] = {}
+        before: dict[str, int] = {}
         for name, motion in motions.items():
-            before[name] = await self._ready(name)
+            before[name] = self._counts(name, await self._ready(name))
             await self._drives[name].load(motion)
         still_wanted()
         sent = False
@@ -112,8 +114,11 @@ class Groups:
                 remedy="read the axis states before anything else",
             )
 
-    async def snapshot(self) -> Mapping[str, int]:
+    async def snapshot(self, still_free: Callable[[], None]) -> Instant:
         """See `Network.snapshot`: Save Current Position as Home freezes, the home registers tell.
+
+        A capture that only guards a motion (`limit_switches`) does not need the register; if it comes meanwhile it
+        overwrites what was frozen, and the instant is missed.
 
         Raises:
             NotSupported, WrongState, BusError: as there; ReplyTimeout when a drive missed the packet.
@@ -124,21 +129,25 @@ class Groups:
                 "positions cannot be frozen on this line: it is not configured, or other modules share the group",
                 remedy="set snapshot = true on the bus",
             )
-        homing = [name for name, drive in self._drives.items() if drive.state.homing_armed]
+        homing = [name for name, drive in self._drives.items() if drive.state.homing_armed and not drive.state.guard]
         if homing:
             raise WrongState(f"axis {homing[0]} is homing: its home register is in use", axis=homing[0])
+        still_free()
         await self._prove()
         before = {name: await self._frozen(name) for name in self._drives}
         packets = [commands.save_home(commands.Group(group.address)).request for group in groups]
-        await self._bus.execute(unanswered(EVERYBODY, self._spaced(packets), self._quiet_s(groups), repeatable=False))
+        save = unanswered(EVERYBODY, self._rate.spaced(packets), self._quiet_s(groups), repeatable=False)
+        still_free()
+        _, timing = await self._bus.execute_timed(save)
         positions = {}
         for name in self._drives:
             status = await self._frozen(name)
             position, home = status.position or 0, status.home or 0
-            if home == before[name].home and position != home:
+            captured = (before[name].flags ^ status.flags) & StatusFlag.HOME_IN_PROGRESS
+            if captured or (home == before[name].home and position != home):
                 raise ReplyTimeout(f"axis {name}: the drive missed the instant", axis=name)
-            positions[name] = home
-        return positions
+            positions[name] = home + self._drives[name].state.offset_counts
+        return Instant(positions, timing.sent_at_s, timing.received_at_s)
 
     # -- steps -------------------------------------------------------------------------------------------------------
 
@@ -148,10 +157,9 @@ class Groups:
     def _quiet_s(self, groups: list[Group]) -> float:
         """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which nobody reads."""
         leaders = sum(group.leader is not None for group in groups)
-        return commands.GROUP_QUIET_S + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
-
-    def _spaced(self, packets: list[bytes]) -> bytes:
-        return spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud)
+        return (
+            commands.group_quiet_s(self._rate.cycle_s) + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
+        )
 
     async def _prove(self) -> None:
         """Tell every drive its group again, unless it was this daemon that did."""
@@ -178,19 +186,19 @@ class Groups:
     async def _start_motion(self, group: Group) -> None:
         """Start Motion, once; a leader's reply proves that the packet was understood, and its loss proves nothing."""
         if group.leader is None:
-            await self._bus.execute(commands.start_motion(commands.Group(group.address)))
+            await self._bus.execute(commands.start_motion(commands.Group(group.address, cycle_s=self._rate.cycle_s)))
             return
         leader = self._drives[group.leader]
         await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))
 
-    async def _started(self, name: str, motion: Motion, before: Status) -> bool:
+    async def _started(self, name: str, motion: Motion, came_from: int) -> bool:
         """Tell from the drive's status whether it has set out, or has arrived already."""
         status = await self._read(name, READY_ITEMS)
         if not status.flags & StatusFlag.MOVE_DONE:
             return True
         if motion.target_counts is None:
             return bool(status.velocity)
-        came_from, is_at = before.position or 0, status.position or 0
+        is_at = self._counts(name, status)
         return abs(is_at - motion.target_counts) <= abs(is_at - came_from)
 
     async def _stop_all(self, group: Group) -> None:
@@ -208,6 +216,10 @@ class Groups:
             await self._drives[name].stop(StopMode.SMOOTH)
         except BusError as error:
             log.error("stop not confirmed", axis=name, reason=error.message)
+
+    def _counts(self, name: str, status: Status) -> int:
+        """Return a position in counts since the reset of the drive."""
+        return (status.position or 0) + self._drives[name].state.offset_counts
 
     async def _frozen(self, name: str) -> Status:
         return await self._read(name, FROZEN_ITEMS)

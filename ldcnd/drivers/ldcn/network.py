@@ -21,7 +21,6 @@ from ldcnd.drivers.ldcn.addressing import (
     FASTEST_BAUD,
     NULLS,
     NULLS_SETTLE_S,
-    RESET_BAUD,
     Addressing,
     Expected,
     GroupPlan,
@@ -33,12 +32,12 @@ from ldcnd.drivers.ldcn.addressing import (
 from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found, Rejoin
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
-from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drivers.ldcn.profiles import PROFILES, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
-from ldcnd.drivers.network import BringUpReport, Network
+from ldcnd.drivers.network import BringUpReport, Instant, Network
 from ldcnd.errors import BusError, NetworkMismatch
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
@@ -77,8 +76,6 @@ class ModuleWatch(Poller[Status]):
 
 log = get_logger("ldcn")
 
-__all__ = ["RESET_BAUD", "LdcnNetwork"]
-
 MISSES_UNTIL_MUTE = 3
 PLACE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY
 RATE_ATTEMPTS = 2
@@ -93,7 +90,9 @@ class LdcnNetwork(Network):
         self._bus = bus
         self._baud = baud
         self._line = line
-        self._drives = {spec.address: LdcnAxis(spec, PROFILES[spec.model], bus) for spec in specs}
+        self._drives = {
+            spec.address: LdcnAxis(spec, at_clock(PROFILES[spec.model], line.clock_hz), bus) for spec in specs
+        }
         self._names = {spec.address: spec.name for spec in specs}
         self._identities: dict[int, Identity] = {}
         self._watches: dict[int, ModuleWatch] = {}
@@ -109,6 +108,7 @@ class LdcnNetwork(Network):
             BaudCodes.ALTERNATE if line.alternate_divisors else BaudCodes.MANUAL,
             plan.addresses,
             fastest=any(each.profile.top_baud >= FASTEST_BAUD for each in self._expected),
+            clock_hz=line.clock_hz,
         )
         self._addressing = Addressing(bus, self._rate, plan)
         self._adoption = Adoption(bus, self._rate, self._expected)
@@ -223,11 +223,11 @@ class LdcnNetwork(Network):
         Raises:
             NetworkMismatch: the drives would be lost by a reset, or are not those of the configuration.
         """
-        if not self._rate.changeable and self._bus.baud != RESET_BAUD:
+        if not self._rate.changeable and self._bus.baud != self._rate.at_reset:
             raise NetworkMismatch(
                 f"bus {self._bus.settings.name}: not reset, as the port stays at {self._bus.baud} baud and the drives"
-                f" would restart at {RESET_BAUD}",
-                remedy=f'set the far end to {RESET_BAUD} baud, or use start = "adopt"',
+                f" would restart at {self._rate.at_reset}",
+                remedy=f'set the far end to {self._rate.at_reset} baud, or use start = "adopt"',
             )
         heard = self._bus.statistics.bytes_in
         places_known = not (self._was_up or self._disturbed) and await self._all_wait()
@@ -249,9 +249,9 @@ class LdcnNetwork(Network):
                 await self._addressing.with_leaders()
                 return modules, remarks
         modules, remarks = await self._address_afresh()
-        self._rate.working = RESET_BAUD
+        self._rate.working = self._rate.at_reset
         await self._addressing.with_leaders()
-        told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {RESET_BAUD}"
+        told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {self._rate.at_reset}"
         return modules, (*remarks, told)
 
     async def _address_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
@@ -330,7 +330,7 @@ class LdcnNetwork(Network):
         """
         await self._adoption.search()
         found = dict(sorted(self._adoption.found.items()))
-        await self._rate.host_to(next(iter(found.values())).baud if found else RESET_BAUD)
+        await self._rate.host_to(next(iter(found.values())).baud if found else self._rate.at_reset)
         return found
 
     def differences(self, found: Mapping[int, Found]) -> tuple[str, ...]:
@@ -374,8 +374,8 @@ class LdcnNetwork(Network):
         await self._groups.start(motions, still_wanted)
 
     @override
-    async def snapshot(self) -> Mapping[str, int]:
-        return await self._groups.snapshot()
+    async def snapshot(self, still_free: Callable[[], None]) -> Instant:
+        return await self._groups.snapshot(still_free)
 
     def _module(self, address: int, identity: Identity) -> FoundModule:
         profile = next((each.profile for each in self._expected if each.address == address), identity.profile)

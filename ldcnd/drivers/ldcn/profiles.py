@@ -36,6 +36,12 @@ class HomingSource(IntFlag):
     CURRENT = 0x80
 
 
+CLOCK_HZ = 20_000_000
+"""The clock on which all timing in the manuals is based."""
+CYCLE_CLOCKS = 10_240
+"""Clocks of a servo cycle: 0.512 ms at 20 MHz."""
+
+
 @dataclass(frozen=True, slots=True)
 class Profile:
     """One dialect.
@@ -72,6 +78,9 @@ class Profile:
             goal, velocity and acceleration that may be changed during a trapezoidal move.
         advanced_stop: Stop Motor bit 5 turns on what the device has beyond version 4.
         path_points: how many points the path buffer holds; 0 without path mode.
+        any_clock: "any clock between 10 MHz and 20 MHz may be used, with the timing specifications adjusted
+            proportionally" (PIC-SERVO manual, 3.0).
+        clock_hz: the clock; servo cycle, baud rates and the encoder rate scale with it.
         motion_lock_from: from this version on, Stop Motor bit 7 unlocks motion and aux bit 7 says that it is locked
             (after homing on a limit); None on devices without the lock.
     """
@@ -103,7 +112,7 @@ class Profile:
     analog_target: bool = False
     offset_on_the_fly: bool = False
     current_limit: bool = True
-    top_baud: int = 115_200
+    top_baud: int = 125_000
     baud_keys: bool = False
     encoder_counts_per_s: int = 500_000
     most_velocity: int = 0x7FFF_FFFF
@@ -114,7 +123,26 @@ class Profile:
     sc_extensions: bool = False
     advanced_stop: bool = False
     path_points: int = 0
+    any_clock: bool = False
+    clock_hz: int = CLOCK_HZ
     motion_lock_from: int | None = None
+
+    @property
+    def servo_cycle_s(self) -> float:
+        """The servo period at divisor 1, seconds; commands are executed at its end whatever the divisor is."""
+        return CYCLE_CLOCKS / self.clock_hz
+
+
+def at_clock(profile: Profile, clock_hz: int) -> Profile:
+    """Return the profile of a device that is clocked otherwise, 10,000,000 to 20,000,000 Hz."""
+    if clock_hz == profile.clock_hz:
+        return profile
+    return replace(
+        profile,
+        clock_hz=clock_hz,
+        encoder_counts_per_s=profile.encoder_counts_per_s * clock_hz // profile.clock_hz,
+        top_baud=profile.top_baud * clock_hz // profile.clock_hz,
+    )
 
 
 PIC_SERVO_V4 = Profile(
@@ -124,6 +152,7 @@ PIC_SERVO_V4 = Profile(
     range(4, 5),
     Support.FULL,
     limit_outputs=True,
+    any_clock=True,
 )
 PIC_SERVO_V3 = replace(
     PIC_SERVO_V4,

@@ -16,18 +16,22 @@ from ldcnd.drivers import driver
 from ldcnd.drivers.driver import Register
 from ldcnd.drivers.ldcn.controls import INPUTS
 from ldcnd.drivers.ldcn.packet import Field
-from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.model.meta import Provenance
 
-SERVO_CYCLE_S = 0.000512
-"""The servo period at divisor 1; commands are executed at its end whatever the divisor is."""
+SERVO_CYCLE_S = CYCLE_CLOCKS / CLOCK_HZ
+"""The servo period of a device with the usual clock at divisor 1: 0.512 ms."""
 FRACTION = 1 << 16
 MOST_RATE = 0x7FFF_FFFF
 """The largest programmed acceleration, and the largest velocity of most devices."""
 MOST_DIVISOR = 0xFF
-PROCESSOR_HZ = 20_000_000
 CLOCKS_PER_BIT = 16
+BAUD_TOLERANCE = 0.01
+"""Most that a rate may differ from what a divisor makes: half of what a receiver bears is left to the host."""
+RESET_BAUD = 19_200
+"""The rate after power-up and Hard Reset, with the usual clock."""
+RESET_BAUD_CODE = 0x3F
 
 
 class BaudCodes(Enum):
@@ -90,29 +94,41 @@ def acceleration_counts_per_s2(programmed: int, servo_divisor: int, profile: Pro
     return programmed / _acceleration_factor(servo_divisor, profile)
 
 
-def baud_divisor(baud: int, codes: BaudCodes = BaudCodes.MANUAL) -> int:
-    """Return the Set Baud Rate code of a rate.
+def baud_divisor(baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> int:
+    """Return the Set Baud Rate code of a rate: a printed one, or the divisor that makes it within 1 %.
+
+    "Please refer to the PIC16C7x data sheet for details in obtaining other baud rates" (PIC-SERVO manual, 5.2).
 
     Raises:
-        ValueOutOfRange: no code is known for this rate.
+        ValueOutOfRange: no divisor makes this rate; names the nearest that one makes.
     """
-    divisors = BAUD_DIVISORS[codes]
-    divisor = divisors.get(baud)
-    if divisor is None:
-        allowed = ", ".join(str(known) for known in divisors)
-        nearest = min(divisors, key=lambda known: abs(known - baud))
-        raise ValueOutOfRange(f"{baud} baud is not one of {allowed}", value=baud, limit=allowed, nearest=nearest)
+    if clock_hz == CLOCK_HZ and (printed := BAUD_DIVISORS[codes].get(baud)) is not None:
+        return printed
+    divisor = min(max(round(clock_hz / CLOCKS_PER_BIT / baud) - 1, 0), MOST_DIVISOR) if baud > 0 else MOST_DIVISOR
+    made = actual_baud(divisor, clock_hz)
+    if abs(made - baud) > BAUD_TOLERANCE * made:
+        raise ValueOutOfRange(
+            f"no divisor of a {clock_hz / 1e6:g} MHz clock makes {baud} baud; the nearest rate is {made:.0f}",
+            value=baud,
+            limit=round(made),
+            nearest=round(made),
+        )
     return divisor
 
 
-def actual_baud(divisor: int) -> float:
-    """Return the rate that a module with a 20 MHz clock really uses with this code, 0 to 255."""
-    return PROCESSOR_HZ / CLOCKS_PER_BIT / (divisor + 1)
+def actual_baud(divisor: int, clock_hz: int = CLOCK_HZ) -> float:
+    """Return the rate that a module really uses with this code, 0 to 255."""
+    return clock_hz / CLOCKS_PER_BIT / (divisor + 1)
+
+
+def baud_at_reset(clock_hz: int) -> int:
+    """Return the rate after power-up and Hard Reset: 19200, and in proportion with another clock."""
+    return RESET_BAUD if clock_hz == CLOCK_HZ else round(actual_baud(RESET_BAUD_CODE, clock_hz))
 
 
 def module_baud(profile: Profile, code: int) -> float | None:
     """Return the rate that a device takes at this code of Set Baud Rate, 0 to 255; None when it knows no such code."""
-    return BAUD_KEYS.get(code) if profile.baud_keys else actual_baud(code)
+    return BAUD_KEYS.get(code) if profile.baud_keys else actual_baud(code, profile.clock_hz)
 
 
 def _velocity_factor(servo_divisor: int, profile: Profile) -> float:
@@ -131,7 +147,7 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
             limit=1 if servo_divisor < 1 else MOST_DIVISOR,
             nearest=min(max(servo_divisor, 1), MOST_DIVISOR),
         )
-    return SERVO_CYCLE_S * (servo_divisor if profile.divisor_slows_profile else 1)
+    return profile.servo_cycle_s * (servo_divisor if profile.divisor_slows_profile else 1)
 
 
 def _programmed(what: str, unit: str, value: float, factor: float, most_register: int) -> int:

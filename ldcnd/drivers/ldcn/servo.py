@@ -3,12 +3,13 @@
 What its status packets mean is in faults.py, what its motions are to it in trajectory.py, what is known of its
 registers in registers.py. Versions 1 and 2 of PIC-SERVO do not stop on home by themselves: the host stops them.
 
-Reset Position is never sent: it would make every position on record mean something else, must not be repeated when its
-reply is lost, and is forbidden during a trapezoidal move. The offset between counts and axis units is the host's.
+Positions are counts since the drive was reset, whatever its 32-bit counter says: where a motion would leave the range
+of the counter, Reset Position sets it back beforehand, at standstill, and the host adds what it has set back.
 Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute positioning mode"; PIC-SERVO manual, 4.1,
 4.5, 5.2.
 """
 
+import contextlib
 from dataclasses import asdict, replace
 from types import MappingProxyType
 from typing import Any
@@ -19,6 +20,7 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers import driver
 from ldcnd.drivers.driver import (
+    LARGEST_COUNT,
     AnalogMotion,
     AxisDriver,
     AxisReading,
@@ -34,11 +36,16 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
 from ldcnd.drivers.ldcn.faults import DriveState, FaultCode, sensor_lost
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, SERVO_CYCLE_S, Gains, RegisterBook, gain_values
+from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
+<<<<<<< HEAD
 from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, Remedy, WrongState, step
+=======
+from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ValueOutOfRange, WrongState
+>>>>>>> 88b1ee1 (Add snapshot, probe, inputs, new goals on the fly, rotary axes, clocks and baud divisors)
 from ldcnd.exchange import Exchange
+from ldcnd.log import get_logger
 from ldcnd.model.catalogue import verbs_for
 from ldcnd.model.commands import Capability, HomeMethod, PinMode, Verb
 from ldcnd.model.samples import TelemetryItem
@@ -82,6 +89,8 @@ def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
     An excess position error opens the loop by itself, so no way to stop goes with it.
     """
     control = HomingControl(homing_source(profile, capture.method))
+    for method in capture.also:
+        control |= HomingControl(homing_source(profile, method))
     if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
         control |= STOPS[capture.stop]
     return control
@@ -110,6 +119,19 @@ def _limits_ahead(motion: Motion | AnalogMotion | PwmOutput, here_counts: int) -
     return (HomeMethod.FORWARD_LIMIT if way > 0 else HomeMethod.REVERSE_LIMIT,)
 
 
+ANY_LIMIT = HomingControl.LIMIT1 | HomingControl.LIMIT2
+LEAST_SET_BACK = 1000
+"""A counter so near to 0 is not set back: whether Reset Position was executed must show in it."""
+log = get_logger("ldcn")
+
+
+def _shifted(motion: Motion, offset_counts: int) -> Motion:
+    """Return a motion in terms of a position counter that lacks so many counts."""
+    if motion.target_counts is None or not offset_counts:
+        return motion
+    return replace(motion, target_counts=motion.target_counts - offset_counts)
+
+
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""
 STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
@@ -133,6 +155,8 @@ def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusIt
 
 class LdcnAxis(AxisDriver):
     """A drive at one address, in the dialect of its profile."""
+
+    shows_inputs = True
 
     def __init__(self, spec: AxisSpec, profile: Profile, bus: Bus) -> None:
         self.spec = spec
@@ -175,9 +199,9 @@ class LdcnAxis(AxisDriver):
         self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
 
     @property
-    def index_sample_s(self) -> float:  # type: ignore[override]
+    def capture_s(self) -> float:  # type: ignore[override]
         """One servo cycle (LS-182AP manual, "Encoder Input")."""
-        return SERVO_CYCLE_S * (self.state.servo_divisor if self.profile.divisor_slows_profile else 1)
+        return self.profile.servo_cycle_s * (self.state.servo_divisor if self.profile.divisor_slows_profile else 1)
 
     @override
     def registers(self) -> tuple[Register, ...]:
@@ -217,8 +241,12 @@ class LdcnAxis(AxisDriver):
 
     @override
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
-        trajectory = trajectory_of(motion, self.state.servo_divisor, self.profile)
-        return commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
+        first: tuple[Exchange[Any], ...] = ()
+        offset = self.state.offset_counts
+        if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
+            first, offset = (commands.reset_position(self._node),), self.state.counts
+        trajectory = trajectory_of(_shifted(motion, offset), self.state.servo_divisor, self.profile)
+        return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
         """See `AxisDriver`. Closing the loop is verified; it takes effect at the present position.
@@ -340,10 +368,20 @@ class LdcnAxis(AxisDriver):
 
         Raises:
             NotSupported: an analog target on a drive without absolute positioning.
-            WrongState: the limit switch pin that would be homed on is an output.
+            WrongState: the limit switch pin that would be homed on is an output; or the target is beyond the counter,
+                and the axis does not stand.
             DriveFault: the analog sensor is out of its range.
         """
-        trajectory = trajectory_of(motion, self.state.servo_divisor, self.profile)
+        if isinstance(motion, Motion):
+            if (
+                motion.target_counts is not None
+                and abs(motion.target_counts - self.state.offset_counts) > LARGEST_COUNT
+            ):
+                await self._set_counter_back()
+            in_counter: Motion | AnalogMotion | PwmOutput = _shifted(motion, self.state.offset_counts)
+        else:
+            in_counter = motion
+        trajectory = trajectory_of(in_counter, self.state.servo_divisor, self.profile)
         if isinstance(motion, AnalogMotion):
             await self._check_sensor()
         if isinstance(motion, PwmOutput) and not self.state.loop_may_open:
@@ -357,6 +395,44 @@ class LdcnAxis(AxisDriver):
             opens_loop=isinstance(motion, PwmOutput) or (home is not None and opens_loop(self.profile, home)),
         )
 
+    async def _set_counter_back(self) -> None:
+        """Set the position counter to 0 by Reset Position, which is forbidden during a trapezoidal move (manuals).
+
+        The host adds what the counter has lost. It takes that from the status before, so each time can cost the counts
+        by which the loop hunts at rest. A lost reply is no harm: the next position tells whether it was executed.
+
+        Raises:
+            WrongState: the axis does not stand, or the counter is at 0 already.
+            OutcomeUnknown: the counter is as it was.
+        """
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        before = status.position or 0
+        if not status.flags & StatusFlag.MOVE_DONE or status.velocity:
+            raise WrongState(
+                f"axis {self.spec.name}: the target is beyond the drive's 32-bit counter",
+                axis=self.spec.name,
+                remedy="send halt first: at standstill the counter is set back",
+            )
+        if abs(before) < LEAST_SET_BACK:
+            raise WrongState(
+                f"axis {self.spec.name}: a motion of more than {LARGEST_COUNT} counts does not fit the drive's counter",
+                axis=self.spec.name,
+                remedy="move in two parts",
+            )
+        self.state.setting_back = before
+        self._book.doubt(("position",))  # the target that was loaded last means another place
+        with contextlib.suppress(OutcomeUnknown):
+            await self._bus.execute(commands.reset_position(self._node))
+        self.state.reading(await self._bus.execute(commands.read_status(self._node, STATE_ITEMS)))
+        if self.state.setting_back:
+            self.state.setting_back = 0
+            raise OutcomeUnknown(
+                f"axis {self.spec.name}: the drive did not set its position counter back",
+                axis=self.spec.name,
+                remedy="send the motion again",
+            )
+        log.info("position counter set back", axis=self.spec.name, counts=before)
+
     async def _arm(self, motion: Motion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
         """Arm the capture that is asked for, or the one that stops the motion at the limit switch ahead, or none.
 
@@ -366,8 +442,11 @@ class LdcnAxis(AxisDriver):
         self.state.guard, self.state.guard_hit = "", False
         control, guard = HomingControl(0), ""
         if home is not None:
-            self._check_pin(home.method)
+            for method in (home.method, *home.also):
+                self._check_pin(method)
             control = homing_control(self.profile, home)
+            if home.guarded and self.spec.limit_stop is not None:
+                control |= (await self._guard(motion, active=self.spec.limit_stop))[0] & ANY_LIMIT
         elif self.spec.limit_stop is not None:
             control, guard = await self._guard(motion, active=self.spec.limit_stop)
         if control or self.state.homing_armed:
@@ -379,7 +458,8 @@ class LdcnAxis(AxisDriver):
     async def _guard(self, motion: Motion | AnalogMotion | PwmOutput, *, active: bool) -> tuple[HomingControl, str]:
         """Return what stops a motion at the limit switches that it may run onto, and their name.
 
-        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one.
+        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
+        drive that turns round in mid-move has the other one ahead until it has.
 
         Raises:
             WrongState: the axis stands on the switch ahead, or its pin is an output.
@@ -387,6 +467,7 @@ class LdcnAxis(AxisDriver):
         status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
         reading = self.state.reading(status)
         ahead = _limits_ahead(motion, reading.position_counts)
+        onward = _limits_ahead(Motion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
         levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
         control = HomingControl(0)
         for method in ahead:
@@ -398,9 +479,21 @@ class LdcnAxis(AxisDriver):
                     value=method.value,
                     remedy="move the other way",
                 )
-            stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
+        ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
+        stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
+        for method in ahead:
             control |= homing_control(self.profile, HomeCapture(method, stop))
         return control, " or ".join(f"{method.value.replace('_', ' ')} switch" for method in ahead)
+
+    @override
+    def room_counts(self, *, forward: bool) -> int:
+        counter = self.state.counts - self.state.offset_counts
+        return LARGEST_COUNT + (-counter if forward else counter)
+
+    @override
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
+        level = reading.forward_limit if limit is HomeMethod.FORWARD_LIMIT else reading.reverse_limit
+        return self.spec.limit_stop is not None and level is self.spec.limit_stop
 
     async def _load(self, trajectory: Trajectory) -> None:
         self._loaded = trajectory
@@ -486,7 +579,16 @@ class LdcnAxis(AxisDriver):
             OutcomeUnknown: the reply was lost.
         """
         control = StopControl.AMP_ENABLE | StopControl.HERE
-        exchange = commands.stop_motor(self._node, control, position_counts)
+        counter = position_counts - self.state.offset_counts
+        if abs(counter) > LARGEST_COUNT:
+            raise ValueOutOfRange(
+                f"axis {self.spec.name}: set-point {position_counts} is beyond the drive's 32-bit counter",
+                axis=self.spec.name,
+                value=position_counts,
+                limit=LARGEST_COUNT,
+                remedy="send move_relative by a small distance: it sets the counter back",
+            )
+        exchange = commands.stop_motor(self._node, control, counter)
         self.state.loaded(absolute=False, opens_loop=False)
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
         await self._bus.execute(replace(exchange, repeatable=False))
@@ -496,7 +598,7 @@ class LdcnAxis(AxisDriver):
         status = await self._bus.execute(commands.read_status(self._node, StatusItem.HOME))
         if status.home is None:
             raise BadReply(f"axis {self.spec.name}: the status packet lacks the home position")
-        return status.home
+        return status.home + self.state.offset_counts
 
     # -- registers ---------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 from ldcnd.drivers.ldcn.controls import HomingControl, IoOption, LimitPins, StartUp, StopControl
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile
+from ldcnd.drivers.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
 from ldcnd.drivers.ldcn.received import (
     AddPathPoints,
     IoControl,
@@ -31,7 +31,7 @@ from ldcnd.drivers.ldcn.received import (
     SetHomingMode,
     StopMotor,
 )
-from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, Gains
+from ldcnd.drivers.ldcn.registers import FRACTION, Gains
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import SimulatedModule
@@ -72,7 +72,8 @@ class SimulatedDrive(SimulatedModule):
     """
 
     def __init__(self, profile: Profile, settings: ModuleSettings, plant: MotorPlant) -> None:
-        self.shaft = Shaft(plant, SERVO_CYCLE_S)
+        profile = at_clock(profile, settings.clock_hz)
+        self.shaft = Shaft(plant, profile.servo_cycle_s)
         self.stage: PowerStage
         self.loop: ServoLoop
         self.saved: SavedConfiguration | None = None
@@ -82,7 +83,9 @@ class SimulatedDrive(SimulatedModule):
             profile = replace(profile, velocity_sign=settings.velocity_sign)
         self._compatible = self._advanced = profile
         if profile.advanced_stop:
-            self._advanced = replace(PIC_SERVO_CMC_ADVANCED, velocity_sign=profile.velocity_sign)
+            self._advanced = at_clock(
+                replace(PIC_SERVO_CMC_ADVANCED, velocity_sign=profile.velocity_sign), settings.clock_hz
+            )
             items = self._advanced if settings.items_before_advanced else profile
             self._compatible = replace(items, path_points=0)
         super().__init__(profile, settings)

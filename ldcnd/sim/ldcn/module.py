@@ -16,7 +16,7 @@ import math
 from abc import abstractmethod
 
 from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader
-from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.profiles import Profile, at_clock
 from ldcnd.drivers.ldcn.received import (
     DefineStatus,
     HardReset,
@@ -27,13 +27,12 @@ from ldcnd.drivers.ldcn.received import (
     SetBaudRate,
     received_command,
 )
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, module_baud
+from ldcnd.drivers.ldcn.registers import RESET_BAUD_CODE, module_baud
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings
 
 EVERYBODY = 0xFF
-RESET_BAUD_CODE = 0x3F
 _ROUNDING = 1e-6
 
 
@@ -50,10 +49,10 @@ class SimulatedModule(Module):
     """
 
     def __init__(self, profile: Profile, settings: ModuleSettings) -> None:
-        self.profile = profile
+        self.profile = at_clock(profile, settings.clock_hz)
         self.settings = settings
         self._reader = PacketReader()
-        self._cycle_s = SERVO_CYCLE_S * (1.0 + settings.drift_ppm * 1e-6)
+        self._cycle_s = self.profile.servo_cycle_s * (1.0 + settings.drift_ppm * 1e-6)
         self._cycles_done = 0
         self.address = 0
         self.group = EVERYBODY

@@ -7,6 +7,8 @@ on. docs/reference/simulator.md lists them with their reasons.
 from dataclasses import dataclass
 from enum import StrEnum
 
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ
+
 
 class CommandBuffer(StrEnum):
     """What becomes of a command that waits for the end of the servo cycle when another packet begins."""
@@ -66,6 +68,7 @@ class ModuleSettings:
     Attributes:
         version: second byte of its identity.
         phase_s: where its servo cycles lie, 0 to 0.000512.
+        clock_hz: of the module.
         drift_ppm: how much longer its servo cycles are than nominal.
         reply_latency_s: added between the end of the cycle and the reply.
         reset_dead_s: how long it is deaf after Hard Reset and power-up.
@@ -104,6 +107,7 @@ class ModuleSettings:
     """
 
     version: int
+    clock_hz: int = CLOCK_HZ
     phase_s: float = 0.0
     drift_ppm: float = 0.0
     reply_latency_s: float = 0.0

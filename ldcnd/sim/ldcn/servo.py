@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from ldcnd.drivers.ldcn.controls import HomingControl, IoOption
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, Gains
+from ldcnd.drivers.ldcn.registers import FRACTION, Gains
 from ldcnd.sim.ldcn.power import Condition, PowerStage, Trip
 from ldcnd.sim.ldcn.quirks import AnalogEnd, LimitInPath, ModuleSettings
 from ldcnd.sim.ldcn.trajectory import PathBuffer, ProfileGenerator
@@ -113,8 +113,8 @@ class ServoLoop:
         self._tick_cycles = 1
         self._path_every_cycle = quirks.path_ignores_divisor and profile.divisor_slows_profile
         rate = profile.encoder_counts_per_s if quirks.encoder_counts_per_s is None else quirks.encoder_counts_per_s
-        self._most_counts = round(rate * SERVO_CYCLE_S) if rate else COUNTER_SPAN
-        self._overload_cycles = round(quirks.overload_s / SERVO_CYCLE_S)
+        self._most_counts = round(rate * profile.servo_cycle_s) if rate else COUNTER_SPAN
+        self._overload_cycles = round(quirks.overload_s / profile.servo_cycle_s)
         self._overloaded = 0  # cycles for which the motor current has been limited
         self._arrived = False  # at the analog target
         shaft.limit_current(quirks.peak_current_a if profile.pic_ae_diagnostics else 0.0)

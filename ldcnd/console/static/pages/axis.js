@@ -12,7 +12,7 @@ import { MovePanel } from "./axis_motion.js";
 import { NowPanel } from "./axis_now.js";
 import { OutputsPanel } from "./axis_outputs.js";
 
-const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog"];
+const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog", "probe"];
 
 export function AxisPage({ at }) {
   const axis = useRigs().get(at.rig)?.axes.get(at.axis);

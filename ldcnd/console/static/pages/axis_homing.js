@@ -29,6 +29,7 @@ export function HomePanel({ axis }) {
       <${Choice} label="At the mark" value=${values.stop} onChange=${set("stop")}
         options=${[CONFIGURED, ...HOME_STOPS.map((each) => [each, STOPS[each]])]} />
       ${field("Search velocity, signed", `${unit}/s`, "velocity")}
+      ${field("Find a switch first at", `${unit}/s`, "find_velocity")}
       ${field("Acceleration", `${unit}/s²`, "acceleration")}
       ${field("Position at the mark", unit, "position")}
       ${field("Then move to", unit, "move_to")}

@@ -39,7 +39,19 @@ const KINDS = {
     unit: () => "A/D count",
     previewed: false,
   },
+  probe: {
+    title: "until an input, and latch",
+    field: "distance",
+    label: "Distance at most",
+    unit: (unit) => unit,
+    previewed: false,
+  },
 };
+const SOURCES = [
+  ["forward_limit", "the forward limit switch changes"],
+  ["reverse_limit", "the reverse limit switch changes"],
+  ["index", "the index comes"],
+];
 const BUFFERING = [
   ["refuse", "refuse it"],
   ["aborting", "halt, then move"],
@@ -73,6 +85,18 @@ export function MovePanel({ axis }) {
             <${Field} label="Acceleration" unit=${`${axis.info.unit}/s²`} value=${values.acceleration}
               onChange=${set("acceleration")} hint="empty: the axis default" />`
       }
+      ${
+        verb === "probe" &&
+        html`<${Choice} label="Until" options=${SOURCES} value=${values.source ?? "forward_limit"}
+          onChange=${set("source")} />`
+      }
+      ${
+        verb === "move_analog" &&
+        html`<${Field} label="For at most" unit="s" value=${values.timeout_s} onChange=${set("timeout_s")}
+            hint="empty: as configured" />
+          <${Field} label="Distance at most" unit=${axis.info.unit} value=${values.reach} onChange=${set("reach")}
+            hint="empty: as configured" />`
+      }
       ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING}
         value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
     </div>
@@ -90,7 +114,9 @@ function bodyOf(verb, values) {
   if (verb === "set_pwm") return values.duration_s ? { duty: values.duty, duration_s: values.duration_s } : null;
   const body = { [field]: values[field], acceleration: values.acceleration ?? null };
   if (verb !== "move_velocity") body.velocity = values.speed ?? null;
-  if (verb !== "move_analog") body.buffer_mode = values.buffer_mode ?? "refuse";
+  if (verb === "probe") return { ...body, sources: [values.source ?? "forward_limit"] };
+  if (verb === "move_analog") return { ...body, timeout_s: values.timeout_s ?? null, distance: values.reach ?? null };
+  body.buffer_mode = values.buffer_mode ?? "refuse";
   return body;
 }
 

@@ -31,6 +31,7 @@ export function NowPanel({ axis }) {
     ]} />
     <h3>Status</h3>
     <${StatusLamps} state=${state} />
+    <${Inputs} sample=${samples.inputs} />
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
   <//>`;
@@ -54,6 +55,18 @@ function StatusLamps({ state }) {
   </ul>`;
 }
 
+/** What every poll carries; a level that the drive does not show is unknown. */
+function Inputs({ sample }) {
+  if (!sample) return null;
+  const lamp = (name, yes = "high", no = "low") =>
+    html`<${Lamp} label=${words(name)} on=${sample[name]} yes=${yes} no=${no} />`;
+  return html`<h3>Inputs</h3>
+    <ul class="lamps" aria-label="Inputs">
+      ${lamp("reverse_limit")}${lamp("forward_limit")}${lamp("index")}
+      ${lamp("stop_input", "open", "closed")}${lamp("amplifier_enable", "on", "off")}
+    </ul>`;
+}
+
 function Monitors({ axis }) {
   const monitors = Object.entries(axis.monitors);
   if (!monitors.length) return null;
@@ -68,7 +81,7 @@ function Monitors({ axis }) {
     ])} />`;
 }
 
-/** The drive's own inputs are no telemetry; a trace of two samples reads them. */
+/** A trace of two samples reads the drive's status bits as well. */
 function Signals({ axis }) {
   const [snapshot, setSnapshot] = useState(null);
   const names = signalsOf(axis);

@@ -15,6 +15,7 @@ const MOTIONS = new Set([
   "set_pwm",
   "track",
   "home",
+  "probe",
 ]);
 
 /** The axes that this page controls, by key; true once it has moved them. */

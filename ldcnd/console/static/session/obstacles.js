@@ -37,6 +37,7 @@ const CHECKS = {
   move_velocity: toMove,
   move_analog: toMove,
   set_pwm: toMove,
+  probe: toMove,
   track: [...toMove, referenced],
   home: toMove,
   set_position: [heard, controlled, reachable, standing],

@@ -123,7 +123,8 @@ class GroupMember(Procedure):
             view = motion.tracker.view()
             guards.check_may_move(view)
             guards.check_referenced(view)
-            self.plan = motion.plan_to(self._request.position, self._request.velocity, self._request.acceleration)
+            position = motion.unwrapped(self._request.position, self._request.direction)
+            self.plan = motion.plan_to(position, self._request.velocity, self._request.acceleration)
             await meeting.join(motion.config.name, self)
         except LdcndError as error:
             meeting.fail(error)
@@ -133,7 +134,7 @@ class GroupMember(Procedure):
         motion.target_counts = self.plan.motion.target_counts
         return motion.reply(self.turn).model_copy(
             update={
-                "position": self.plan.position,
+                "position": motion.shown(self.plan.position),
                 "velocity": self.plan.velocity,
                 "acceleration": self.plan.acceleration,
                 "duration_s": self.plan.duration_s,

@@ -11,13 +11,14 @@ from typing_extensions import override
 
 from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import LARGEST_COUNT, AxisMotion, MotionPlan
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.permit import QuietDrive
 from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedures.probe import check_index_is_seen
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode
 from ldcnd.drivers.scaling import Scale
-from ldcnd.errors import MalformedRequest, NotSupported, VelocityLimit
+from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.log import get_logger
 from ldcnd.model.commands import CommandReply, Home, HomeMethod, HomeStop
 from ldcnd.model.samples import AxisState
@@ -26,8 +27,6 @@ log = get_logger("axis")
 
 DEFAULT_TIMEOUT_S = 60.0
 STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
-INDEX_SHARE = 0.75
-"""Of the velocity at which an index pulse lasts exactly one look of the drive: a shaft does not turn quite evenly."""
 BEYOND = 1.1
 """A search without a distance ends in the drive this much later than its time-out, in case nobody stops it."""
 
@@ -147,7 +146,8 @@ class HomeSequence(Procedure):
         guards.check_may_move(view)
         search = self._search
         plan = motion.planner.at_velocity(view, search.velocity, search.acceleration)
-        self._check_index_is_seen(plan)
+        if search.method is HomeMethod.INDEX:
+            check_index_is_seen(motion, plan, search.index_width)
         if search.move_to is not None:
             guards.check_position(view, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
@@ -214,30 +214,6 @@ class HomeSequence(Procedure):
         self.deadline_s = motion.clock.now_s() + search.timeout_s
         await motion.start(turn, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH)
 
-    def _check_index_is_seen(self, plan: MotionPlan) -> None:
-        """Refuse a search that the index pulse can slip through: the drive looks once in a servo cycle.
-
-        LS-182AP manual, "Encoder Input": the velocity has "to guarantee index pulse longer then 512us".
-
-        Raises:
-            VelocityLimit: names the nearest velocity at which no pulse is missed.
-        """
-        motion, search = self._motion, self._search
-        sample_s = motion.driver.index_sample_s
-        if search.method is not HomeMethod.INDEX or not sample_s:
-            return
-        limit = INDEX_SHARE * search.index_width / sample_s / motion.scale.counts_per_unit
-        if abs(plan.velocity) > limit:
-            raise VelocityLimit(
-                f"axis {motion.config.name}: at {abs(search.velocity):g} {motion.config.unit}/s the drive can miss an"
-                f" index pulse of {search.index_width} counts: it looks every {1000 * sample_s:g} ms",
-                axis=motion.config.name,
-                value=search.velocity,
-                limit=limit,
-                nearest=math.copysign(math.floor(limit * 1e6) / 1e6, search.velocity),
-                remedy="search more slowly, or configure index_width if the pulse is wider",
-            )
-
     def _end_of_leg(self, plan: MotionPlan) -> int:
         search, here = self._search, self._motion.latest().position_counts
         speed = plan.motion.velocity_counts_per_s
@@ -245,8 +221,7 @@ class HomeSequence(Procedure):
             reach = abs(speed) * search.timeout_s * BEYOND
         else:
             reach = search.distance * self._motion.scale.counts_per_unit
-        room = LARGEST_COUNT - (here if speed > 0 else -here)  # to the end of the counter on this side
-        return here + round(math.copysign(min(reach, max(room, 0), LARGEST_COUNT), speed))
+        return here + round(math.copysign(min(reach, LARGEST_COUNT), speed))
 
     def _failure(self) -> str:
         search = self._search
@@ -294,7 +269,7 @@ class HomeSequence(Procedure):
         motion, move_to = self._motion, self._search.move_to
         if move_to is None or not motion.tracker.at_rest:
             return await self._give_up(turn, f"not at rest within {self._search.timeout_s:g} s")
-        plan = motion.plan_to(move_to, None, None)
+        plan = motion.plan_to(motion.unwrapped(move_to), None, None)
         await turn.permit.load(plan.motion)
         await motion.start(turn, AxisState.HOMING, Completion.PROFILE)
         motion.target_counts = plan.motion.target_counts

@@ -15,6 +15,8 @@ from ldcnd.errors import PositionLimit, Remedy, step
 from ldcnd.model.commands import CommandReply, MoveVelocity, Verb
 from ldcnd.model.samples import AxisState
 
+COUNTER_SHARE = 0.99
+"""Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
 LATENCY_S = 0.2
 """Longest time from a reading to the stop that follows it; what is gone meanwhile must not reach the software limit."""
 
@@ -60,7 +62,9 @@ class Jog(Procedure):
                 remedy=Remedy("{}", step("halt")),
             )
         await self.turn.permit.load(plan.motion)
-        self.deadline_s = motion.clock.now_s() + motion.config.jog_horizon_s
+        speed_counts = plan.motion.velocity_counts_per_s
+        room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
+        self.deadline_s = motion.clock.now_s() + min(motion.config.jog_horizon_s, COUNTER_SHARE * room_s)
         await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         return motion.reply(self.turn).model_copy(update={"velocity": plan.velocity, "acceleration": plan.acceleration})
 

@@ -1,0 +1,89 @@
+"""PIC-SERVO SC takes a new goal in mid-move; other drives are halted first."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.drivers.ldcn.packet import Command, PacketReader
+from ldcnd.errors import WrongState
+from ldcnd.model.commands import MoveAbsolute, MoveRelative, MoveVelocity
+from ldcnd.wirelog.recorder import WireEvent
+from tests.support.dialect_rig import SC, V4, DialectRig, dialect_rig
+
+
+def stops(rig: DialectRig) -> int:
+    reader = PacketReader()
+    records = rig.rig.daemon.rig.buses[0].bus.wire_log.records()
+    data = b"".join(record.data for record in records if record.event is WireEvent.SENT and record.data)
+    received = [reader.feed(byte) for byte in data]
+    return sum(each is not None and each.packet.command is Command.STOP_MOTOR for each in received)
+
+
+@pytest.mark.parametrize(
+    ("then", "ends_at"),
+    [
+        (MoveAbsolute(position=18.0, buffer_mode="aborting"), 18.0),
+        (MoveAbsolute(position=-5.0, velocity=5.0, buffer_mode="aborting"), -5.0),
+        (MoveRelative(distance=2.0, buffer_mode="aborting"), 12.0),
+    ],
+)
+async def test_an_sc_goes_on_to_the_new_goal_without_a_halt(then, ends_at):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=10.0, velocity=10.0))
+        await asyncio.sleep(0.4)
+        before = stops(rig)
+
+        done = await rig.done(then)
+        assert stops(rig) == before
+        assert done.last_error is None
+        assert rig.position_mm == pytest.approx(ends_at, abs=0.02)
+
+
+async def test_a_jog_of_an_sc_becomes_a_move_without_a_halt():
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.4)
+        before = stops(rig)
+
+        await rig.done(MoveAbsolute(position=12.0, buffer_mode="aborting"))
+
+        assert stops(rig) == before
+        assert rig.position_mm == pytest.approx(12.0, abs=0.02)
+
+
+async def test_a_move_of_an_sc_is_refused_in_mid_move_unless_it_says_so():
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=10.0, velocity=10.0))
+
+        with pytest.raises(WrongState):
+            await rig.send(MoveAbsolute(position=5.0))
+
+
+async def test_another_drive_is_halted_first():
+    async with dialect_rig(V4) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=10.0, velocity=10.0))
+        await asyncio.sleep(0.4)
+        before = stops(rig)
+
+        await rig.done(MoveAbsolute(position=-5.0, velocity=10.0, buffer_mode="aborting"))
+
+        assert stops(rig) == before + 1
+        assert rig.position_mm == pytest.approx(-5.0, abs=0.02)
+
+
+async def test_the_switch_ahead_stops_an_sc_that_turns_round_too_late():
+    async with dialect_rig(SC, limit_switches="stop", start_counts=18_000.0) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=10.0, velocity=20.0, acceleration=100.0))
+        await asyncio.sleep(0.19)
+        turned = rig.position_mm
+        assert turned < 20.0
+
+        state = await rig.done(MoveAbsolute(position=-1.0, acceleration=100.0, buffer_mode="aborting"))
+
+        assert state.last_error is not None
+        assert state.last_error.endswith("the forward limit switch")

@@ -1,0 +1,172 @@
+"""Rotary axes: positions that repeat, the way to turn, and no end at the range of the drive's counter."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+
+import pytest
+from pydantic import ValidationError
+
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.errors import NotSupported, OutcomeUnknown, WrongState
+from ldcnd.model.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
+from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.sim.plant import MotorPlant
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V1, V4, DialectRig, adopting_rig, dialect_rig
+
+ENDLESS = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=2**40, index_at_counts=2**30)
+ROTARY = {"modulo": 10.0, "home": {"method": "index", "velocity": 1.0}}
+NEAR_END = 2**31 - 5_000
+WAYS = Direction
+
+
+async def position(rig: DialectRig) -> PositionSample:
+    async with asyncio.timeout(5.0), rig.rig.client.samples(AXIS, TelemetryItem.POSITION) as samples:
+        _, sample = await anext(samples)
+    assert isinstance(sample, PositionSample)
+    return sample
+
+
+@asynccontextmanager
+async def near_the_end(dialect, side: int = 1, **axis: object) -> AsyncIterator[DialectRig]:
+    """Run a daemon on an axis that has turned in one direction for long: its counter is near the end."""
+    async with dialect_rig(dialect, ENDLESS, **axis) as before:
+        before.drive.loop._zero -= side * NEAR_END
+    async with adopting_rig(dialect, before, **axis) as rig:
+        await rig.power_on()
+        await rig.send(SetPosition(position=4.0))
+        yield rig
+
+
+@pytest.mark.parametrize(
+    ("start", "target", "direction", "ends_at"),
+    [
+        (1.0, 4.0, None, 4.0),
+        (1.0, 9.0, None, -1.0),
+        (1.0, 9.0, WAYS.POSITIVE, 9.0),
+        (1.0, 4.0, WAYS.NEGATIVE, -6.0),
+        (9.0, 1.0, WAYS.SHORTEST_WAY, 11.0),
+        (2.0, 32.0, WAYS.POSITIVE, 2.0),
+        (2.0, -3.0, WAYS.SHORTEST_WAY, 7.0),
+    ],
+)
+async def test_an_axis_turns_the_shortest_way_or_as_it_is_told(start, target, direction, ends_at):
+    async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        await rig.done(MoveRelative(distance=start))
+
+        reply = await rig.send(MoveAbsolute(position=target, direction=direction))
+        state = await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+        sample = await position(rig)
+
+        assert state.last_error is None
+        assert rig.position_mm == pytest.approx(ends_at, abs=0.01)
+        assert reply.position == pytest.approx(ends_at % 10.0, abs=0.001)
+        assert sample.turns * 10.0 + sample.value == pytest.approx(ends_at, abs=0.01)
+        assert 0.0 <= sample.value < 10.0
+
+
+async def test_a_position_where_the_axis_is_told_to_be_is_no_turn():
+    async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        await rig.done(MoveAbsolute(position=3.3333))
+
+        for direction in WAYS:
+            await rig.done(MoveAbsolute(position=3.3333, direction=direction))
+
+        assert rig.position_mm == pytest.approx(3.333, abs=0.005)
+
+
+async def test_set_points_are_followed_through_the_turn():
+    async with dialect_rig(V4, ENDLESS, **ROTARY, tracking={"step": 0.5, "rate": 50}) as rig:
+        await rig.power_on()
+        for at in (9.8, 9.6, 9.9, 0.1, 0.3):
+            await rig.send(Track(position=at))
+            await asyncio.sleep(0.05)
+
+        assert rig.position_mm == pytest.approx(0.3, abs=0.02)
+
+
+@pytest.mark.parametrize("dialect", [V1, V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize("side", [1, -1])
+async def test_at_the_end_of_its_counter_an_axis_goes_on(dialect, side):
+    async with near_the_end(dialect, side, modulo=10.0) as rig:
+        before = rig.position_mm
+        for _ in range(3):
+            state = await rig.done(MoveRelative(distance=20.0 * side))
+            assert (state.state, state.last_error, state.referenced) == (AxisState.STANDSTILL, None, True)
+
+        sample = await position(rig)
+        assert rig.position_mm - before == pytest.approx(60.0 * side, abs=0.02)
+        assert sample.turns * 10.0 + sample.value == pytest.approx(4.0 + 60.0 * side, abs=0.02)
+        assert abs(rig.drive.loop.position) < 2**31 - 1
+        assert abs(sample.counts) > 2**31
+
+
+async def test_a_jog_at_the_end_of_the_counter_goes_on():
+    async with near_the_end(LS_182AP, jog_horizon_s=5.0) as rig:
+        state = await rig.done(MoveVelocity(velocity=10.0))
+
+        assert state.last_error is None
+        assert (await position(rig)).counts == pytest.approx(NEAR_END + 50_000, abs=100)
+
+
+async def test_a_jog_that_is_changed_on_its_way_does_not_run_through_the_counter():
+    async with near_the_end(LS_182AP, jog_horizon_s=0.3) as rig:
+        await rig.send(MoveVelocity(velocity=5.0))
+        await rig.send(MoveVelocity(velocity=10.0))
+        async with asyncio.timeout(5.0):
+            state = await rig.until(lambda state: state.state is AxisState.STANDSTILL)
+
+        assert state.referenced
+
+
+async def test_homing_near_the_end_of_the_counter_takes_the_reference_over():
+    plant = replace(ENDLESS, index_at_counts=6_000, index_spacing_counts=2**31)
+    async with dialect_rig(LS_182AP, plant) as before:
+        before.drive.loop._zero -= NEAR_END
+    async with adopting_rig(LS_182AP, before) as rig:
+        await rig.power_on()
+        state = await rig.done(Home(method="index", velocity=1.0, position=2.0))
+
+        sample = await position(rig)
+        assert (state.last_error, state.referenced) == (None, True)
+        assert sample.value == pytest.approx(2.0 + rig.position_mm - 6.0, abs=0.005)
+
+
+async def test_a_lost_acknowledgement_of_the_counter_leaves_no_wrong_position(monkeypatch):
+    async with near_the_end(V4, modulo=10.0) as rig:
+        bus = rig.rig.daemon.rig.buses[0].bus
+        execute = bus.execute
+
+        async def lose(exchange, *lanes, **options):
+            reply = await execute(exchange, *lanes, **options)
+            if exchange.request[2] & 0x0F == Command.RESET_POSITION:
+                raise OutcomeUnknown("the reply was lost")
+            return reply
+
+        monkeypatch.setattr(bus, "execute", lose)
+        state = await rig.done(MoveRelative(distance=20.0))
+
+        assert (state.last_error, state.referenced) == (None, True)
+        assert (await position(rig)).value == pytest.approx(4.0, abs=0.02)
+
+
+async def test_an_sc_in_mid_move_is_not_set_back():
+    async with near_the_end(SC) as rig:
+        await rig.send(MoveRelative(distance=4.0, velocity=1.0))
+        await asyncio.sleep(0.3)
+
+        with pytest.raises(WrongState, match="beyond the drive's 32-bit counter"):
+            await rig.send(MoveRelative(distance=50.0, buffer_mode="aborting"))
+
+
+async def test_a_direction_needs_a_modulo_and_a_modulo_no_limits():
+    async with dialect_rig(V4) as rig:
+        await rig.power_on()
+        with pytest.raises(NotSupported, match="no modulo"):
+            await rig.send(MoveAbsolute(position=1.0, direction=WAYS.POSITIVE))
+    with pytest.raises(ValidationError, match="no position limits"):
+        async with dialect_rig(V4, modulo=360.0, limits={"position_max": 5.0}):
+            pass
