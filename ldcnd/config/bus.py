@@ -2,12 +2,12 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from ldcnd.config.axis import AxisConfig
 from ldcnd.config.toml import DeviceIdentity, Name, refuse_duplicates
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PROFILES, at_clock
-from ldcnd.drivers.ldcn.registers import BaudCodes, baud_divisor
+from ldcnd.drivers.ldcn.registers import baud_divisor
 from ldcnd.drivers.line import AdoptFallback, StartPolicy
 from ldcnd.drivers.smartstep import config as smartstep_config
 from ldcnd.drivers.smartstep.config import SmartStepLineConfig
@@ -88,11 +88,11 @@ class BusConfig(Frozen):
     """The drive family on it."""
     smartstep: SmartStepLineConfig = SmartStepLineConfig()
     """How a line of the smartstep family is wired; its rate is always 9600."""
+    clock_mhz: float = Field(default=20.0, ge=10.0, le=20.0)
+    """Clock of the drives; PIC-SERVO up to version 5 only, all with the same. Servo cycle and rates follow it."""
     baud: int = Field(default=19_200, gt=0, le=BAUDS[-1])
     """The working rate: 9600, 19200, 57600, 115200, 230400, or on LDCN and NMC drives another that a divisor of their
     clock makes, such as 125000; the port has to make it, too."""
-    clock_mhz: float = Field(default=20.0, ge=10.0, le=20.0)
-    """Clock of the drives; PIC-SERVO up to version 5 only, all with the same. Servo cycle and rates follow it."""
     margin_ms: float = Field(default=5.0, gt=0, le=1000)
     """Added to every reply's deadline: host scheduling and adapter latency."""
     rs485: Rs485Config | None = None
@@ -124,6 +124,20 @@ None where polls would miss their turns for it."""
     """Axes that start and stop together."""
     recorder: RecorderConfig = RecorderConfig()
     """The flight recorder of the line."""
+
+    @field_validator("baud")
+    @classmethod
+    def _possible_rate(cls, baud: int, known: ValidationInfo) -> int:
+        """Refuse a rate that no drive has: one of the list, or on LDCN and NMC what a divisor makes."""
+        if baud in BAUDS:
+            return baud
+        if known.data.get("family") != "ldcn":
+            raise ValueError(f"no drive has this rate; known are {', '.join(map(str, BAUDS))}")
+        try:
+            baud_divisor(baud, clock_hz=round(known.data.get("clock_mhz", 20.0) * 1e6))
+        except ValueOutOfRange as error:
+            raise ValueError(f"{error.message}; known are {', '.join(map(str, BAUDS))}") from None
+        return baud
 
     @property
     def transmitter(self) -> Rs485 | None:
@@ -181,9 +195,6 @@ None where polls would miss their turns for it."""
 
     @model_validator(mode="after")
     def _reachable_rate(self) -> Self:
-        printed = self.baud in BAUDS
-        if self.family != "ldcn" and not printed:
-            raise ValueError(f"baud {self.baud}: no drive has this rate; known are {', '.join(map(str, BAUDS))}")
         for address, model in self._models.items():
             profile = PROFILES.get(model)
             if profile is None:
@@ -193,13 +204,8 @@ None where polls would miss their turns for it."""
             top = at_clock(profile, self.clock_hz).top_baud
             if self.baud > top:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {top} at most")
-            if profile.baud_keys and not printed:
+            if profile.baud_keys and self.baud not in BAUDS:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} knows {', '.join(map(str, BAUDS))}")
-        if self.family == "ldcn":
-            try:
-                baud_divisor(self.baud, BaudCodes(self.divisors), self.clock_hz)
-            except ValueOutOfRange as error:
-                raise ValueError(f"baud {self.baud}: {error.message}") from None
         return self
 
     @model_validator(mode="after")

@@ -321,7 +321,7 @@ async def test_the_stop_of_a_rig_closes_no_open_loop():
         ('group = [{ name = "g", axes = ["x", "nobody"] }]', "no axis 'nobody' on this bus"),
         ('group = [{ name = "g", axes = ["x", "y"], leader = "z" }]', "leader 'z' is not one of x, y"),
         ('group = [{ name = "g", axes = ["x", "y"] }, { name = "h", axes = ["y", "z"] }]', "'y' is given more than"),
-        ("baud = 230400", "ls-182ap at address 1 reaches 115200 at most"),
+        ("baud = 230400", "ls-182ap at address 1 reaches 125000 at most"),
         ('module = [{ address = 4, model = "pic-io" }]', "address 4 of a module is given twice"),
         ('module = [{ address = 5, model = "toaster" }]', "no such module"),
     ],

@@ -37,7 +37,7 @@ async def test_an_sc_goes_on_to_the_new_goal_without_a_halt(then, ends_at):
         done = await rig.done(then)
         assert stops(rig) == before
         assert done.last_error is None
-        assert rig.position_mm == pytest.approx(ends_at, abs=0.02)
+        assert rig.position_mm == pytest.approx(ends_at, abs=0.05)
 
 
 async def test_a_jog_of_an_sc_becomes_a_move_without_a_halt():
@@ -50,7 +50,7 @@ async def test_a_jog_of_an_sc_becomes_a_move_without_a_halt():
         await rig.done(MoveAbsolute(position=12.0, buffer_mode="aborting"))
 
         assert stops(rig) == before
-        assert rig.position_mm == pytest.approx(12.0, abs=0.02)
+        assert rig.position_mm == pytest.approx(12.0, abs=0.05)
 
 
 async def test_a_move_of_an_sc_is_refused_in_mid_move_unless_it_says_so():
@@ -72,7 +72,7 @@ async def test_another_drive_is_halted_first():
         await rig.done(MoveAbsolute(position=-5.0, velocity=10.0, buffer_mode="aborting"))
 
         assert stops(rig) == before + 1
-        assert rig.position_mm == pytest.approx(-5.0, abs=0.02)
+        assert rig.position_mm == pytest.approx(-5.0, abs=0.05)
 
 
 async def test_the_switch_ahead_stops_an_sc_that_turns_round_too_late():

@@ -32,7 +32,7 @@ async def position(rig: DialectRig) -> PositionSample:
 async def near_the_end(dialect, side: int = 1, **axis: object) -> AsyncIterator[DialectRig]:
     """Run a daemon on an axis that has turned in one direction for long: its counter is near the end."""
     async with dialect_rig(dialect, ENDLESS, **axis) as before:
-        before.drive.loop._zero -= side * NEAR_END
+        before.drive.loop.renumber(side * NEAR_END)
     async with adopting_rig(dialect, before, **axis) as rig:
         await rig.power_on()
         await rig.send(SetPosition(position=4.0))
@@ -61,9 +61,9 @@ async def test_an_axis_turns_the_shortest_way_or_as_it_is_told(start, target, di
         sample = await position(rig)
 
         assert state.last_error is None
-        assert rig.position_mm == pytest.approx(ends_at, abs=0.01)
+        assert rig.position_mm == pytest.approx(ends_at, abs=0.05)
         assert reply.position == pytest.approx(ends_at % 10.0, abs=0.001)
-        assert sample.turns * 10.0 + sample.value == pytest.approx(ends_at, abs=0.01)
+        assert sample.turns * 10.0 + sample.value == pytest.approx(ends_at, abs=0.05)
         assert 0.0 <= sample.value < 10.0
 
 
@@ -125,7 +125,7 @@ async def test_a_jog_that_is_changed_on_its_way_does_not_run_through_the_counter
 async def test_homing_near_the_end_of_the_counter_takes_the_reference_over():
     plant = replace(ENDLESS, index_at_counts=6_000, index_spacing_counts=2**31)
     async with dialect_rig(LS_182AP, plant) as before:
-        before.drive.loop._zero -= NEAR_END
+        before.drive.loop.renumber(NEAR_END)
     async with adopting_rig(LS_182AP, before) as rig:
         await rig.power_on()
         state = await rig.done(Home(method="index", velocity=1.0, position=2.0))

@@ -57,7 +57,7 @@ def test_a_group_without_a_leader_stays_silent_for_a_servo_cycle():
     exchange = commands.start_motion(Group(0xFF))
 
     assert exchange.request == bytes.fromhex("aa ff 05 04")
-    assert (exchange.reply_bytes, exchange.response_s, exchange.node) == (0, commands.GROUP_QUIET_S, 0xFF)
+    assert (exchange.reply_bytes, exchange.response_s, exchange.node) == (0, commands.group_quiet_s(), 0xFF)
     assert exchange.decode(b"") is None
 
 
@@ -399,4 +399,4 @@ def test_only_sc_reaches_230400():
     for group in (Group(0xFF), Group(0xFF, V4)):
         with pytest.raises(ValueOutOfRange) as refusal:
             commands.set_baud(group, 230_400)
-        assert refusal.value.nearest == 115_200
+        assert refusal.value.nearest == 125_000

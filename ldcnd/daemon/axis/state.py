@@ -309,6 +309,8 @@ class AxisTracker:
             self.last_error = None
         elif self.command.command_id != command.command_id:
             self._end(CommandStatus.ABORTED, f"aborted by {command.verb}")
+            if command.state is not AxisState.STOPPING:
+                self.last_error = None  # the motion goes on as another command's
         self.command = command
         self.state = command.state
         self._effective_from_s = now_s

@@ -27,6 +27,8 @@ from ldcnd.model.samples import (
 StateKey = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None]
 Inputs = tuple[bool | None, bool | None, bool | None, bool | None, bool | None]
 """Reverse limit, forward limit, index, stop input, amplifier enable."""
+INPUTS_NS = 1_000_000_000
+"""Inputs are published when one changes, and when so long has passed."""
 FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
 
 # five of each poll, of values that are checked when they come off the wire
@@ -75,6 +77,7 @@ class AxisTelemetry:
         self._shows_inputs = shows_inputs
         self._modulo = modulo
         self._last_inputs: Inputs | None = None
+        self._inputs_at_ns = 0
 
     def position(self, counts: float) -> float:
         """Return the position that a count of the drive stands for, in axis units, counted through all turns."""
@@ -148,8 +151,8 @@ class AxisTelemetry:
             reading.stop_input,
             reading.amplifier_enable,
         )
-        if self._shows_inputs and (due or inputs != self._last_inputs):
-            self._last_inputs = inputs
+        if self._shows_inputs and (inputs != self._last_inputs or t - self._inputs_at_ns > INPUTS_NS):
+            self._last_inputs, self._inputs_at_ns = inputs, t
             reverse, forward, index, stop_input, amplifier_enable = inputs
             topic = self._inputs
             topic.publish(

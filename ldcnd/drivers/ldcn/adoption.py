@@ -257,16 +257,16 @@ class Rejoin:
         Raises:
             BusError: the line failed meanwhile.
         """
-        if not self._rate.changeable and self._bus.baud != RESET_BAUD:
+        if not self._rate.changeable and self._bus.baud != self._rate.at_reset:
             return False
         lost = [each for each in self._expected if each.address not in found]
         rates = {each.baud for each in found.values()}
-        if len(rates) == 1 and not (lost and await self._rate.who_is_at(RESET_BAUD, UNADDRESSED)):
+        if len(rates) == 1 and not (lost and await self._rate.who_is_at(self._rate.at_reset, UNADDRESSED)):
             return False
-        for baud in rates - {RESET_BAUD, self._bus.baud}:
+        for baud in rates - {self._rate.at_reset, self._bus.baud}:
             await self._rate.host_to(baud)
             await self._addressing.without_leaders()
-            await self._rate.everybody_to(RESET_BAUD)
+            await self._rate.everybody_to(self._rate.at_reset)
             await self._rate.host_to(self._rate.working)
         await self._at_reset_baud(lost, addressing)
         return True

@@ -373,11 +373,9 @@ class LdcnAxis(AxisDriver):
             DriveFault: the analog sensor is out of its range.
         """
         if isinstance(motion, Motion):
-            if (
-                motion.target_counts is not None
-                and abs(motion.target_counts - self.state.offset_counts) > LARGEST_COUNT
-            ):
-                await self._set_counter_back()
+            target = motion.target_counts
+            if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
+                await self._set_counter_back(target)
             in_counter: Motion | AnalogMotion | PwmOutput = _shifted(motion, self.state.offset_counts)
         else:
             in_counter = motion
@@ -395,13 +393,14 @@ class LdcnAxis(AxisDriver):
             opens_loop=isinstance(motion, PwmOutput) or (home is not None and opens_loop(self.profile, home)),
         )
 
-    async def _set_counter_back(self) -> None:
+    async def _set_counter_back(self, target_counts: int) -> None:
         """Set the position counter to 0 by Reset Position, which is forbidden during a trapezoidal move (manuals).
 
         The host adds what the counter has lost. It takes that from the status before, so each time can cost the counts
         by which the loop hunts at rest. A lost reply is no harm: the next position tells whether it was executed.
 
         Raises:
+            ValueOutOfRange: the target is farther away than the counter reaches.
             WrongState: the axis does not stand, or the counter is at 0 already.
             OutcomeUnknown: the counter is as it was.
         """
@@ -412,6 +411,15 @@ class LdcnAxis(AxisDriver):
                 f"axis {self.spec.name}: the target is beyond the drive's 32-bit counter",
                 axis=self.spec.name,
                 remedy="send halt first: at standstill the counter is set back",
+            )
+        away = abs(target_counts - self.state.offset_counts - before)
+        if away > LARGEST_COUNT:
+            raise ValueOutOfRange(
+                f"axis {self.spec.name}: {away} counts do not fit the drive's 32-bit counter",
+                axis=self.spec.name,
+                value=away,
+                limit=LARGEST_COUNT,
+                nearest=LARGEST_COUNT,
             )
         if abs(before) < LEAST_SET_BACK:
             raise WrongState(
