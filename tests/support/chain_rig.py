@@ -11,8 +11,8 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.drivers.ldcn.addressing import RESET_BAUD
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
+from ldcnd.drivers.ldcn.registers import RESET_BAUD
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -271,7 +271,10 @@ class LdcnNetwork(Network):
         keeps the next one from hearing. If only some wait, modules meet at one address, the attempt fails, and the next
         one is not the first at which something was heard.
         """
-        if not await self._rate.host_to(self._rate.at_reset) or await self._rate.who_is(UNADDRESSED, patient=True) is None:
+        if (
+            not await self._rate.host_to(self._rate.at_reset)
+            or await self._rate.who_is(UNADDRESSED, patient=True) is None
+        ):
             return False
         for baud in self._rate.candidates if self._rate.changeable else (self._rate.at_reset,):
             if await self._rate.who_is_at(baud, self._expected[0].address):
