@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -61,3 +62,25 @@ def pytest_configure() -> None:
     path, node, kind = json.loads(os.environ[MUTANT])
     mutant = Mutant(path, "", "", (0, 0), node, kind, "")
     sys.meta_path.insert(0, ChangedFinder(mutant, Path(__file__).parents[2]))
+
+
+@dataclass(frozen=True, slots=True)
+class Revert:
+    """One fix that is taken back.
+
+    Attributes:
+        path: of the module.
+        fixed: what stands there, exactly once.
+        broken: what stood there, or what comes to the same.
+        noticed_by: tests every one of which fails without the fix.
+    """
+
+    path: str
+    fixed: str
+    broken: str
+    noticed_by: tuple[str, ...]
+
+    def module(self, root: Path) -> CodeType:
+        """Return the module without the fix."""
+        source = (root / self.path).read_text(encoding="utf-8").replace(self.fixed, self.broken)
+        return compile(source, str(root / self.path), "exec")

@@ -5,11 +5,10 @@ The environment says which fix is missing (`LDCND_REVERT`: its place in `REVERTS
 
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType
 
-from tests.mutants.applied import ChangedFinder
+from tests.mutants.applied import ChangedFinder, Revert
+from tests.mutants.ldcn_reverts import LDCN_REVERTS
 
 ROOT = Path(__file__).parents[2]
 REVERT = "LDCND_REVERT"
@@ -19,28 +18,6 @@ LEDGER = "tests/unit/test_ledger.py::"
 PERMISSION = "tests/integration/test_permission.py::"
 CAMPAIGN = "tests/property/test_control_campaign.py::"
 START = "tests/integration/test_start_policies.py::"
-
-
-@dataclass(frozen=True, slots=True)
-class Revert:
-    """One fix that is taken back.
-
-    Attributes:
-        path: of the module.
-        fixed: what stands there, exactly once.
-        broken: what stood there, or what comes to the same.
-        noticed_by: tests every one of which fails without the fix.
-    """
-
-    path: str
-    fixed: str
-    broken: str
-    noticed_by: tuple[str, ...]
-
-    def module(self, root: Path) -> CodeType:
-        """Return the module without the fix."""
-        source = (root / self.path).read_text(encoding="utf-8").replace(self.fixed, self.broken)
-        return compile(source, str(root / self.path), "exec")
 
 
 REVERTS = (
@@ -246,6 +223,7 @@ REVERTS = (
         "            pass\n",
         ("tests/integration/test_rough_lines.py::test_a_rough_line_shows_no_false_position_and_lets_stops_through",),
     ),
+    *LDCN_REVERTS,
 )
 
 
