@@ -7,14 +7,14 @@ from pathlib import Path
 import click
 
 from ldcnd.cli import replay
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
 from ldcnd.drivers.dissector import install
 from ldcnd.drivers.transcript import Describe, describer
-from ldcnd.model.rig_commands import Snapshot
+from ldcnd.model.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.wirelog.pcapng import encode_pcapng
 from ldcnd.wirelog.recorder import WireEvent, WireRecord, parse_records
@@ -49,6 +49,42 @@ def command() -> None:
 
 
 command.add_command(replay.command)
+
+
+@command.command("set-io")
+@click.argument("module")
+@click.argument("lines", nargs=-1, metavar="[LINE=LEVEL]...")
+@click.option("--pwm1", type=Finite(), help="Share of time for which PWM output 1 is on, 0 to 1.")
+@click.option("--pwm2", type=Finite(), help="Likewise output 2.")
+@click.option("--lease", envvar="LDCND_LEASE", help="Send it under this lease, as `ldcnd lease hold` prints it.")
+@with_target
+def set_io(
+    target: Target, module: str, lines: tuple[str, ...], pwm1: float | None, pwm2: float | None, lease: str | None
+) -> None:
+    """Set outputs of the I/O module MODULE: `4=high 9=low 5=input`; what is left out stays as it is."""
+    wanted = dict(each.partition("=")[::2] for each in lines)
+    request = of_options(SetIo, module=module, lines=wanted, pwm1=pwm1, pwm2=pwm2, lease=lease)
+    target.show(*_shown(target.run(lambda client: client.ask(request))))
+
+
+@command.command("set-io-timer")
+@click.argument("module")
+@click.argument("mode", type=click.Choice([mode.value for mode in IoTimer]))
+@click.option(
+    "--prescale", type=click.Choice(["1", "2", "4", "8"]), default="1", help="Edges or clocks for each count."
+)
+@click.option("--lease", envvar="LDCND_LEASE", help="Send it under this lease, as `ldcnd lease hold` prints it.")
+@with_target
+def set_io_timer(target: Target, module: str, mode: str, prescale: str, lease: str | None) -> None:
+    """Choose what the counter of the I/O module MODULE counts."""
+    request = of_options(SetIoTimer, module=module, mode=mode, prescale=int(prescale), lease=lease)
+    target.show(*_shown(target.run(lambda client: client.ask(request))))
+
+
+def _shown(reply: IoReply) -> tuple[IoReply, str]:
+    levels = " ".join(f"{line}={'high' if level else 'low'}" for line, level in enumerate(reply.levels, 1))
+    outputs = "not known" if reply.outputs is None else ", ".join(map(str, reply.outputs)) or "none"
+    return reply, f"{reply.module}: {levels}; outputs: {outputs}"
 
 
 @command.command()

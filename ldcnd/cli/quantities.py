@@ -9,6 +9,7 @@ from ldcnd.model.samples import (
     AxisState,
     FaultSample,
     InputsSample,
+    IoSample,
     LatchSample,
     Moving,
     PositionSample,
@@ -101,6 +102,9 @@ def sample_text(sample: Sample) -> str:
         case LatchSample():
             at = f"{sample.value:14.4f} {sample.unit}, up to {sample.error:.2g} {sample.unit} behind the edge"
             return f"latch    {at}{_worth(sample)}"
+        case IoSample():
+            pins = "".join("01"[level] for level in sample.levels)
+            return f"io       lines 1 to 12 {pins}, A/D {sample.adc}, counter {sample.counter}{_worth(sample)}"
         case StateSample():
             moving = "" if sample.moving is not Moving.UNKNOWN else ", moving: unknown"
             link = "" if sample.link == "up" else f", link {sample.link}"

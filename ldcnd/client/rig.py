@@ -6,7 +6,7 @@ import os
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import overload
+from typing import Literal, overload
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.events import Events, follow_events
@@ -19,7 +19,20 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.commands import StopReply
 from ldcnd.model.events import CommandOutcome, ReadOutcome
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
-from ldcnd.model.rig_commands import Acquire, AxisMove, HolderList, ListHolders, MoveTogether, Snapshot, SnapshotReply
+from ldcnd.model.rig_commands import (
+    Acquire,
+    AxisMove,
+    HolderList,
+    IoLevel,
+    IoReply,
+    IoTimer,
+    ListHolders,
+    MoveTogether,
+    SetIo,
+    SetIoTimer,
+    Snapshot,
+    SnapshotReply,
+)
 from ldcnd.model.samples import FaultSample
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -186,6 +199,33 @@ class Rig:
             NotSupported: the line is not configured for it.
         """
         return await self._client.ask(Snapshot(bus=bus))
+
+    async def set_io(
+        self,
+        module: str,
+        lines: Mapping[int, IoLevel | str] | None = None,
+        *,
+        pwm1: float | None = None,
+        pwm2: float | None = None,
+        lease: str | None = None,
+    ) -> IoReply:
+        """Set outputs of an I/O module; what is left out stays as it is.
+
+        Args:
+            module: its configured name.
+            lines: by number: `high`, `low`, or `input`.
+            pwm1: share of time for which PWM output 1 is on, 0 to 1.
+            pwm2: likewise output 2.
+            lease: must cover the axes of the module's line, where a motion of them would need one.
+        """
+        levels = {line: IoLevel(level) for line, level in (lines or {}).items()}
+        return await self._client.ask(SetIo(module=module, lines=levels, pwm1=pwm1, pwm2=pwm2, lease=lease))
+
+    async def set_io_timer(
+        self, module: str, mode: IoTimer | str, *, prescale: Literal[1, 2, 4, 8] = 1, lease: str | None = None
+    ) -> IoReply:
+        """Choose what the counter of an I/O module counts: `timer`, `counter` (edges of line 10), or `off`."""
+        return await self._client.ask(SetIoTimer(module=module, mode=IoTimer(mode), prescale=prescale, lease=lease))
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Return what became of a command."""

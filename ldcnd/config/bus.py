@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 
 from ldcnd.config.axis import AxisConfig
 from ldcnd.config.toml import DeviceIdentity, Name, refuse_duplicates
-from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PROFILES, at_clock
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, at_clock
 from ldcnd.drivers.ldcn.registers import baud_divisor
 from ldcnd.drivers.line import AdoptFallback, StartPolicy
 from ldcnd.drivers.smartstep import config as smartstep_config
@@ -40,6 +40,20 @@ class ModuleConfig(Frozen):
     """The module model."""
     identity: DeviceIdentity | None = None
     """As for an axis."""
+    name: Name | None = None
+    """Of a PIC-I/O: its inputs are published and its outputs can be set under this name; unique among the axes."""
+    outputs: tuple[Annotated[int, Field(ge=1, le=12)], ...] = ()
+    """Lines of a PIC-I/O that may be driven; all others stay inputs. Nothing is driven before it is asked for."""
+    rate: float = Field(default=5.0, gt=0, le=500)
+    """How often a PIC-I/O is asked, in Hz."""
+
+    @model_validator(mode="after")
+    def _has_terminals(self) -> Self:
+        if (self.name or self.outputs) and self.model != PIC_IO.name:
+            raise ValueError(f"name and outputs: a {self.model} has no lines to serve")
+        if self.outputs and not self.name:
+            raise ValueError("outputs: nobody can set them without a name of the module")
+        return self
 
 
 class GroupConfig(Frozen):

@@ -132,7 +132,8 @@ class RigConfig(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         refuse_duplicates("bus", [bus.name for bus in self.bus])
-        refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis])
+        named = [module.name for bus in self.bus for module in bus.module if module.name]
+        refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis] + named)
         refuse_duplicates("sim", [line.name for line in self.sim])
         ports = [bus.port for bus in self.bus]
         refuse_duplicates("port", ports)

@@ -30,11 +30,17 @@ class ModuleEntry:
         address: node address, 1 to 127.
         model: profile name of the family.
         identity: see `AxisSpec`.
+        name: of an I/O module that is served; empty for one that is only watched.
+        outputs: its lines that may be driven.
+        rate_hz: how often it is asked.
     """
 
     address: int
     model: str
     identity: tuple[int, int] | None = None
+    name: str = ""
+    outputs: tuple[int, ...] = ()
+    rate_hz: float = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +91,7 @@ class FoundModule:
         model: profile name; None when nobody described this device: then it is never moved.
         device_id: as it reports.
         version: as it reports.
+        name: under which an I/O module is served.
         axis: the axis it is; None for a module that is only kept on the line.
         status: its latest status byte; None for an axis, whose state is telemetry.
     """
@@ -96,3 +103,4 @@ class FoundModule:
     version: int
     axis: str | None
     status: int | None
+    name: str | None = None

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from ldcnd.bus.poller import Poller
@@ -10,6 +11,7 @@ from ldcnd.bus.resync import Resync
 from ldcnd.drivers.driver import AxisDriver, Motion, StopMode
 from ldcnd.drivers.line import FoundModule
 from ldcnd.errors import NotSupported
+from ldcnd.exchange import Timing
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +52,69 @@ class Instant:
     until_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class IoReading:
+    """What one poll of an I/O module said, and what it was told.
+
+    Attributes:
+        levels: of its lines, the first is line 1; true is high.
+        outputs: lines that are outputs; None while that is not known.
+        adc: of its analog inputs, 0 to 255 for 0 to 5 V.
+        counter: counter or timer, 32 bits that wrap silently.
+        pwm: shares of time for which its PWM outputs are on; None while they are not known.
+    """
+
+    levels: tuple[bool, ...]
+    outputs: tuple[int, ...] | None
+    adc: tuple[int, ...]
+    counter: int
+    pwm: tuple[float, float] | None
+
+
+class IoDriver(ABC):
+    """An I/O module of a line.
+
+    Attributes:
+        name: as configured.
+        observed: called with each reading.
+        lost: called when a poll brought nothing.
+    """
+
+    name: str
+    observed: Callable[[IoReading, Timing], None]
+    lost: Callable[[], None]
+
+    @abstractmethod
+    async def set_outputs(
+        self, levels: Mapping[int, bool], inputs: frozenset[int], pwm: tuple[float | None, float | None]
+    ) -> IoReading:
+        """Drive lines to levels, make others inputs, set PWM outputs; return what the pins show afterwards.
+
+        A line that becomes an output may be low for the time between two packets.
+
+        Raises:
+            ValueOutOfRange: a line is not configured as an output.
+            WrongState: what the others are is not known, and they are not named.
+            BusError: the line failed.
+        """
+
+    @abstractmethod
+    async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:
+        """Run the counter or timer, one count for each `prescale` edges or clocks; the count goes on."""
+
+
 class Network(ABC):
     """All drives of one line.
 
     Attributes:
         axes: by axis name.
         resync: how the bus gets this line back in step.
+        io: its I/O modules that have a name, by name.
     """
 
     axes: Mapping[str, AxisDriver]
     resync: Resync
+    io: Mapping[str, IoDriver] = MappingProxyType({})
 
     @property
     def modules(self) -> tuple[FoundModule, ...]:

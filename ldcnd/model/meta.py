@@ -72,6 +72,8 @@ class ModuleInfo(Frozen):
     """As it reports."""
     axis: str | None
     """The axis that it is; null for a module that is only kept on the line."""
+    name: str | None = None
+    """Under which an I/O module is served; null for others."""
     status: int | None
     """Latest status byte of a module that is no axis; null while it does not answer, and for axes."""
 

@@ -1,6 +1,7 @@
 """What the rig as a whole can be asked: leases, moves of several axes, loss drills, what was on a line."""
 
 from enum import StrEnum
+from typing import Literal
 
 from pydantic import ConfigDict, Field
 
@@ -165,6 +166,75 @@ class Snapshot(Command[SnapshotReply]):
     """Which line; it needs `snapshot = true`."""
 
 
+class IoLevel(StrEnum):
+    """What a line of an I/O module does."""
+
+    HIGH = "high"
+    LOW = "low"
+    INPUT = "input"
+    """It is driven from outside, or pulled up."""
+
+
+class IoReply(Frozen):
+    """The module acknowledged it; what its pins show now."""
+
+    module: str
+    """The module."""
+    levels: tuple[bool, ...]
+    """Levels of the lines, the first is line 1; an output that is shorted shows the level of its pin."""
+    outputs: tuple[int, ...] | None
+    """Lines that are outputs."""
+
+
+class SetIo(Command[IoReply]):
+    """Set outputs of an I/O module; what is left out stays as it is. What they switch, the daemon does not know.
+
+    They keep what they were told when the daemon or its client ends: nothing in the module watches over them.
+    """
+
+    verb = "set_io"
+    about = About.RIG
+
+    module: str
+    """Which module, by its configured name."""
+    lines: dict[int, IoLevel] = Field(default_factory=dict)
+    """By number, 1 to 12. Only lines that are configured as outputs can be driven; one that becomes an output may be
+    low for the time between two packets."""
+    pwm1: float | None = Field(default=None, ge=0, le=1)
+    """Share of time for which PWM output 1 is on."""
+    pwm2: float | None = Field(default=None, ge=0, le=1)
+    """Likewise output 2."""
+    lease: str | None = None
+    """The sender's lease: it must cover all axes on the module's line, where a motion of them would need one."""
+
+
+class IoTimer(StrEnum):
+    """What the counter of an I/O module counts."""
+
+    OFF = "off"
+    """Nothing: it keeps its count."""
+    TIMER = "timer"
+    """Clocks of 5 MHz."""
+    COUNTER = "counter"
+    """Rising edges of line 10, which must be an input."""
+
+
+class SetIoTimer(Command[IoReply]):
+    """Choose what the counter of an I/O module counts; there is no command that sets it."""
+
+    verb = "set_io_timer"
+    about = About.RIG
+
+    module: str
+    """Which module, by its configured name."""
+    mode: IoTimer
+    """What is counted."""
+    prescale: Literal[1, 2, 4, 8] = 1
+    """Edges or clocks for each count."""
+    lease: str | None = None
+    """As for `set_io`."""
+
+
 class Rehearsal(StrEnum):
     """Who is to disappear."""
 
@@ -251,5 +321,7 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     MoveTogether,
     ReadWireLog,
     Snapshot,
+    SetIo,
+    SetIoTimer,
 )
 """The commands about the rig, those about events included."""

@@ -54,6 +54,7 @@ class TelemetryItem(StrEnum):
     ADC = "adc"
     INPUTS = "inputs"
     LATCH = "latch"
+    IO = "io"
     FAULT = "fault"
     STATE = "state"
 
@@ -139,6 +140,23 @@ class LatchSample(Sample):
     """What it can have been."""
     command_id: str
     """Of the probe."""
+
+
+class IoSample(Sample):
+    """What the lines of an I/O module show, and what they were told; published under the name of the module."""
+
+    levels: tuple[bool, ...]
+    """Levels of the lines, the first is line 1; true is high. Outputs show their pins, too."""
+    outputs: tuple[int, ...] | None
+    """Lines that are outputs; null while that is not known, such as after a take-over."""
+    adc: tuple[int, ...]
+    """The analog inputs, 0 to 255."""
+    volts: tuple[float, ...]
+    """The same in volts, 5 V at full scale."""
+    counter: int
+    """Counter or timer: 32 bits that wrap silently; only differences mean something."""
+    pwm: tuple[float, ...] | None
+    """Shares of time for which the PWM outputs are on; null while they are not known."""
 
 
 class FaultEntry(Frozen):
@@ -249,6 +267,7 @@ SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {
     TelemetryItem.ADC: AdcSample,
     TelemetryItem.INPUTS: InputsSample,
     TelemetryItem.LATCH: LatchSample,
+    TelemetryItem.IO: IoSample,
     TelemetryItem.FAULT: FaultSample,
     TelemetryItem.STATE: StateSample,
 }

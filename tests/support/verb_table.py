@@ -35,13 +35,15 @@ EXPLAINED = {
     ("move_relative", "documentation"): "`ldcnd axis move --relative`, in the reference of the command line",
     ("read_monitors", "console"): "the page of the axis shows the monitors as they are published",
     ("snapshot", "console"): "answered by the console's server; no page sends it yet: `ldcnd bus snapshot`",
+    ("set_io", "console"): "what an output switches, a page cannot show: `ldcnd bus set-io`",
+    ("set_io_timer", "console"): "`ldcnd bus set-io-timer`",
     ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
     ("renew", "command line"): "a command that holds control renews it by itself",
     ("outcome", "command line"): "`ldcnd events` shows it",
 }
 """Why a verb is not in a place; everything else is there."""
-METHODS_OF_RIGS = {"holders", "outcome", "move_together", "snapshot"}
+METHODS_OF_RIGS = {"holders", "outcome", "move_together", "snapshot", "set_io", "set_io_timer"}
 BY_FUNCTIONS = {
     "events": ("follow_events", "latest_events"),
     "wire_log": ("fetch_wire_log",),

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 
+from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
@@ -14,6 +15,7 @@ from ldcnd.daemon.command.events import EventLog
 from ldcnd.daemon.command.ledger import Entry, Ledger
 from ldcnd.daemon.command.loss import LeaseWatch, concerned, rehearse
 from ldcnd.daemon.command.why import explain
+from ldcnd.daemon.line.modules import ModuleService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import (
     CommandExpired,
@@ -54,6 +56,8 @@ from ldcnd.model.rig_commands import (
     Rehearse,
     Release,
     Renew,
+    SetIo,
+    SetIoTimer,
     Snapshot,
 )
 
@@ -117,6 +121,13 @@ class Dispatcher:
                 return MoveTogetherReply(replies=await self._move_together(command, login))
             case Snapshot():
                 return await self._rig.line(command.bus).snapshot(self._clock)
+            case SetIo():
+                module = self._rig.module(command.module)
+                return await module.set_io(command, lambda: self._admit_module(module, command.lease))
+            case SetIoTimer():
+                module = self._rig.module(command.module)
+                self._admit_module(module, command.lease)
+                return await module.set_timer(command)
             case Rehearse():
                 self._admit_rehearsal(command)
                 return await rehearse(self._rig, command)
@@ -211,6 +222,16 @@ class Dispatcher:
         for axis in concerned(self._rig, command):
             self._refuse_rival(axis)
             self.authority.admit(axis, command.lease, None, self._clock.now_s())
+
+    def _admit_module(self, module: ModuleService, lease: str | None) -> None:
+        """Refuse outputs to who may not move the axes of the module's line, and while one of them is stopped.
+
+        What an output switches is not known: it may move something.
+        """
+        for name in module.axes:
+            self._refuse_rival(name)
+            self.authority.admit(name, lease, None, self._clock.now_s())
+            guards.check_not_latched(self._rig.axis(name).tracker.view())
 
     async def _answer_again(self, entry: Entry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""

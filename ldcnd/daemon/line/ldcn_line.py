@@ -62,7 +62,10 @@ def _line(settings: BusConfig) -> LineSpec:
         alternate_divisors=settings.divisors == "alternate",
         clock_hz=settings.clock_hz,
         snapshot=settings.snapshot,
-        modules=tuple(ModuleEntry(module.address, module.model, module.identity) for module in settings.module),
+        modules=tuple(
+            ModuleEntry(module.address, module.model, module.identity, module.name or "", module.outputs, module.rate)
+            for module in settings.module
+        ),
         groups=tuple(GroupSpec(group.name, group.axes, group.leader) for group in settings.group),
     )
 

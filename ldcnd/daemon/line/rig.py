@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.line.line import BusService
+from ldcnd.daemon.line.modules import ModuleService
 from ldcnd.drivers.driver import StopMode
 from ldcnd.errors import UnknownAxis, ValueOutOfRange
 
@@ -12,14 +13,22 @@ from ldcnd.errors import UnknownAxis, ValueOutOfRange
 class Rig:
     """All lines and axes of one daemon."""
 
-    def __init__(self, name: str, buses: tuple[BusService, ...], groups: Mapping[str, tuple[str, ...]]) -> None:
+    def __init__(
+        self,
+        name: str,
+        buses: tuple[BusService, ...],
+        groups: Mapping[str, tuple[str, ...]],
+        modules: tuple[ModuleService, ...] = (),
+    ) -> None:
         """Take what a rig consists of.
 
         Args:
             name: of the rig.
             buses: its lines.
             groups: configured groups, with the names of their axes.
+            modules: its I/O modules.
         """
+        self.modules = {module.name: module for module in modules}
         self.name = name
         self.buses = buses
         self.groups = groups
@@ -49,6 +58,20 @@ class Rig:
                 return line
         names = ", ".join(line.bus.settings.name for line in self.buses)
         raise ValueOutOfRange(f"rig {self.name} has no bus {name!r}; it has {names}", value=name)
+
+    def module(self, name: str) -> ModuleService:
+        """Return the I/O module of that name.
+
+        Raises:
+            ValueOutOfRange: there is none; names those that exist.
+        """
+        try:
+            return self.modules[name]
+        except KeyError:
+            names = ", ".join(self.modules) or "none"
+            raise ValueOutOfRange(
+                f"rig {self.name} has no module {name!r}; it has {names}", value=name, remedy="configure its name"
+            ) from None
 
     def members(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the axes that are meant by names of axes and of groups."""

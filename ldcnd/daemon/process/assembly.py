@@ -20,6 +20,7 @@ from ldcnd.daemon.command.ledger import Ledger
 from ldcnd.daemon.command.requests import EarlyStops
 from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.line import BusService
+from ldcnd.daemon.line.modules import ModuleService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.line.smartstep_line import build_line, open_ledger
 from ldcnd.daemon.process.daemon import Daemon
@@ -100,7 +101,12 @@ def build_daemon(
     eeprom = open_ledger(config.state_dir)
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
     buses = tuple(_build_bus(config, bus, make_axis, chains, openers, eeprom) for bus in config.bus)
-    rig = Rig(config.rig, buses, groups)
+    modules = tuple(
+        ModuleService(driver, publisher, clock, tuple(axis.config.name for axis in bus.axes))
+        for bus in buses
+        for driver in bus.network.io.values()
+    )
+    rig = Rig(config.rig, buses, groups, modules)
     authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
     dispatcher = Dispatcher(rig, authority, ledger, events, clock, next_command_id, instance)
 

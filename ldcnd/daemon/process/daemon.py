@@ -155,8 +155,8 @@ class Daemon:
             finally:
                 for task in serving:
                     task.cancel()
-                for axis in self.rig.axes:
-                    self._publisher.withdraw(axis)
+                for name in (*self.rig.axes, *self.rig.modules):
+                    self._publisher.withdraw(name)
         log.info("ended", rig=self.rig.name)
 
     async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:

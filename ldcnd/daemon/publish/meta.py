@@ -235,6 +235,8 @@ def _publishes(driver: AxisDriver, item: TelemetryItem) -> bool:
             return driver.shows_inputs
         case TelemetryItem.LATCH:
             return Verb.PROBE in driver.capabilities
+        case TelemetryItem.IO:
+            return False  # of modules, which are no axes
         case _:
             return True
 

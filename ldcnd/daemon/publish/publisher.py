@@ -14,6 +14,7 @@ QOS = {
     TelemetryItem.ADC: Qos.TELEMETRY,
     TelemetryItem.INPUTS: Qos.EVENT,
     TelemetryItem.LATCH: Qos.EVENT,
+    TelemetryItem.IO: Qos.TELEMETRY,
     TelemetryItem.FAULT: Qos.EVENT,
     TelemetryItem.STATE: Qos.EVENT,
 }

@@ -32,12 +32,13 @@ from ldcnd.drivers.ldcn.addressing import (
 from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found, Rejoin
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
+from ldcnd.drivers.ldcn.io_module import IoModule
 from ldcnd.drivers.ldcn.profiles import PROFILES, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
-from ldcnd.drivers.network import BringUpReport, Instant, Network
+from ldcnd.drivers.network import BringUpReport, Instant, IoDriver, Network
 from ldcnd.errors import BusError, NetworkMismatch
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
@@ -95,7 +96,7 @@ class LdcnNetwork(Network):
         }
         self._names = {spec.address: spec.name for spec in specs}
         self._identities: dict[int, Identity] = {}
-        self._watches: dict[int, ModuleWatch] = {}
+        self._watches: dict[int, ModuleWatch | IoModule] = {}
         self._was_up = False
         self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
         self._disturbed = False  # an attempt to reset the line has failed on the way
@@ -116,6 +117,8 @@ class LdcnNetwork(Network):
         drives = {drive.spec.name: drive for drive in self._drives.values()}
         self._groups = Groups(bus, plan, self._addressing, drives, snapshots=line.snapshot)
         self.axes: Mapping[str, AxisDriver] = drives
+        self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
+        self.io: Mapping[str, IoDriver] = {module.name: module for module in self._io.values()}
         self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)
 
     # -- bring-up ----------------------------------------------------------------------------------------------------
@@ -142,6 +145,8 @@ class LdcnNetwork(Network):
                 return replace(report, open_loops=found_open, restarted=restarted)
         for drive in self._drives.values():
             drive.forget()
+        for module in self._io.values():
+            module.forget()
         modules, found = await self._start_afresh()
         return self._up(modules, remarks + found, reset=True)
 
@@ -156,6 +161,8 @@ class LdcnNetwork(Network):
             self._restarted.add(address)
             if address in self._drives:
                 self._drives[address].forget()
+            elif address in self._io:
+                self._io[address].forget()
 
         try:
             return await self._adoption.attempt()
@@ -175,7 +182,9 @@ class LdcnNetwork(Network):
 
     def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
         self._identities = dict(modules)
-        self._watches = {address: ModuleWatch(address) for address in modules if address not in self._drives}
+        self._watches = {
+            address: self._io.get(address) or ModuleWatch(address) for address in modules if address not in self._drives
+        }
         self._groups.proven = reset
         self._groups.servos_only = reset and not self._watches  # an adoption asks only for what it expects
         for address, drive in self._drives.items():
@@ -197,6 +206,9 @@ class LdcnNetwork(Network):
         for address, drive in self._drives.items():
             if address not in self._restarted:
                 drive.adopted(adopted.states[address], known=self._was_up)
+        for address, module in self._io.items():
+            if address not in self._restarted and not self._was_up:
+                module.adopted()
         remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
         remarks += [f"address {address} had lost power and is disabled" for address in sorted(self._restarted)]
         if adopted.baud != self._baud:
@@ -363,6 +375,8 @@ class LdcnNetwork(Network):
             if address in self._drives:
                 self._drives[address].forget()
                 restarted(self._names[address])
+            elif address in self._io:
+                self._io[address].forget()
 
         silent = tuple(each for each in self._expected if self._bus.misses(each.address))
         heard = await self._rejoin.look(silent, addressing)
@@ -391,6 +405,7 @@ class LdcnNetwork(Network):
             version=identity.version,
             axis=self._names.get(address),
             status=watch.status if watch else None,
+            name=self._io[address].name if address in self._io else None,
         )
 
     def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:

@@ -302,7 +302,8 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
         ValueOutOfRange: see `encode_io_command`.
     """
     repeatable = not isinstance(command, SynchOutput | SynchInput)
-    return to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
+    moves = not isinstance(command, SetTimerMode | SynchInput)  # what an output switches, nobody here knows
+    return to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable, moves=moves)
 
 
 def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:

@@ -1,0 +1,152 @@
+"""PIC-I/O as a module: inputs, analog inputs and counter as a topic, outputs and timer as commands."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from pydantic import ValidationError
+
+from ldcnd.config.rig import RigConfig
+from ldcnd.errors import LeaseHeld, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.model.commands import Power, Stop
+from ldcnd.model.rig_commands import Acquire, IoReply, SetIo, SetIoTimer
+from ldcnd.model.samples import IoSample, LinkState, TelemetryItem
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo
+from tests.support.dialect_rig import GAINS
+from tests.support.rig import RunningRig, running_rig
+
+MODULE = {"name": "cabinet", "address": 2, "model": "pic-io", "outputs": [4, 9], "rate": 50}
+
+
+def config(start: str = "reset", **module: object) -> RigConfig:
+    axis = {"name": "x", "address": 1, "model": "pic-servo-v4", "velocity": 1000, "acceleration": 1000, "gains": GAINS}
+    bus = {"name": "line", "port": "sim:line", "baud": 115_200, "start": start, "axis": [axis]}
+    return RigConfig.model_validate(
+        {
+            "rig": "io",
+            "sim": [{"name": "line", "module": [{"model": "picservo-v4"}, {"model": "picio"}]}],
+            "bus": [bus | {"module": [MODULE | module]}],
+        }
+    )
+
+
+def chain_of():
+    wiring = IoWiring(low=frozenset({1}), wires={5: 4}, adc=(0, 51, 255))
+    return build_chain(ChainSpec((ModuleSpec("picservo-v4"), ModuleSpec("picio", wiring=wiring))))
+
+
+@asynccontextmanager
+async def cabinet(chain=None, **module: object) -> AsyncIterator[tuple[RunningRig, SimulatedIo]]:
+    chain = chain or chain_of()
+    async with running_rig(config(**module), {"line": chain}) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        yield rig, chain.modules[1]
+
+
+async def sample(rig: RunningRig, wanted: Callable[[IoSample], bool] = lambda _: True) -> IoSample:
+    async with asyncio.timeout(5.0), rig.client.samples("cabinet", TelemetryItem.IO) as samples:
+        async for _, found in samples:
+            assert isinstance(found, IoSample)
+            if wanted(found):
+                return found
+    raise AssertionError
+
+
+async def set_io(rig: RunningRig, **asked: object) -> IoReply:
+    return await rig.client.ask(SetIo(module="cabinet", **asked))
+
+
+async def test_inputs_and_analog_inputs_are_published():
+    async with cabinet() as (rig, io):
+        found = await sample(rig)
+        io.drive_line(1, high=True, at_s=asyncio.get_running_loop().time())
+
+        assert (found.levels, found.outputs, found.pwm) == ((False,) + (True,) * 11, (), (0.0, 0.0))
+        assert (found.adc, found.volts) == ((0, 51, 255), (0.0, 1.0, 5.0))
+        assert (await sample(rig, lambda each: each.levels[0])).levels == (True,) * 12
+
+
+async def test_nothing_is_driven_before_it_is_asked_for_and_what_is_asked_is_read_back():
+    async with cabinet() as (rig, io):
+        assert io.outputs == 0
+        reply = await set_io(rig, lines={4: "low"}, pwm2=0.5)
+
+        assert (io.outputs, io.latch, io.pwm) == (0b1000, 0, (0, 128))
+        assert (reply.outputs, reply.levels[3], reply.levels[4]) == ((4,), False, False)  # line 5 is wired to 4
+        assert (await set_io(rig, lines={4: "high", 9: "high"})).levels[3:5] == (True, True)
+        await set_io(rig, lines={4: "input"})
+        assert (io.outputs, io.pwm) == (0b1_0000_0000, (0, 128))
+
+
+async def test_lines_that_are_not_configured_as_outputs_are_not_driven():
+    async with cabinet() as (rig, io):
+        with pytest.raises(ValueOutOfRange, match="line 5 is not configured as an output; those are 4, 9"):
+            await set_io(rig, lines={5: "high"})
+        with pytest.raises(ValueOutOfRange, match="no module 'other'"):
+            await rig.client.ask(SetIo(module="other"))
+
+        assert io.outputs == 0
+
+
+async def test_the_counter_counts_what_it_is_told_to():
+    async with cabinet() as (rig, _):
+        await rig.client.ask(SetIoTimer(module="cabinet", mode="timer", prescale=8))
+        first = await sample(rig)
+        await asyncio.sleep(1.0)
+        last = await sample(rig)
+
+        elapsed_s = (last.t - first.t) / 1e9
+        assert last.counter - first.counter == pytest.approx(625_000 * elapsed_s, rel=0.01)
+
+
+async def test_a_module_that_loses_power_has_inputs_again_and_nothing_is_sent_to_it_by_itself():
+    chain = chain_of()
+    async with cabinet(chain) as (rig, io):
+        await set_io(rig, lines={4: "high"}, pwm1=1.0)
+        loop = asyncio.get_running_loop()
+        io.power(on=False, at_s=loop.time())
+        await asyncio.sleep(1.0)
+        io.power(on=True, at_s=loop.time())
+        found = await sample(rig, lambda each: each.outputs == () and each.quality == "good")
+
+        assert (io.outputs, io.latch, io.pwm, found.pwm) == (0, 0, (0, 0), (0.0, 0.0))
+
+
+async def test_after_a_take_over_all_outputs_are_named_at_once():
+    chain = chain_of()
+    async with cabinet(chain) as (rig, _):
+        await set_io(rig, lines={4: "high", 9: "low"}, pwm1=1.0)
+    async with cabinet(chain, start="adopt") as (rig, io):
+        unknown = await sample(rig)
+        with pytest.raises(WrongState, match="not known"):
+            await set_io(rig, lines={4: "low"})
+        assert (unknown.outputs, unknown.pwm, io.latch & 0b1000, io.pwm) == (None, None, 0b1000, (255, 0))
+
+        reply = await set_io(rig, lines={4: "high", 9: "input"}, pwm1=0.0, pwm2=0.0)
+
+        assert (reply.outputs, io.outputs, io.latch, io.pwm) == ((4,), 0b1000, 0b1000, (0, 0))
+
+
+async def test_outputs_need_the_lease_of_the_line_and_no_latched_stop():
+    async with cabinet() as (rig, io):
+        lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=30.0))
+        with pytest.raises(LeaseHeld):
+            await set_io(rig, lines={4: "high"})
+        await set_io(rig, lines={4: "high"}, lease=lease.lease)
+        await rig.client.command("x", Power(on=True, lease=lease.lease))
+        await rig.client.command("x", Stop())
+        with pytest.raises(StopLatched):
+            await set_io(rig, lines={4: "low"}, lease=lease.lease)
+
+        assert io.latch == 0b1000
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [({"name": "x"}, "x"), ({"model": "pic-step"}, "no lines to serve"), ({"name": None}, "without a name")],
+)
+def test_impossible_modules_are_refused_in_the_configuration(module, message):
+    with pytest.raises(ValidationError, match=message):
+        config(**module)
