@@ -1,4 +1,4 @@
-"""One PIC-I/O of a line: polled for its inputs, told its outputs; what it was told is remembered, as it cannot be read back.
+"""One PIC-I/O of a line: polled for its inputs, told its outputs; what it was told is remembered, as it cannot be read.
 
 Nothing is written at start-up, after a reset or when the module comes back after a loss of power: its lines are inputs
 then and stay so until somebody asks for something else. Source: PIC-I/O data sheet, 2.2, 3.1.
