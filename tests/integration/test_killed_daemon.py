@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.model.commands import Home, MoveAbsolute, Power, Probe
 from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, START_TIME_S, _all_axes_answer, client, free_port, process, simulated_terminal
 
@@ -61,3 +61,31 @@ async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
     assert (state.link, state.state, state.referenced) == (LinkState.UP, AxisState.DISCRETE_MOTION, False)
     assert 500 < before < after < 90_000
     assert still == 0
+
+
+async def test_what_a_killed_daemon_has_started_ends_within_its_bound(tmp_path):
+    link, config = tmp_path / "line0", tmp_path / "adopt.toml"
+    simulated = (ROOT / "config" / "simulated.toml").read_text()
+    simulated = simulated[: simulated.index("[[sim]]")].replace('"sim:line0"', f'"{link}"')
+    config.write_text(simulated.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'))
+
+    async with simulated_terminal(link, "ls182ap", "ls182ap", "picservo-v4", "picservo-v4"):
+        async with killable_daemon(config) as (running, endpoint), client(endpoint) as rig:
+            for axis in ("x", "y", "z"):
+                await rig.command(axis, Power(on=True))
+            await rig.command("x", MoveAbsolute(position=4.0, velocity=5.0))
+            await rig.command("y", Home(method="index", velocity=-0.1, distance=0.2))
+            await rig.command("z", Probe(sources=("forward_limit",), distance=2.0, velocity=5.0))
+            await asyncio.sleep(0.2)
+            with contextlib.suppress(ProcessLookupError):
+                running.kill()
+            await running.wait()
+        await asyncio.sleep(3.0)  # longer than any of them lasts
+
+        async with killable_daemon(config) as (_, endpoint), client(endpoint) as rig:
+            first = [await counts_of(rig, axis) for axis in ("x", "y", "z")]
+            await asyncio.sleep(0.5)
+            last = [await counts_of(rig, axis) for axis in ("x", "y", "z")]
+
+    assert [abs(b - a) <= 2 for a, b in zip(first, last, strict=True)] == [True] * 3
+    assert last[0] == pytest.approx(4000, abs=20)

@@ -86,4 +86,4 @@ async def test_the_switch_ahead_stops_an_sc_that_turns_round_too_late():
         state = await rig.done(MoveAbsolute(position=-1.0, acceleration=100.0, buffer_mode="aborting"))
 
         assert state.last_error is not None
-        assert state.last_error.endswith("the forward limit switch")
+        assert "forward limit switch" in state.last_error
