@@ -62,8 +62,14 @@ def set_io(
     target: Target, module: str, lines: tuple[str, ...], pwm1: float | None, pwm2: float | None, lease: str | None
 ) -> None:
     """Set outputs of the I/O module MODULE: `4=high 9=low 5=input`; what is left out stays as it is."""
-    wanted = dict(each.partition("=")[::2] for each in lines)
-    request = of_options(SetIo, module=module, lines=wanted, pwm1=pwm1, pwm2=pwm2, lease=lease)
+    wanted: dict[str, list[str]] = {"high": [], "low": [], "input": []}
+    for each in lines:
+        line, _, level = each.partition("=")
+        if level not in wanted:
+            raise click.UsageError(f"{each!r} is not LINE=high, LINE=low or LINE=input")
+        wanted[level].append(line)
+    given = {"high": wanted["high"], "low": wanted["low"], "inputs": wanted["input"]}
+    request = of_options(SetIo, module=module, **given, pwm1=pwm1, pwm2=pwm2, lease=lease)
     target.show(*_shown(target.run(lambda client: client.ask(request))))
 
 

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import os
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Literal, overload
@@ -23,7 +23,6 @@ from ldcnd.model.rig_commands import (
     Acquire,
     AxisMove,
     HolderList,
-    IoLevel,
     IoReply,
     IoTimer,
     ListHolders,
@@ -203,8 +202,10 @@ class Rig:
     async def set_io(
         self,
         module: str,
-        lines: Mapping[int, IoLevel | str] | None = None,
         *,
+        high: Iterable[int] = (),
+        low: Iterable[int] = (),
+        inputs: Iterable[int] = (),
         pwm1: float | None = None,
         pwm2: float | None = None,
         lease: str | None = None,
@@ -213,13 +214,23 @@ class Rig:
 
         Args:
             module: its configured name.
-            lines: by number: `high`, `low`, or `input`.
+            high: numbers of lines that are driven high.
+            low: likewise low.
+            inputs: lines that are inputs from now on.
             pwm1: share of time for which PWM output 1 is on, 0 to 1.
             pwm2: likewise output 2.
             lease: must cover the axes of the module's line, where a motion of them would need one.
         """
-        levels = {line: IoLevel(level) for line, level in (lines or {}).items()}
-        return await self._client.ask(SetIo(module=module, lines=levels, pwm1=pwm1, pwm2=pwm2, lease=lease))
+        request = SetIo(
+            module=module,
+            high=tuple(high),
+            low=tuple(low),
+            inputs=tuple(inputs),
+            pwm1=pwm1,
+            pwm2=pwm2,
+            lease=lease,
+        )
+        return await self._client.ask(request)
 
     async def set_io_timer(
         self, module: str, mode: IoTimer | str, *, prescale: Literal[1, 2, 4, 8] = 1, lease: str | None = None

@@ -1,7 +1,7 @@
 """What the rig as a whole can be asked: leases, moves of several axes, loss drills, what was on a line."""
 
 from enum import StrEnum
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
@@ -166,13 +166,7 @@ class Snapshot(Command[SnapshotReply]):
     """Which line; it needs `snapshot = true`."""
 
 
-class IoLevel(StrEnum):
-    """What a line of an I/O module does."""
-
-    HIGH = "high"
-    LOW = "low"
-    INPUT = "input"
-    """It is driven from outside, or pulled up."""
+Line = Annotated[int, Field(ge=1, le=12)]
 
 
 class IoReply(Frozen):
@@ -197,9 +191,13 @@ class SetIo(Command[IoReply]):
 
     module: str
     """Which module, by its configured name."""
-    lines: dict[int, IoLevel] = Field(default_factory=dict)
-    """By number, 1 to 12. Only lines that are configured as outputs can be driven; one that becomes an output may be
+    high: tuple[Line, ...] = ()
+    """Lines that are driven high. Only those that are configured as outputs can be; one that becomes an output may be
     low for the time between two packets."""
+    low: tuple[Line, ...] = ()
+    """Lines that are driven low."""
+    inputs: tuple[Line, ...] = ()
+    """Lines that are inputs from now on: driven from outside, or pulled up."""
     pwm1: float | None = Field(default=None, ge=0, le=1)
     """Share of time for which PWM output 1 is on."""
     pwm2: float | None = Field(default=None, ge=0, le=1)

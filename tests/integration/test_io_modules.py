@@ -71,19 +71,19 @@ async def test_inputs_and_analog_inputs_are_published():
 async def test_nothing_is_driven_before_it_is_asked_for_and_what_is_asked_is_read_back():
     async with cabinet() as (rig, io):
         assert io.outputs == 0
-        reply = await set_io(rig, lines={4: "low"}, pwm2=0.5)
+        reply = await set_io(rig, low=[4], pwm2=0.5)
 
         assert (io.outputs, io.latch, io.pwm) == (0b1000, 0, (0, 128))
         assert (reply.outputs, reply.levels[3], reply.levels[4]) == ((4,), False, False)  # line 5 is wired to 4
-        assert (await set_io(rig, lines={4: "high", 9: "high"})).levels[3:5] == (True, True)
-        await set_io(rig, lines={4: "input"})
+        assert (await set_io(rig, high=[4, 9])).levels[3:5] == (True, True)
+        await set_io(rig, inputs=[4])
         assert (io.outputs, io.pwm) == (0b1_0000_0000, (0, 128))
 
 
 async def test_lines_that_are_not_configured_as_outputs_are_not_driven():
     async with cabinet() as (rig, io):
         with pytest.raises(ValueOutOfRange, match="line 5 is not configured as an output; those are 4, 9"):
-            await set_io(rig, lines={5: "high"})
+            await set_io(rig, high=[5])
         with pytest.raises(ValueOutOfRange, match="no module 'other'"):
             await rig.client.ask(SetIo(module="other"))
 
@@ -104,7 +104,7 @@ async def test_the_counter_counts_what_it_is_told_to():
 async def test_a_module_that_loses_power_has_inputs_again_and_nothing_is_sent_to_it_by_itself():
     chain = chain_of()
     async with cabinet(chain) as (rig, io):
-        await set_io(rig, lines={4: "high"}, pwm1=1.0)
+        await set_io(rig, high=[4], pwm1=1.0)
         loop = asyncio.get_running_loop()
         io.power(on=False, at_s=loop.time())
         await asyncio.sleep(1.0)
@@ -117,14 +117,14 @@ async def test_a_module_that_loses_power_has_inputs_again_and_nothing_is_sent_to
 async def test_after_a_take_over_all_outputs_are_named_at_once():
     chain = chain_of()
     async with cabinet(chain) as (rig, _):
-        await set_io(rig, lines={4: "high", 9: "low"}, pwm1=1.0)
+        await set_io(rig, high=[4], low=[9], pwm1=1.0)
     async with cabinet(chain, start="adopt") as (rig, io):
         unknown = await sample(rig)
         with pytest.raises(WrongState, match="not known"):
-            await set_io(rig, lines={4: "low"})
+            await set_io(rig, low=[4])
         assert (unknown.outputs, unknown.pwm, io.latch & 0b1000, io.pwm) == (None, None, 0b1000, (255, 0))
 
-        reply = await set_io(rig, lines={4: "high", 9: "input"}, pwm1=0.0, pwm2=0.0)
+        reply = await set_io(rig, high=[4], inputs=[9], pwm1=0.0, pwm2=0.0)
 
         assert (reply.outputs, io.outputs, io.latch, io.pwm) == ((4,), 0b1000, 0b1000, (0, 0))
 
@@ -133,12 +133,12 @@ async def test_outputs_need_the_lease_of_the_line_and_no_latched_stop():
     async with cabinet() as (rig, io):
         lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=30.0))
         with pytest.raises(LeaseHeld):
-            await set_io(rig, lines={4: "high"})
-        await set_io(rig, lines={4: "high"}, lease=lease.lease)
+            await set_io(rig, high=[4])
+        await set_io(rig, high=[4], lease=lease.lease)
         await rig.client.command("x", Power(on=True, lease=lease.lease))
         await rig.client.command("x", Stop())
         with pytest.raises(StopLatched):
-            await set_io(rig, lines={4: "low"}, lease=lease.lease)
+            await set_io(rig, low=[4], lease=lease.lease)
 
         assert io.latch == 0b1000
 

@@ -3,9 +3,10 @@
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.network import IoDriver, IoReading
+from ldcnd.errors import MalformedRequest
 from ldcnd.exchange import Condition, Timing, only_while
 from ldcnd.log import get_logger
-from ldcnd.model.rig_commands import IoLevel, IoReply, IoTimer, SetIo, SetIoTimer
+from ldcnd.model.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
 from ldcnd.model.samples import IoSample, Quality, TelemetryItem
 
 FULL_SCALE_V = 5.0
@@ -35,14 +36,17 @@ class ModuleService:
         """Set outputs, if the sender still may when their packets are sent.
 
         Raises:
+            MalformedRequest: a line is named twice.
             LdcndError: as `IoDriver.set_outputs`, or as the condition.
         """
-        levels = {line: level is IoLevel.HIGH for line, level in command.lines.items() if level is not IoLevel.INPUT}
-        inputs = frozenset(line for line, level in command.lines.items() if level is IoLevel.INPUT)
+        levels = dict.fromkeys(command.high, True) | dict.fromkeys(command.low, False)
+        twice = sorted(set(command.high) & set(command.low))
+        if twice:
+            raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
         condition()
         with only_while(condition):
-            reading = await self._driver.set_outputs(levels, inputs, (command.pwm1, command.pwm2))
-        log.info("outputs set", module=self.name, lines=command.lines, pwm1=command.pwm1, pwm2=command.pwm2)
+            reading = await self._driver.set_outputs(levels, frozenset(command.inputs), (command.pwm1, command.pwm2))
+        log.info("outputs set", module=self.name, high=command.high, low=command.low, inputs=command.inputs)
         return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
 
     async def set_timer(self, command: SetIoTimer) -> IoReply:
