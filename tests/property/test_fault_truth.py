@@ -42,7 +42,9 @@ class History:
         self.dice = random.Random(seed)
         self.axis = SimulatedAxis(model, closed=False)
         self.story: list[str] = []
-        self.opened_by: FaultCode | None = None  # PIC-SERVO: what has opened the loop and was not cleared
+        self.opened_by: set[FaultCode] = (
+            set()
+        )  # PIC-SERVO: what opened the loop or kept it open
         self.known = self.tracker = None
         self._new_daemon()
         self.known.restarted()
@@ -82,7 +84,7 @@ class History:
         self.known.clearing()
         if arrives:
             self.axis.clear()
-            self.opened_by = None
+            self.opened_by = set()
         if arrives and answered:
             self.known.cleared()
         else:
@@ -158,13 +160,13 @@ class History:
         off = Condition.MOTOR_POWER_OFF in stage.conditions
         step = self.story[-1].rstrip("?")
         if self.axis.drive.loop.servo_on:
-            self.opened_by = None
+            self.opened_by = set()
         if off and step in ("suffer", "cut", "switch_on"):  # without power a loop that is told to close stays open
-            self.opened_by = self.opened_by or FaultCode.POWER_LOST
+            self.opened_by.add(FaultCode.POWER_LOST)
         if step == "jam" and not off:
-            self.opened_by = self.opened_by or FaultCode.POSITION_ERROR
+            self.opened_by.add(FaultCode.POSITION_ERROR)
         causes = {FaultCode.POWER_LOST} if off else set()
-        return causes | ({self.opened_by} if self.opened_by else set())
+        return causes | self.opened_by
 
 
 def play(model: str, seed: int) -> None:
