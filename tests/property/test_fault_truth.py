@@ -42,9 +42,7 @@ class History:
         self.dice = random.Random(seed)
         self.axis = SimulatedAxis(model, closed=False)
         self.story: list[str] = []
-        self.opened_by: set[FaultCode] = (
-            set()
-        )  # PIC-SERVO: what opened the loop or kept it open
+        self.opened_by: set[FaultCode] = set()  # PIC-SERVO: what opened the loop or kept it open
         self.known = self.tracker = None
         self._new_daemon()
         self.known.restarted()
