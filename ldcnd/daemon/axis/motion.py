@@ -22,20 +22,13 @@ from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import (
     BusError,
     MalformedRequest,
-<<<<<<< HEAD
+    NotSupported,
     OutcomeUnknown,
     Remedy,
     RequestRefused,
     ValueOutOfRange,
     WrongState,
     step,
-=======
-    NotSupported,
-    OutcomeUnknown,
-    RequestRefused,
-    ValueOutOfRange,
-    WrongState,
->>>>>>> 88b1ee1 (Add snapshot, probe, inputs, new goals on the fly, rotary axes, clocks and baud divisors)
 )
 from ldcnd.messaging.codec import error_reply
 from ldcnd.model.commands import CommandReply, Direction, Preview, PreviewReply, Verb

@@ -39,11 +39,16 @@ from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
 from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
-<<<<<<< HEAD
-from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, Remedy, WrongState, step
-=======
-from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ValueOutOfRange, WrongState
->>>>>>> 88b1ee1 (Add snapshot, probe, inputs, new goals on the fly, rotary axes, clocks and baud divisors)
+from ldcnd.errors import (
+    BadReply,
+    DriveFault,
+    OutcomeUnknown,
+    PacketRejected,
+    Remedy,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
 from ldcnd.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.model.catalogue import verbs_for
