@@ -46,8 +46,8 @@ def test_any_bytes_are_a_command_or_a_bad_reply(profile, data):
 def test_any_packet_has_an_interpretation(profile, packet):
     interpretation = interpret(profile, packet)
 
-    assert interpretation.checksum_ok
-    assert all(interpretation.oddities)
+    assert (interpretation.checksum_ok, interpretation.address) == (True, packet.address)
+    assert "" not in interpretation.oddities
 
 
 @given(profiles, masks, st.binary(max_size=20))

@@ -20,7 +20,7 @@ from ldcnd.errors import (
     StaleSequence,
     UnknownAxis,
 )
-from ldcnd.model.commands import MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb
 from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.model.rig_commands import SHORTEST_LEASE_S, Acquire, ListHolders
 from ldcnd.model.samples import AxisState
@@ -61,6 +61,9 @@ async def test_stop_and_halt_never_need_a_lease():
         await rig.until("x", lambda state: state.link == "up")
         async with control(rig.client, "ann", "x") as held:
             await held.command("x", Power(on=True))
+            await held.command("x", MoveVelocity(velocity=10.0))
+            await rig.client.command("x", Halt())
+            await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
             await held.command("x", MoveVelocity(velocity=10.0))
 
             reply = await rig.client.stop("x")

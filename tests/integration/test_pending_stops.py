@@ -119,7 +119,7 @@ async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
         await unplugged(rig, chain)
         await rig.client.stop("x")
         await asyncio.sleep(1.0)
-        rig.daemon.rig.axis("x").tracker._at_rest = True
+        rig.daemon.rig.axis("x").tracker._rest.forget(rests=True)
         chain.replug()
         await rig.until("x", lambda state: not state.stop_pending)
         await asyncio.sleep(0.3)

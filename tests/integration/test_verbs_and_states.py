@@ -117,7 +117,7 @@ async def put(axis: AxisService, name: str) -> None:
 
 
 def set_at_rest(axis: AxisService, at_rest: bool) -> None:  # noqa: FBT001
-    axis.tracker._at_rest = at_rest
+    axis.tracker._rest.forget(rests=at_rest)
 
 
 async def outcome(send: Callable[[], Awaitable[object]]) -> object:
