@@ -9,11 +9,15 @@ from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import MoveAbsolute
 from ldcnd.model.samples import AxisState, MonitorName, Quality, TelemetryItem
+from ldcnd.model.traces import TraceChunk
 from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench
 
 POSITION, VELOCITY, ADC = TelemetryItem.POSITION, TelemetryItem.VELOCITY, TelemetryItem.ADC
 STATE, FAULT = TelemetryItem.STATE, TelemetryItem.FAULT
 TIMING = Timing(1.0, 1.0, 1.002, 1.003)
+CHUNK = TraceChunk(
+    t=0, t_error_ns=0, seq=0, quality=Quality.GOOD, trace_id="t", index=0, first=0, offsets_ns=(), values=(), raw=()
+)
 
 
 def poll(bench: AxisBench, *asked: TelemetryItem, **changes: object) -> None:
@@ -111,3 +115,17 @@ async def test_a_counter_that_had_to_be_corrected_is_uncertain_and_one_of_a_lost
         sample = bench._publisher.last[KEYS.monitor("x", MonitorName.SPEED_FEEDBACK)]
 
     assert (sample.value, sample.unit, sample.quality) == (100, "rpm", quality)
+
+
+async def test_an_axis_that_is_withdrawn_leaves_nothing_that_looks_alive():
+    gone = []
+    async with axis_bench() as bench:
+        publisher = bench._publisher
+        poll(bench, POSITION)
+        for index in range(2):
+            publisher.publish_trace_chunk("x", index, CHUNK)
+        publisher.session.delete = gone.append
+        publisher.withdraw("x")
+
+        assert publisher.last == {}
+        assert set(gone) >= {KEYS.telemetry("x", POSITION), KEYS.trace_chunk("x", 0), KEYS.trace_chunk("x", 1)}

@@ -263,3 +263,23 @@ def test_a_probe_is_no_stop_and_is_drained_like_any_job():
     assert not queue.stop_waits()
     assert [job.name for job in queue.drain()] == ["probe", "command0"]
     assert queue.takes_probe()
+
+
+def test_a_probe_is_taken_only_where_it_is_alone():
+    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    stop = Ticket("stop")
+    queue.push(stop, Lane.STOP)
+    assert not queue.takes_probe()
+    stop.abandoned = True
+    assert queue.takes_probe()
+
+    queue.push_probe(Ticket("probe"))
+    assert not queue.takes_probe()
+
+
+def test_a_probe_that_nobody_waits_for_any_more_is_passed_over():
+    queue = filled(command=1)
+    queue.push_probe(Ticket("probe", abandoned=True))
+
+    assert order(queue, 1) == ["command0"]
+    assert queue.takes_probe()

@@ -151,3 +151,30 @@ def test_ids_that_could_not_be_remembered_are_refused_before_anything_is_done(le
 def test_an_id_under_a_lease_with_a_sequence_takes_no_memory(ledger):
     done(ledger, "c1", lease="l", sequence=1)
     assert not ledger._until_s
+
+
+def test_an_entry_keeps_whose_it_is_through_all_its_states(ledger):
+    ledger.open(Entry("c1", "x", MOVE, "ann", "operator"))
+    ledger.answered("c1", CommandReply(command_id="c1", axis="x", verb="move_absolute"), CommandStatus.EXECUTING)
+    ledger.reached("c1", CommandStatus.DONE)
+
+    kept = ledger.get("c1")
+    assert (kept.command_id, kept.axis, kept.command, kept.client, kept.login) == ("c1", "x", MOVE, "ann", "operator")
+
+
+def test_a_sender_with_a_login_is_known_by_it():
+    ledger = Ledger(lambda _entry, _error: None, lambda: 0.0)
+    for number in range(2 * SENDERS):
+        command = MoveAbsolute(position=1.0, command_id=f"c{number}")
+        ledger.open(Entry(f"c{number}", "x", command, f"client{number}", "operator"))
+        ledger.reached(f"c{number}", CommandStatus.DONE)
+
+    assert ledger.get("c0").login == "operator"  # all are of one sender
+
+
+def test_a_sender_with_a_command_under_way_is_not_forgotten(ledger):
+    ledger.open(Entry("running", "x", MOVE, "ann"))
+    for number in range(2 * SENDERS):
+        done(ledger, f"c{number}", client=f"client{number}")
+
+    assert ledger.get("running").status is CommandStatus.ACCEPTED

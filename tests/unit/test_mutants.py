@@ -1,12 +1,13 @@
 """The tool behind `make mutants`: what it changes, and which tests it runs for a change."""
 
 import json
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
 
-from tests.mutants.__main__ import SUBJECTS, TESTS, report
+from tests.mutants.__main__ import EQUIVALENTS, SUBJECTS, TESTS, report
 from tests.mutants.campaign import Judgement, Verdict
 from tests.mutants.changes import Mutant, mutants_of
 from tests.mutants.covering import ROOT, Covering
@@ -97,3 +98,15 @@ def test_a_campaign_fails_on_a_survivor_and_on_too_few_killed(
 
 def test_every_subject_and_folder_of_tests_exists():
     assert [glob for glob in (*SUBJECTS, *TESTS) if not list(ROOT.glob(glob))] == []
+
+
+def test_what_is_argued_to_be_equivalent_is_still_in_the_code():
+    argued = tomllib.loads(EQUIVALENTS.read_text())["equivalent"]
+    known = {
+        (mutant.path, mutant.place, mutant.change)
+        for path in {each["path"] for each in argued}
+        for mutant in mutants_of(path, ROOT)
+    }
+
+    assert [each for each in argued if (each["path"], each["place"], each["change"]) not in known] == []
+    assert all(each["reason"].strip() for each in argued)

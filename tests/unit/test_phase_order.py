@@ -158,3 +158,14 @@ def test_the_line_is_free_after_the_cycle_and_a_reply_at_the_drives_rate():
 
     expected_s = tick_after(asked_at_s, phase_s, 0.0) + stretch * REPLY_S
     assert order.free_at_s(7, asked_at_s, REPLY_S) == pytest.approx(expected_s, abs=20e-6)
+
+
+def test_two_replies_at_one_instant_are_one_cycle():
+    tracker, at_s = followed(0.0, 0.0, seed=1)
+    before = (tracker.period_s, tracker.wait_s(at_s), tracker.locked)
+    last_s = tracker._tick_s
+
+    tracker.observe(last_s)
+    tracker.observe(last_s - 0.2 * CYCLE_S)
+
+    assert (tracker.period_s, tracker.wait_s(at_s), tracker.locked) == before

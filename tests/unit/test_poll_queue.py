@@ -295,3 +295,14 @@ def test_to_choose_ahead_changes_nothing_for_the_earliest_deadline(seed):
             now_s += 0.001
         orders_taken.append(taken)
     assert orders_taken[0] == orders_taken[1]
+
+
+@pytest.mark.parametrize("gone", range(1, 8))
+def test_the_deadlines_stay_in_order_when_one_poll_is_forgotten(gone):
+    pollers = {node: poller(node, NORMAL, 10.0 - node) for node in range(1, 8)}
+    queue = queued("deadline", *pollers.values())
+    assert queue.is_due(0.0)
+
+    queue.unschedule(pollers[gone])
+
+    assert nodes(queue, 0.0, 6) == [node for node in range(7, 0, -1) if node != gone]

@@ -140,3 +140,14 @@ def test_rates_of_a_line_that_paces_itself_are_refused():
 
     assert reload.refused == (f"bus.{bus['name']}.axis.{unit['name']}.rates.position",)
     assert reload.config == running
+
+
+def test_a_direction_that_is_turned_leaves_everything_of_that_axis_alone():
+    wanted = document()
+    axis(wanted, "x")["direction"] = "reverse"
+    axis(wanted, "x")["limits"]["position_max"] = 50
+
+    reload = plan_reload(RUNNING, validated(wanted))
+
+    assert reload.config == RUNNING
+    assert set(reload.refused) == {"bus.line0.axis.x.direction", "bus.line0.axis.x.limits.position_max"}

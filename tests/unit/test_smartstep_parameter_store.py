@@ -13,6 +13,7 @@ from ldcnd.errors import (
     AddressRefused,
     BusyTracing,
     DataRefused,
+    DriveFault,
     EepromBudgetSpent,
     NotSupported,
     OutcomeUnknown,
@@ -310,3 +311,36 @@ async def read_surely(access, label):
         with suppress(ReplyTimeout):
             return await access.read(label)
     raise AssertionError("the line lets nothing through")
+
+
+async def test_an_eeprom_that_lags_behind_ram_is_written(tmp_path):
+    drive = simulated(1)
+    async with smartstep_line([drive], ledger=tmp_path / "ledger.json") as line:
+        access = line.axis("u1").parameters
+        await access.write(to_ram("Pn100", 120))
+        done = await access.write(to_eeprom("Pn100", 120))
+
+    assert (done.written, done.value.stored) == (True, 120)
+    assert drive.drive.memory.writes[PN100.number] == 1
+
+
+async def test_a_write_that_left_a_third_value_is_counted_and_not_sent_again(tmp_path):
+    drive = simulated(1)
+    async with smartstep_line([drive], ledger=tmp_path / "ledger.json") as line:
+        access = line.axis("u1").parameters
+        asked, ask = [], access._words.ask
+
+        async def worn_out(exchange):
+            reply = await ask(exchange)
+            if not exchange.request.startswith(b"W11"):
+                return reply
+            asked.append(exchange)
+            drive.drive.memory._eeprom[PN100.number] = 99
+            raise OutcomeUnknown("no reply")
+
+        access._words.ask = worn_out
+        with pytest.raises(DriveFault, match="reads 99"):
+            await access.write(to_eeprom("Pn100", 120))
+
+    assert len(asked) == 1
+    assert '"Pn100": 1' in (tmp_path / "ledger.json").read_text()
