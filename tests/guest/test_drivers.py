@@ -6,6 +6,7 @@ do can be seen. Clients are on the host, too.
 
 import asyncio
 import contextlib
+import json
 import random
 import re
 import time
@@ -534,3 +535,16 @@ async def test_reload_applies_a_limit_without_a_restart(bench):
         guest.must(f"systemctl reload {UNIT}")
 
         assert guest.must(f"systemctl show -P MainPID {UNIT}") == pid
+
+
+def test_the_doctor_names_the_driver_and_what_makes_it_slow(bench):
+    guest = bench.guest
+    guest.must(f"systemctl stop {ON_BOARD}", timeout_s=START_S)
+    guest.must("echo 8 > /sys/class/tty/ttyS1/rx_trig_bytes")
+    said = guest.run("ldcnd doctor ldcn --config /etc/ldcnd/uart.toml --bus uart --json", timeout_s=START_S).stdout
+    guest.must("echo 1 > /sys/class/tty/ttyS1/rx_trig_bytes")
+
+    findings = {finding["what"]: finding for finding in map(json.loads, said.splitlines())}
+    assert "8250" in findings["adapter"]["text"] or "serial" in findings["adapter"]["text"]
+    assert "echo 1 | sudo tee /sys/class/tty/ttyS1/rx_trig_bytes" in findings["FIFO trigger"]["remedy"]
+    assert {"drives", "turn-around", "errors"} <= findings.keys()
