@@ -471,8 +471,7 @@ async def test_a_killed_daemon_is_followed_by_one_that_knows_what_can_be_known(b
             await service.outage(0.5)
             await service.up()
             after_outage = await service.faults("x")
-            await service.client.command("y", Reset())
-            await service.client.command("y", Power(on=True))
+            await service.ready("y")
             await service.client.command("y", MoveVelocity(velocity=0.8))
             await kill(service.guest)
         finally:
@@ -489,6 +488,7 @@ async def test_a_killed_daemon_is_followed_by_one_that_knows_what_can_be_known(b
         assert moving
         assert line.started_by == "adoption"
         assert await service.stands("y")
+        await service.ready("x")
     assert at_first == {"position_error"}
     assert after_outage <= {"position_error", "latched_fault", "link_lost"}
     assert after_kill <= {"latched_fault"}
