@@ -27,23 +27,23 @@ LONGEST_BACKOFF_S = 5.0
 
 
 class MuteNodes:
-    """Exchanges in a row that were not answered, by node."""
+    """Who does not answer.
+
+    Attributes:
+        misses: exchanges in a row that were not answered, by node; without those that answer.
+    """
 
     def __init__(self) -> None:
-        self._misses: dict[int, int] = {}
+        self.misses: dict[int, int] = {}
         self._backed_off: set[int] = set()
-
-    def misses(self, node: int) -> int:
-        """Return how many exchanges in a row this node has left unanswered."""
-        return self._misses.get(node, 0)
 
     def failing(self) -> set[int]:
         """Return the nodes that left their last exchange unanswered."""
-        return set(self._misses)
+        return set(self.misses)
 
     def missed(self, node: int) -> None:
         """Note an exchange without an answer."""
-        self._misses[node] = self._misses.get(node, 0) + 1
+        self.misses[node] = self.misses.get(node, 0) + 1
 
     def pause_s(self, node: int, lost_s: float) -> float:
         """Return for how long to leave a node alone, whose poll has just been lost.
@@ -52,7 +52,7 @@ class MuteNodes:
             node: its miss was noted.
             lost_s: what a poll that it does not answer costs the line.
         """
-        beyond = self.misses(node) - MISSES_BEFORE_BACKOFF
+        beyond = self.misses[node] - MISSES_BEFORE_BACKOFF
         if beyond < 0:
             return 0.0
         self._backed_off.add(node)
@@ -65,14 +65,14 @@ class MuteNodes:
 
         What made several nodes mute, a connector or the supply of one of them, often ends for all of them together.
         """
-        if self._misses.pop(node, None) is None or node not in self._backed_off:
+        if self.misses.pop(node, None) is None or node not in self._backed_off:
             return None
         self._backed_off.discard(node)
         return min(self._backed_off, key=lambda other: (other < node, other), default=None)  # the chain, once round
 
     def forget(self) -> None:
         """Begin anew: the line was opened."""
-        self._misses.clear()
+        self.misses.clear()
         self._backed_off.clear()
 
 
@@ -260,7 +260,7 @@ class Bus:
 
     def misses(self, node: int) -> int:
         """Return how many exchanges in a row this node has left unanswered."""
-        return self._mute.misses(node)
+        return self._mute.misses.get(node, 0)
 
     def longest_s(self, exchange: Exchange[Any]) -> float:
         """Return how long an exchange occupies the line at most when nothing is lost, in seconds."""
@@ -366,7 +366,7 @@ class Bus:
         while job and not job.may_go():
             job = self._queue.take_job(now_s)
         if job is None:
-            poller = self._queue.take_poll(now_s)
+            poller = self._queue.polls.take_due(now_s)
             if poller is None:
                 return None
             wanted_at_s = poller.due_at_s
@@ -378,15 +378,15 @@ class Bus:
 
     def sent(self, turn: Turn) -> None:
         """See `Users`; a poller that was asked has its next turn."""
-        if isinstance(turn, PollTurn):
-            self._schedule(turn.poller, turn.poller.due_at_s)
+        if isinstance(turn, PollTurn) and (poller := turn.poller) in self._pollers:
+            self._queue.polls.schedule(poller, poller.due_at_s)
 
-    def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
+    def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
         """See `Users`: to choose a poll and what to ask takes longer than all else between two packets."""
         exchange = turn.exchange
-        reply_s = exchange.reply_bytes * self.settings.bits_per_byte / self.baud
+        reply_s = exchange.reply_bytes * byte_s
         at_s = self._order.free_at_s(exchange.node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s
-        if poller := self._queue.look_ahead(at_s):
+        if poller := self._queue.polls.look_ahead(at_s):
             poller.prepare(at_s)
 
     def next_due_s(self) -> float:
@@ -403,7 +403,10 @@ class Bus:
 
     def answered(self, turn: Turn) -> None:
         """See `Users`."""
-        if turn.exchange.reply_bytes and (also := self._mute.answered(turn.exchange.node)) is not None:
+        exchange, mute = turn.exchange, self._mute
+        if not exchange.reply_bytes or exchange.node not in mute.misses:
+            return
+        if (also := mute.answered(exchange.node)) is not None:
             for poller in self._pollers:
                 if poller.node == also:
                     self._queue.schedule(poller, poller.due_at_s)

@@ -49,12 +49,13 @@ class Users(Protocol):
     def sent(self, turn: Turn) -> None:
         """Note that a turn that was taken is on the wire."""
 
-    def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
+    def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
         """Make ready what can be made ready of the next turn, while there is time.
 
         Args:
             turn: on the wire.
             asked_at_s: when the last bit of its request leaves, in loop time.
+            byte_s: how long a byte takes now.
         """
 
     def next_due_s(self) -> float:
@@ -107,6 +108,7 @@ class Line:
         self.phase = Phase.IDLE
         self._settings = settings
         self.wire = Wire(settings, transport, statistics, wire_log)
+        self._transport, self._log = transport, wire_log
         self._users = users
         self._resync = resync
         self._fence = Fence(resync)
@@ -246,11 +248,11 @@ class Line:
         if following and not following.at_baud:
             failure = self._put(following, self._loop.time())
             if turn.laborious:
-                self.wire.push()
+                self._transport.push()
         else:
             self._turn, self.phase = None, Phase.IDLE
         self._statistics.bytes_in += len(arrived)
-        self.wire.note(WireEvent.RECEIVED, now_s, arrived)
+        self._log.add(now_s, WireEvent.RECEIVED, arrived)
         timing = self.wire.replied(turn, reply, sent_at_s, now_s)
         self._users.answered(turn)
         if following is None:
@@ -261,7 +263,8 @@ class Line:
             self._attend(following, AT_ONCE[following.lane], failure, early=int(turn.laborious))
         turn.completed(reply, timing)
         if self._turn and self._missing and turn.lane is POLL:  # who waits for an answer has it first
-            self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * self.wire.byte_s)
+            byte_s = self.wire.byte_s
+            self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * byte_s, byte_s)
 
     def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
@@ -400,7 +403,11 @@ class Line:
         """Write a request and do nothing else; return why the line was lost over it, if it was."""
         self._turn, self._sent_at_s = turn, now_s
         self.phase = Phase.REPLY if turn.exchange.reply_bytes else Phase.QUIET
-        return self.wire.write(turn.exchange.request)
+        try:
+            self._transport.write(turn.exchange.request)
+        except TransportLost as error:
+            return error.message
+        return ""
 
     def _attend(self, turn: Turn, remark: str, failure: str, *, early: int = 0) -> None:
         """Note a request that has just been written, and prepare for its reply.
@@ -409,15 +416,21 @@ class Line:
         """
         exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
-        self._pieces.begin(now_s if settings.paced else -NEVER_S, request_s, wire.byte_s)
-        plain = exchange.reply_bytes and turn.plain and self._fence.in_step and not settings.echo
+        self._whole_from_s = self._pieces.begin(
+            now_s if settings.paced else -NEVER_S, request_s, wire.byte_s, exchange.reply_bytes
+        )
+        # a whole intact reply is all that it takes to go on to the next turn
+        goes_on = exchange.repeatable and not (exchange.total_bytes or turn.then_baud or turn.at_baud or turn.proves)
+        plain = exchange.reply_bytes and goes_on and self._fence.in_step and not settings.echo
         self._missing = exchange.reply_bytes if plain else NOT_PLAIN
-        self._whole_from_s = self._pieces.earliest_s(exchange.reply_bytes)
-        wire.expect(max(ANY, self._missing - early))
-        answer_s = reply_s + settings.margin_s + wire.lag_s if exchange.reply_bytes else 0.0
+        self._transport.expect(ANY if settings.echo else max(ANY, self._missing - early))
+        answer_s = reply_s + settings.margin_s + self._transport.lag_s if exchange.reply_bytes else 0.0
         self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
         self._statistics.exchanges += 1
-        wire.sent(exchange.request, now_s, remark)
+        self._statistics.bytes_out += len(exchange.request)
+        self._log.add(now_s, WireEvent.SENT, exchange.request, remark)
+        if wire.echo is not None:
+            wire.echo.sent(exchange.request)
         self._users.sent(turn)
         if failure:
             self.transport_lost(failure)

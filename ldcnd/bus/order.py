@@ -1,7 +1,7 @@
 """When drives answer that do so at the end of a cycle of their own, and which of them to ask next. Pure.
 
-An LDCN or NMC module answers at the end of the servo cycle in which the request was complete. The modules on a line are
-not synchronised: one that is asked at the right instant answers at once, one that is asked just too late makes the line
+Such a drive answers at the end of the servo cycle in which the request was complete. The drives on a line are not
+synchronised: one that is asked at the right instant answers at once, one that is asked just too late makes the line
 wait for nearly a whole cycle. Phase and length of each cycle show in the replies.
 """
 

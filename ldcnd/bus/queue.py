@@ -35,20 +35,20 @@ class PollRank:
         self._choose = choose
         self._turn = 0
         self._late: list[tuple[int, float, Poller[Any]]] = []  # since which turn, and since when it is due
-        self._due: list[tuple[float, float, int, Poller[Any]]] = []
+        self.due: list[tuple[float, float, int, Poller[Any]]] = []  # those that were not late yet
 
     def __bool__(self) -> bool:
-        return bool(self._due or self._late)
+        return bool(self.due or self._late)
 
     @property
     def since_s(self) -> float:
         """Since when the first one is due."""
-        return self._late[0][1] if self._late else self._due[0][1]
+        return self._late[0][1] if self._late else self.due[0][1]
 
     @property
     def deadline_s(self) -> float:
         """The earliest deadline of those that were not late yet when one was last taken."""
-        return self._due[0][0] if self._due else NO_DEADLINE_S
+        return self.due[0][0] if self.due else NO_DEADLINE_S
 
     def is_late(self, now_s: float) -> bool:
         """Tell whether the deadline of one has passed."""
@@ -56,21 +56,21 @@ class PollRank:
 
     def add(self, poller: Poller[Any], at_s: float, serial: int) -> None:
         """Take a poll that has become due at `at_s`; equal ones go in the order of their serial numbers."""
-        heapq.heappush(self._due, (poller.deadline_at_s, at_s, serial, poller))
+        heapq.heappush(self.due, (poller.deadline_at_s, at_s, serial, poller))
 
     def remove(self, poller: Poller[Any]) -> None:
         """Forget a poll; unknown ones are ignored."""
         self._late = [late for late in self._late if late[2] is not poller]
-        self._due = [due for due in self._due if due[3] is not poller]
-        heapq.heapify(self._due)
+        self.due = [due for due in self.due if due[3] is not poller]
+        heapq.heapify(self.due)
 
     def take(self, now_s: float) -> Poller[Any]:
         """Remove and return the one that goes now."""
         if self._choose is None:
-            return heapq.heappop(self._due)[3]
+            return heapq.heappop(self.due)[3]
         self._turn += 1
-        while self._due and self._due[0][0] <= now_s:
-            _, at_s, _, poller = heapq.heappop(self._due)
+        while self.due and self.due[0][0] <= now_s:
+            _, at_s, _, poller = heapq.heappop(self.due)
             self._late.append((self._turn, at_s, poller))
         return self._take_late(self._choose, now_s) if self._late else self._take_equal(self._choose, now_s)
 
@@ -87,13 +87,13 @@ class PollRank:
         return chosen
 
     def _take_equal(self, choose: Choose, now_s: float) -> Poller[Any]:
-        equal = [heapq.heappop(self._due)]
-        while len(equal) < CHOICE and self._due and self._due[0][0] == equal[0][0]:
-            equal.append(heapq.heappop(self._due))
+        equal = [heapq.heappop(self.due)]
+        while len(equal) < CHOICE and self.due and self.due[0][0] == equal[0][0]:
+            equal.append(heapq.heappop(self.due))
         chosen = choose([poller for *_, poller in equal], now_s)
         for entry in equal:
             if entry[3] is not chosen:
-                heapq.heappush(self._due, entry)
+                heapq.heappush(self.due, entry)
         return chosen
 
 
@@ -179,6 +179,10 @@ class PollQueue:
         self._ahead = self._take(at_s)
         return self._ahead
 
+    def take_due(self, now_s: float) -> Poller[Any] | None:
+        """Remove and return the poller whose turn it is, or None when none is due."""
+        return self.take(now_s) if self._ahead or self.is_due(now_s) else None
+
     def take(self, now_s: float) -> Poller[Any]:
         """Remove and return the poller whose turn it is; one is due."""
         ahead = self._ahead
@@ -191,7 +195,7 @@ class PollQueue:
         if self._later and self._later[0][0] <= now_s:
             self._rank_due(now_s)
         if (only := self._only) is not None:
-            return only.deadline_s < ahead.deadline_at_s
+            return bool(only.due) and only.due[0][0] < ahead.deadline_at_s
         if self._behind:
             return False
         return any(rank.deadline_s < ahead.deadline_at_s for rank in self._ranks)
@@ -263,15 +267,18 @@ class ExchangeQueue(Generic[JobT]):
 
     A stop goes before everything. Commands go before polls, but a due poll waits for at most `COMMANDS_PER_POLL`
     commands; background jobs wait for at most `POLLS_PER_BACKGROUND` polls.
+
+    Attributes:
+        polls: the pollers.
     """
 
     def __init__(self, choose: Choose | None = None) -> None:
         self._choose = choose
-        self._polls = PollQueue(choose)
+        self.polls = PollQueue(choose)
         self._probe: JobT | None = None
         self._jobs: dict[Lane, deque[JobT]] = {lane: deque() for lane in LANE_LIMITS}
         self._commands_in_a_row = 0
-        self._polls_in_a_row = 0
+        self.polls_in_a_row = 0
 
     def push(self, job: JobT, lane: Lane) -> None:
         """Queue a job behind its lane's others.
@@ -308,11 +315,11 @@ class ExchangeQueue(Generic[JobT]):
 
     def schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Let a poller have its next turn at `at_s`; replaces any turn it had."""
-        self._polls.schedule(poller, at_s)
+        self.polls.schedule(poller, at_s)
 
     def unschedule(self, poller: Poller[Any]) -> None:
         """Forget a poller; unknown ones are ignored."""
-        self._polls.unschedule(poller)
+        self.polls.unschedule(poller)
 
     def stop_waits(self) -> bool:
         """Tell whether a stop is queued that somebody waits for."""
@@ -320,7 +327,7 @@ class ExchangeQueue(Generic[JobT]):
 
     def next_due_s(self) -> float:
         """Return when the next poller is due; infinity when there is none."""
-        return self._polls.next_due_s()
+        return self.polls.next_due_s()
 
     def take_job(self, now_s: float) -> JobT | None:
         """Remove and return the job that goes on the wire now, or None when it is a poll's turn or nothing is due."""
@@ -332,28 +339,28 @@ class ExchangeQueue(Generic[JobT]):
         probe, self._probe = self._probe, None
         if probe and not probe.abandoned:
             return probe
-        poll_due = self._polls.is_due(now_s)
+        poll_due = self.polls.is_due(now_s)
         if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (command := self._take_job(COMMAND)):
             self._commands_in_a_row += 1
             return command
         self._commands_in_a_row = 0
-        if not poll_due or self._polls_in_a_row >= POLLS_PER_BACKGROUND:
-            self._polls_in_a_row = 0
+        if not poll_due or self.polls_in_a_row >= POLLS_PER_BACKGROUND:
+            self.polls_in_a_row = 0
             return self._take_job(BACKGROUND)
-        self._polls_in_a_row += 1
+        self.polls_in_a_row += 1
         return None
 
     def take_poll(self, now_s: float) -> Poller[Any] | None:
         """Remove and return the poller whose turn it is when no job goes, or None when none is due."""
-        return self._polls.take(now_s) if self._polls.is_due(now_s) else None
+        return self.polls.take_due(now_s)
 
     def look_ahead(self, at_s: float) -> Poller[Any] | None:
         """Choose the next poll ahead, see `PollQueue`; jobs may still go before it."""
-        return self._polls.look_ahead(at_s)
+        return self.polls.look_ahead(at_s)
 
     def drain(self) -> list[JobT]:
         """Forget all pollers; remove and return all jobs, stops first."""
-        self._polls = PollQueue(self._choose)
+        self.polls = PollQueue(self._choose)
         drained = [self._probe] if self._probe else []
         self._probe = None
         drained += [job for lane in sorted(self._jobs) for job in self._jobs[lane]]

@@ -41,7 +41,7 @@ class Probe(Turn):
     """The line's own exchange behind the fence."""
 
     __slots__ = ("passed",)
-    plain = False
+    proves = True
 
     def __init__(self, exchange: Exchange[Any], at_s: float) -> None:
         super().__init__(exchange, Lane.STOP, at_s)
@@ -70,25 +70,25 @@ LONGEST_FENCE = 20
 
 
 class Fence:
-    """What must happen before a line is used again."""
+    """What must happen before a line is used again.
+
+    Attributes:
+        in_step: nothing has happened since the last proof that leaves it open whose a reply is.
+    """
 
     def __init__(self, resync: Resync) -> None:
+        self.in_step = True
         self._resync = resync
         self._rounds_left = 0
         self._since_s = 0.0
 
-    @property
-    def in_step(self) -> bool:
-        """Whether nothing has happened since the last proof that makes it doubtful whose a reply is."""
-        return self._rounds_left == 0
-
     def doubt(self) -> None:
         """Something has happened: the line must prove that it is in step."""
-        self._rounds_left = PROBE_ROUNDS
+        self._rounds_left, self.in_step = PROBE_ROUNDS, False
 
     def proven(self) -> None:
         """The known reply has come."""
-        self._rounds_left = 0
+        self._rounds_left, self.in_step = 0, True
 
     def raised(self, now_s: float) -> float:
         """Begin to wait for silence; return until when, if no byte comes."""
@@ -106,4 +106,5 @@ class Fence:
             return None
         exchange = self._resync.probe(avoid)
         self._rounds_left = self._rounds_left - 1 if exchange else 0
+        self.in_step = self._rounds_left == 0
         return Probe(exchange, now_s) if exchange else None

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import Lane
+from ldcnd.bus.queue import POLL, Lane
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Condition, Exchange, Timing
 from ldcnd.wirelog.recorder import AT_ONCE_REMARK
@@ -28,9 +28,12 @@ class Turn(ABC):
         wanted_at_s: since when, in loop time.
         then_baud: the rate to use from the end of this exchange on; None for the present one.
         at_baud: the rate of this exchange alone; None for the line's.
+        laborious: much is done with the reply.
     """
 
-    __slots__ = ("at_baud", "exchange", "lane", "then_baud", "wanted_at_s")
+    __slots__ = ("at_baud", "exchange", "laborious", "lane", "then_baud", "wanted_at_s")
+    proves = False
+    """Whether the line judges the content of the reply itself."""
 
     def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float) -> None:
         self.exchange = exchange
@@ -38,17 +41,7 @@ class Turn(ABC):
         self.wanted_at_s = wanted_at_s
         self.then_baud: int | None = None
         self.at_baud: int | None = None
-
-    @property
-    def plain(self) -> bool:
-        """Whether a whole intact reply is all that it takes for the line to go on to the next turn."""
-        exchange = self.exchange
-        return exchange.repeatable and not (exchange.total_bytes or self.then_baud or self.at_baud)
-
-    @property
-    def laborious(self) -> bool:
-        """Whether much is done with the reply."""
-        return False
+        self.laborious = False
 
     @abstractmethod
     def completed(self, reply: bytes, timing: Timing) -> None:
@@ -71,14 +64,11 @@ class PollTurn(Turn):
     def __init__(
         self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float, order: PhaseOrder | None = None
     ) -> None:
-        super().__init__(exchange, Lane.POLL, wanted_at_s)
+        self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
+        self.then_baud = self.at_baud = None
+        self.laborious = poller.laborious
         self.poller = poller
         self.order = order
-
-    @property
-    @override
-    def laborious(self) -> bool:
-        return self.poller.laborious
 
     @override
     def completed(self, reply: bytes, timing: Timing) -> None:

@@ -83,16 +83,18 @@ class Pieces:
         self.early = False
         self._over_s = self._byte_s = 0.0
 
-    def begin(self, sent_at_s: float, request_s: float, byte_s: float) -> None:
-        """Forget what came; wait for the reply to a request.
+    def begin(self, sent_at_s: float, request_s: float, byte_s: float, reply_bytes: int) -> float:
+        """Forget what came; wait for the reply to a request; return the earliest instant at which it can be whole.
 
         Args:
             sent_at_s: when that was handed over; minus infinity on a line where nothing can come too early.
             request_s: how long it takes on the wire.
             byte_s: how long each byte of the reply takes.
+            reply_bytes: so many make it.
         """
         self.held, self.early = b"", False
         self._over_s, self._byte_s = sent_at_s + CLOCK_TOLERANCE * request_s, CLOCK_TOLERANCE * byte_s
+        return self._over_s + reply_bytes * self._byte_s
 
     def earliest_s(self, count: int) -> float:
         """Return the earliest instant at which so many bytes can have come behind the request."""
@@ -166,6 +168,9 @@ class Wire:
         baud: the rate of all turns that have none of their own.
         byte_s: how long a byte takes now, in seconds.
         fixed_baud: the transport cannot change its rate.
+        transport: the pipe.
+        echo: what is still to come back; None on a line without one.
+        log: the record of all that passes.
     """
 
     def __init__(
@@ -175,16 +180,11 @@ class Wire:
         self.byte_s = settings.bits_per_byte / settings.baud
         self.fixed_baud = transport.fixed_baud
         self._bits_per_byte = settings.bits_per_byte
-        self._transport = transport
+        self.transport = transport
         self._statistics = statistics
-        self._log = wire_log
+        self.log = wire_log
         self._loop = asyncio.get_running_loop()
-        self._echo = Echo() if settings.echo else None
-
-    @property
-    def lag_s(self) -> float:
-        """See `Transport`."""
-        return self._transport.lag_s
+        self.echo = Echo() if settings.echo else None
 
     def longest_s(self, exchange: Exchange[Any]) -> float:
         """Return how long an exchange can take at the present rate, first bit to last, in seconds."""
@@ -192,15 +192,15 @@ class Wire:
 
     def offers(self, baud: int) -> bool:
         """See `Transport`."""
-        return self._transport.offers(baud)
+        return self.transport.offers(baud)
 
     def line_errors(self) -> LineErrors | None:
         """See `Transport`."""
-        return self._transport.line_errors()
+        return self.transport.line_errors()
 
     def attach(self, receiver: Receiver) -> None:
         """See `Transport`."""
-        self._transport.attach(receiver)
+        self.transport.attach(receiver)
 
     def tune(self, baud: int, *, for_good: bool) -> None:
         """Change the rate.
@@ -208,33 +208,29 @@ class Wire:
         Raises:
             TransportLost: the pipe is gone.
         """
-        self._transport.set_baud(baud)
-        self._log.add(self._loop.time(), WireEvent.BAUD, note=str(baud))
+        self.transport.set_baud(baud)
+        self.log.add(self._loop.time(), WireEvent.BAUD, note=str(baud))
         self.byte_s = self._bits_per_byte / baud
         if for_good:
             self.baud = baud
 
     def expect(self, reply_bytes: int) -> None:
         """See `Transport`; with an echo every byte counts."""
-        self._transport.expect(1 if self._echo is not None else reply_bytes)
-
-    def push(self) -> None:
-        """See `Transport`."""
-        self._transport.push()
+        self.transport.expect(1 if self.echo is not None else reply_bytes)
 
     def collect(self) -> None:
         """See `Transport`."""
-        self._transport.collect()
+        self.transport.collect()
 
     def discard_input(self) -> None:
         """Forget what has come in and what is still to come back."""
-        self._transport.discard_input()
+        self.transport.discard_input()
         self.forget_echo()
 
     def write(self, data: bytes) -> str:
         """Hand bytes to the transport and do nothing else, `sent` is due behind it; return why it is lost, if it is."""
         try:
-            self._transport.write(data)
+            self.transport.write(data)
         except TransportLost as error:
             return error.message
         return ""
@@ -243,26 +239,26 @@ class Wire:
 
     def sent(self, data: bytes, at_s: float, remark: str) -> None:
         """Note what was written."""
-        self._log.add(at_s, WireEvent.SENT, data, remark)
+        self.log.add(at_s, WireEvent.SENT, data, remark)
         self._statistics.bytes_out += len(data)
-        if self._echo is not None:
-            self._echo.sent(data)
+        if self.echo is not None:
+            self.echo.sent(data)
 
     def without_echo(self, data: bytes, now_s: float) -> bytes | None:
         """Take our own bytes off what has come in; None when it should be our own bytes and is not."""
-        if not self._echo:
+        if not self.echo:
             return data
-        stripped = self._echo.strip(data)
+        stripped = self.echo.strip(data)
         if stripped is None:
             return None
         own, rest = stripped
-        self._log.add(now_s, WireEvent.ECHO, own)
+        self.log.add(now_s, WireEvent.ECHO, own)
         return rest
 
     def forget_echo(self) -> None:
         """Expect nothing of ours back any more."""
-        if self._echo:
-            self._echo.clear()
+        if self.echo:
+            self.echo.clear()
 
     def replied(self, turn: Turn, reply: bytes, sent_at_s: float, now_s: float) -> Timing:
         """Count an intact reply; return when it was true."""
@@ -283,8 +279,8 @@ class Wire:
     def stray(self, data: bytes, now_s: float, why: str = "") -> None:
         """Note bytes that belong to no request."""
         self._statistics.stray_bytes += len(data)
-        self._log.add(now_s, WireEvent.STRAY, data, why)
+        self.log.add(now_s, WireEvent.STRAY, data, why)
 
     def note(self, event: WireEvent, now_s: float, data: bytes = b"", remark: str = "") -> None:
         """Note anything else."""
-        self._log.add(now_s, event, data, remark)
+        self.log.add(now_s, event, data, remark)

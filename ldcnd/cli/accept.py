@@ -3,34 +3,36 @@
 import asyncio
 import json
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from ldcnd.bus.bus import Bus
-from ldcnd.daemon.line import acceptance
+from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.registers import RESET_BAUD
-from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS as SMARTSTEP_ASSUMPTIONS
-from ldcnd.drivers.transcript import describer
-from ldcnd.errors import BusDown, ConfigError
+from ldcnd.families.family import TrialMove, Tries
+from ldcnd.families.known import DEFAULT, FAMILIES
+from ldcnd.families.opened import show_findings
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
-from ldcnd.transport.port_url import port_opener
-from ldcnd.wirelog.capture import Capture, capture_lines
+from ldcnd.version import version
+from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
 
-OPEN_TIME_S = 5.0
 HELD_S = 1.0
 """The dead-man counts as released when Enter was not pressed for so long."""
 GAINS = "kp,kd,ki,il,ol,el"
 
 
+TRIED = {name: family for name, family in FAMILIES.items() if isinstance(family, Tries)}
+
+
 @click.command()
 @click.argument("port", required=False)
-@click.option("--family", type=click.Choice(["ldcn", "smartstep"]), default="ldcn", show_default=True)
-@click.option("--units", default="1", show_default=True, help="Unit numbers of the SmartSteps, as 1,2.")
+@click.option("--family", type=click.Choice(list(TRIED)), default=DEFAULT, show_default=True)
+@click.option("--units", default="1", show_default=True, help="Unit numbers, as 1,2, of drives that have some.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("acceptance"), show_default=True)
 @click.option("--move", "address", type=click.IntRange(1, 127), help="Let the drive at this address move, too.")
 @click.option("--gains", help=f"For the move: {GAINS}.")
@@ -72,10 +74,7 @@ def command(  # noqa: PLR0917 - click passes them by name
         print(f"{finding.axis:8} {word:9} {finding.what:16} {finding.text}", flush=True)
 
     out.mkdir(parents=True, exist_ok=True)
-    if family == "smartstep":
-        asyncio.run(_smartstep(port, units, out, show))
-    else:
-        asyncio.run(_ldcn(port, move, out, show))
+    asyncio.run(_try(family, port, _numbers(units), move, out, show))
     report = out / "report.jsonl"
     report.write_text("".join(f"{finding.model_dump_json()}\n" for finding in findings), encoding="utf-8")
     print(report)
@@ -87,15 +86,21 @@ def _refutes(finding: Finding) -> bool:
 
 
 def _list() -> None:
-    for each in acceptance.ASSUMPTIONS:
-        print(json.dumps({"family": "ldcn", "key": each.key, "says": each.says, "confirmed_by": each.confirmed_by}))
-    for doubt in SMARTSTEP_ASSUMPTIONS:
-        print(json.dumps({"family": "smartstep", "key": doubt.key, "says": doubt.question}))
+    for name, family in TRIED.items():
+        for each in family.assumptions():
+            print(json.dumps({"family": name, **each}))
+
+
+def _numbers(units: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(number) for number in units.split(","))
+    except ValueError:
+        raise click.UsageError(f"--units: {units!r} is not like 1,2") from None
 
 
 def _move(
     address: int | None, gains: str | None, counts: int, velocity: float, acceleration: float
-) -> acceptance.TrialMove | None:
+) -> TrialMove | None:
     if address is None:
         return None
     numbers = [int(number) for number in (gains or "").split(",") if number.strip().isdigit()]
@@ -105,54 +110,57 @@ def _move(
         raise click.UsageError("--move needs a terminal: Enter is the dead-man")
     kp, kd, ki, il, ol, el = numbers
     chosen = Gains(kp=kp, kd=kd, ki=ki, il=il, ol=ol, el=el, cl=0, sr=1, deadband=0)
-    return acceptance.TrialMove(address, chosen, counts, velocity, acceleration)
+    return TrialMove(address, chosen, counts, velocity, acceleration)
 
 
-async def _ldcn(port: str, move: acceptance.TrialMove | None, out: Path, show: Callable[[Finding], None]) -> None:
-    bus = acceptance.trial_bus(port_opener(port, RESET_BAUD))
-    zero_ns = acceptance.zero_ns()
+async def _try(
+    family: str,
+    port: str,
+    units: tuple[int, ...],
+    move: TrialMove | None,
+    out: Path,
+    show: Callable[[Finding], None],
+) -> None:
+    zero_ns = time.time_ns() - round(asyncio.get_running_loop().time() * 1e9)
     if move:
         print(
             f"Keep Enter pressed: the drive at address {move.address} moves {move.counts} counts and back.", flush=True
         )
     with _dead_man(wanted=move is not None) as held:
-        await _run(bus, port, acceptance.accept(bus, move, held), show)
-    _keep(acceptance.capture_of(bus, port, zero_ns), out)
-
-
-def _keep(capture: Capture, out: Path) -> None:
-    text = "\n".join(capture_lines(capture.header, capture.records, describer(capture.header.family, {})))
+        trial = TRIED[family].trial(port, units, move, held)
+        await show_findings(trial.bus, port, trial.findings, show)
+    config = RigConfig(rig="accept", bus=(trial.settings,)) if trial.settings else None
+    capture = capture_of(trial.bus, family, port, zero_ns, config)
+    text = "\n".join(capture_lines(capture.header, capture.records, FAMILIES[family].describe({})))
     (out / "line.capture").write_text(f"{text}\n", encoding="utf-8")
 
 
-async def _smartstep(port: str, units: str, out: Path, show: Callable[[Finding], None]) -> None:
-    try:
-        numbers = [int(number) for number in units.split(",")]
-    except ValueError:
-        raise click.UsageError(f"--units: {units!r} is not like 1,2") from None
-    try:
-        rig = acceptance.smartstep_rig(port, numbers)
-    except ValueError as error:
-        raise ConfigError(f"{port}, units {units}: {error}") from error
-    zero_ns = acceptance.zero_ns()
-    bus, findings = acceptance.accept_smartsteps(rig)
-    await _run(bus, port, findings, show)
-    _keep(acceptance.capture_of(bus, port, zero_ns, rig), out)
+def capture_of(bus: Bus, family: str, port: str, zero_ns: int, config: RigConfig | None = None) -> Capture:
+    """Return what was on the line from its opening on.
 
-
-async def _run(bus: Bus, port: str, findings: AsyncIterator[Finding], show: Callable[[Finding], None]) -> None:
-    async with asyncio.TaskGroup() as group:
-        owner = group.create_task(bus.run(), name="bus accept")
-        try:
-            async with asyncio.timeout(OPEN_TIME_S):
-                await bus.wait_opened()
-            async for finding in findings:
-                show(finding)
-        except TimeoutError:
-            why = bus.loss_reason or f"{port} did not open within {OPEN_TIME_S:g} s"
-            raise BusDown(why, remedy="end the daemon that has it, or correct the port") from None
-        finally:
-            owner.cancel()
+    Args:
+        bus: after the sequence.
+        family: of the drives on it.
+        port: where it was.
+        zero_ns: the wall time at which the loop's clock was 0.
+        config: of drives that are not found by themselves.
+    """
+    records = tuple(bus.wire_log.records())
+    header = CaptureHeader(
+        version=version(),
+        bus=bus.settings.name,
+        family=family,
+        port=port,
+        baud=bus.baud,
+        instance="accept",
+        zero_ns=zero_ns,
+        started_s=records[0].at_s,
+        until_s=records[-1].at_s + 1.0,
+        first_record=0,
+        cause="acceptance of drives",
+        config=config.model_dump(mode="json", exclude_defaults=True) if config else None,
+    )
+    return Capture(header, records)
 
 
 @contextmanager

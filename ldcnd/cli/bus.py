@@ -12,8 +12,9 @@ from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
-from ldcnd.drivers.dissector import install
-from ldcnd.drivers.transcript import Describe, describer
+from ldcnd.drivers.transcript import Describe
+from ldcnd.families.dissector import install
+from ldcnd.families.known import FAMILIES
 from ldcnd.model.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.wirelog.pcapng import encode_pcapng
@@ -158,7 +159,7 @@ def convert(file: Path, form: str | None, out: Path | None, *, as_json: bool) ->
     if capture.header.config:
         (line,) = config_of(capture.header).bus
         models = {axis.address: axis.model for axis in line.axis}
-    _render(capture, describer(capture.header.family, models), form, out, as_json=as_json)
+    _render(capture, FAMILIES[capture.header.family].describe(models), form, out, as_json=as_json)
 
 
 def _render(capture: Capture, describe: Describe, form: str | None, out: Path | None, *, as_json: bool) -> None:
@@ -194,7 +195,7 @@ async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[FetchedWi
         first_record=log.first_record,
     )
     models = {axis.address: axis.model for axis in await client.axes() if axis.bus == bus}
-    return log, header, describer(log.family, models)
+    return log, header, FAMILIES[log.family].describe(models)
 
 
 def _word_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:

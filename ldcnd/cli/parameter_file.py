@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from ldcnd.drivers.smartstep.parameters import digit_texts
-from ldcnd.drivers.smartstep.transfer import check_values, listed
 from ldcnd.errors import ConfigError
+from ldcnd.families.family import HasParameters
+from ldcnd.families.known import FAMILIES
 from ldcnd.model.parameters import ParameterDump
 
 LARGEST = 0xFFFF
+FAMILY = next(family for family in FAMILIES.values() if isinstance(family, HasParameters))
+"""Whose drives files are about: there is one such family, so that files need not name it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +32,11 @@ class ParameterFile:
 
     def named(self) -> dict[str, int]:
         """Return the stored values by their numbers; what the manual does not list keeps its name."""
-        return {_label(name): value for name, value in self.values.items()}
+        return {FAMILY.parameter(name, value)[0]: value for name, value in self.values.items()}
 
     def check(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return what is wrong with the values, and what deserves attention; asks no drive."""
-        return check_values(self.values)
+        return FAMILY.check_parameters(self.values)
 
 
 def as_toml(axis: str, reply: ParameterDump, read_at: datetime) -> str:
@@ -52,12 +54,9 @@ def as_toml(axis: str, reply: ParameterDump, read_at: datetime) -> str:
         ]
     lines += ["", "# in EEPROM", "[parameters]"]
     for value in reply.values:
-        parameter = listed(value.parameter)
-        nibbles = parameter is not None and parameter.nibbles
-        word = f"0x{value.stored:04X}" if nibbles else str(value.stored)
+        _, word, remarks = FAMILY.parameter(value.parameter, value.stored)
         lines.append(f"{value.parameter} = {word}  # {value.name}")
-        if parameter:
-            lines += [f"#   {text}" for text in digit_texts(parameter, value.stored)]
+        lines += [f"#   {text}" for text in remarks]
     lines += ["", "# in RAM", "[in_use]"]
     lines += [f"{value.parameter} = {value.active}" for value in reply.values]
     return "\n".join(lines) + "\n"
@@ -92,8 +91,3 @@ def _words(file: Path, table: str, values: object) -> dict[str, int]:
         if type(value) is not int or not 0 <= value <= LARGEST:
             raise ConfigError(f"{file}: {name}: {value!r} is not a word from 0 to {LARGEST}")
     return values
-
-
-def _label(name: str) -> str:
-    parameter = listed(name)
-    return parameter.label if parameter else name

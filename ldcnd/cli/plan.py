@@ -36,7 +36,7 @@ def _table(bus: BusPlan) -> str:
         f"bus {bus.bus}, {bus.baud} baud (drives: {bus.node_baud:.0f}): {'holds' if bus.holds else 'CANNOT HOLD'}",
         f"  load         {bus.load:6.1%} at worst, {bus.mean_load:.1%} on average",
         f"  commands     {bus.commands_per_s:6.0f} /s before a poll misses its turn",
-        *(stops if bus.family == "ldcn" else ["  stop         nothing on this line can move or stop a drive"]),
+        *(stops if bus.stops else ["  stop         nothing on this line can move or stop a drive"]),
         f"  assumed      {assumed}",
         f"  {'axis':12} {'item':20} {'rate':>8} {'bytes':>7} {'on line':>10} {'read within':>12}",
     ]

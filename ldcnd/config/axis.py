@@ -1,31 +1,20 @@
 """The configuration of one axis: its drive, its machine, and what it may do."""
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Literal, Self
+from typing import ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from ldcnd.config.toml import DeviceIdentity, Name
-from ldcnd.drivers.ldcn.profiles import PROFILES, HomingSource, Support
-from ldcnd.drivers.smartstep import config as smartstep_config
-from ldcnd.drivers.smartstep.config import SmartStepUnitConfig
-from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
 from ldcnd.model.commands import HomeMethod, HomeStop
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisLimits
 from ldcnd.model.plan import PollPriority
+from ldcnd.model.samples import TelemetryItem
 
 LEAST_TURN_COUNTS = 4
 """Of a rotary axis: one count must be no larger than the way to the other side."""
-
-
-def _known_model(model: str) -> str:
-    if model == smartstep_config.MODEL:
-        return model
-    movable = [name for name, profile in PROFILES.items() if profile.support is Support.FULL]
-    if model not in movable:
-        raise ValueError(f"no such drive model; known are {', '.join(movable)}")
-    return model
 
 
 class GainsConfig(Frozen):
@@ -139,16 +128,29 @@ class RatesConfig(Frozen):
     state: float = Field(default=5.0, gt=0, le=2000)
     """The drive's status and state; cannot be switched off, faults come with it."""
 
+    def wanted_hz(self, *, adc: bool) -> Mapping[TelemetryItem, float]:
+        """Return the items that are polled and how often; `adc` tells whether the drive has a converter."""
+        wanted = {
+            TelemetryItem.POSITION: self.position,
+            TelemetryItem.VELOCITY: self.velocity,
+            TelemetryItem.ADC: self.adc if adc else 0.0,
+            TelemetryItem.STATE: self.state,
+        }
+        return {item: rate for item, rate in wanted.items() if rate > 0}
+
 
 class AxisConfig(Frozen):
-    """One drive on a line."""
+    """One drive on a line; a family says which keys its drives need or do not have."""
+
+    reloadable: ClassVar[tuple[str, ...]] = ()
+    """Keys that may change while the daemon runs."""
 
     name: Name
     """Its chunk in every key; unique on the rig."""
-    model: Annotated[str, AfterValidator(_known_model)]
+    model: str
     """The drive model."""
     address: int = Field(ge=0, le=127)
-    """Node address from 1 on; the unit number of a SmartStep, 0 to 15."""
+    """Node address or unit number."""
     unit: str = "count"
     """Unit of everything that concerns this axis."""
     counts_per_unit: float | None = Field(default=None, ge=1e-9, le=1e12)
@@ -159,10 +161,10 @@ class AxisConfig(Frozen):
     modulo: float | None = Field(default=None, gt=0)
     """A rotary axis: positions repeat after so many axis units, such as 360. It turns without an end, and takes no
     position limits."""
-    velocity: float = Field(gt=0)
-    """Velocity of moves that do not name one, units a second."""
-    acceleration: float = Field(gt=0)
-    """Acceleration of moves that do not name one, units a second squared."""
+    velocity: float = Field(default=0.0, ge=0)
+    """Velocity of moves that do not name one, units a second; 0 for a drive that takes no motion over its line."""
+    acceleration: float = Field(default=0.0, ge=0)
+    """Acceleration of moves that do not name one, units a second squared; 0 likewise."""
     limits: AxisLimits = AxisLimits()
     """Software limits, in axis units."""
     gains: GainsConfig | None = None
@@ -195,24 +197,6 @@ moving off a switch stays possible. Not for `track`, nor on drives that do not s
     identity: DeviceIdentity | None = None
     """Id and version of this drive, when they are not among those known for its model: it is treated as that model."""
 
-    smartstep: SmartStepUnitConfig = SmartStepUnitConfig()
-    """What only a SmartStep has."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _complete(cls, document: object) -> object:
-        return smartstep_config.as_axis(document)
-
-    @field_validator("address")
-    @classmethod
-    def _within_family(cls, address: int, known: ValidationInfo) -> int:
-        is_smartstep = known.data.get("model") == smartstep_config.MODEL
-        if is_smartstep and address > HIGHEST_UNIT:
-            raise ValueError("a SmartStep has a unit number from 0 to 15")
-        if not is_smartstep and address == 0:
-            raise ValueError("a node address is 1 to 127")
-        return address
-
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         limits = self.limits
@@ -235,22 +219,12 @@ moving off a switch stays possible. Not for `track`, nor on drives that do not s
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
         self._check_tracking()
-        self._check_limit_switches()
         return self
 
     @property
     def switch_active(self) -> Literal["high", "low"]:
         """Level of a limit switch input while the switch is actuated."""
         return self.home.switch_active if self.home else "high"
-
-    def _check_limit_switches(self) -> None:
-        """Refuse limit switches that the drive cannot stop on."""
-        profile = PROFILES.get(self.model)
-        needed = HomingSource.LIMIT1 | HomingSource.LIMIT2
-        if self.limit_switches == "stop" and not (
-            profile and profile.stops_on_home and profile.homing_sources & needed == needed
-        ):
-            raise ValueError(f"limit_switches: {self.model} does not stop on its limit inputs by itself")
 
     def _check_tracking(self) -> None:
         """Refuse bounds of `track` that would trip the drive or outrun the axis."""
@@ -264,3 +238,15 @@ moving off a switch stays possible. Not for `track`, nor on drives that do not s
             raise ValueError(
                 f"tracking.step x rate is {tracking.step * tracking.rate:g}, above limits.velocity {limits.velocity}"
             )
+
+
+class MovedAxisConfig(AxisConfig):
+    """A drive that takes motion over its line."""
+
+    reloadable: ClassVar[tuple[str, ...]] = ("limits", "velocity", "acceleration", "rates", "priority")
+    """Looked up anew by every command, or by the poller that is made when they change."""
+
+    velocity: float = Field(gt=0)
+    """Velocity of moves that do not name one, units a second."""
+    acceleration: float = Field(gt=0)
+    """Acceleration of moves that do not name one, units a second squared."""

@@ -20,7 +20,7 @@ def set_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> Non
     Args:
         config: the file.
         axis: its name.
-        tables: by their names below the axis, such as `smartstep.trace`.
+        tables: by their names below the axis, such as `home`.
 
     Raises:
         ConfigError: the file is laid out so that the tables have to be put in by hand, or would be none any more.

@@ -10,6 +10,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from ldcnd.config.rig import RigConfig
+from ldcnd.config.toml import Variants
 from ldcnd.model.frozen import attribute_docstrings
 
 PREFACE = """# Configuration
@@ -25,19 +26,49 @@ def config_reference() -> str:
     return PREFACE + "".join(_sections(RigConfig, "", {RigConfig}))
 
 
-def _sections(model: type[BaseModel], path: str, seen: set[type[BaseModel]]) -> Iterator[str]:
-    """Describe a table and the tables within it, each model once."""
-    title = f"`[{path}]`" if path else "Top level"
-    what = (model.__doc__ or "").strip().splitlines()[0]
+def _sections(
+    model: type[BaseModel], path: str, seen: set[type[BaseModel]], family: str = "", common: type[BaseModel] = BaseModel
+) -> Iterator[str]:
+    """Describe a table and the tables within it, each model once; of a family only what `common` has not alike."""
+    fields = {name: field for name, field in model.model_fields.items() if not _alike(field, common, name)}
     said = attribute_docstrings(model)
-    rows = "".join(_row(name, field, said.get(name, "")) for name, field in model.model_fields.items())
-    yield f"\n## {title}\n\n{what}\n\n| key | type | default | meaning |\n|---|---|---|---|\n{rows}"
-    for name, field in model.model_fields.items():
+    if common is not BaseModel:
+        said = attribute_docstrings(common) | said
+    title = f"{f'`[{path}]`' if path else 'Top level'}{f', family `{family}`' if family else ''}"
+    what = (model.__doc__ or "").strip().splitlines()[0]
+    rows = "".join(_row(name, field, said.get(name, "")) for name, field in fields.items())
+    if rows:
+        yield f"\n## {title}\n\n{what}\n\n| key | type | default | meaning |\n|---|---|---|---|\n{rows}"
+    for name, field in fields.items():
         inner, many = _table(field.annotation)
-        if inner and inner not in seen:
-            seen.add(inner)
-            below = f"{path.strip('[]')}.{name}".lstrip(".")
-            yield from _sections(inner, f"[{below}]" if many else below, seen)
+        if inner is None or inner in seen:
+            continue
+        seen.add(inner)
+        below = f"{path.strip('[]')}.{name}".lstrip(".")
+        place = f"[{below}]" if many else below
+        known = common.model_fields.get(name)
+        base = _table(known.annotation)[0] if known else None
+        yield from _sections(inner, place, seen, family if base else "", base or BaseModel)
+        for variant, special in _variants(field):
+            yield from _sections(special, place, seen, variant, inner)
+
+
+def _alike(field: FieldInfo, common: type[BaseModel], name: str) -> bool:
+    known = common.model_fields.get(name)
+    if known is None:
+        return False
+    return (known.annotation, known.default, known.metadata) == (field.annotation, field.default, field.metadata)
+
+
+def _variants(field: FieldInfo) -> list[tuple[str, type[BaseModel]]]:
+    return [each for found in _marks(field.annotation) for each in found.models().items()]
+
+
+def _marks(annotation: Any) -> list[Variants]:  # noqa: ANN401 - an annotation can be anything
+    if isinstance(annotation, Variants):
+        return [annotation]
+    inner = (*get_args(annotation), *getattr(annotation, "__metadata__", ()))
+    return list(dict.fromkeys(found for each in inner for found in _marks(each)))
 
 
 def _row(name: str, field: FieldInfo, said: str) -> str:

@@ -1,32 +1,19 @@
 """The configuration file: TOML, validated whole before anything is opened."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializeAsAny, model_validator
 
 from ldcnd.config.bus import BusConfig
-from ldcnd.config.simulation import SimulatedChainConfig
-from ldcnd.config.toml import NAME_CHARACTERS, Name, read_toml, refuse_duplicates
-from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
+from ldcnd.config.simulated_line import SimulatedLineConfig
+from ldcnd.config.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
 from ldcnd.errors import ConfigError
+from ldcnd.families import known
 from ldcnd.model.frozen import Frozen
 
-
-class SimulatedLineConfig(SimulatedChainConfig):
-    """One simulated line, used by `port = "sim:NAME"`."""
-
-    name: Name
-    """What `port = "sim:NAME"` names."""
-    unit: tuple[SimulatedUnitConfig, ...] = Field(default=(), max_length=16)
-    """SmartSteps; a line has modules or units."""
-
-    @model_validator(mode="after")
-    def _one_family(self) -> Self:
-        if bool(self.module) is bool(self.unit):
-            raise ValueError("a simulated line has either modules or units")
-        refuse_duplicates("unit", [str(unit.number) for unit in self.unit])
-        return self
+Bus = Annotated[SerializeAsAny[BusConfig], Variants(known.bus_config, known.bus_configs)]
+SimulatedLine = Annotated[SerializeAsAny[SimulatedLineConfig], Variants(known.simulated_line, known.simulated_lines)]
 
 
 class ZenohConfig(Frozen):
@@ -119,9 +106,9 @@ class RigConfig(Frozen):
     """Captures that the daemon writes by itself."""
     heartbeat: HeartbeatConfig | None = None
     """A wire that changes its level while the daemon works."""
-    bus: tuple[BusConfig, ...] = Field(min_length=1)
+    bus: tuple[Bus, ...] = Field(min_length=1)
     """The lines."""
-    sim: tuple[SimulatedLineConfig, ...] = ()
+    sim: tuple[SimulatedLine, ...] = ()
     """Simulated lines, used by ports of the form sim:NAME."""
 
     @property
@@ -132,21 +119,24 @@ class RigConfig(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         refuse_duplicates("bus", [bus.name for bus in self.bus])
-        named = [module.name for bus in self.bus for module in bus.module if module.name]
+        named = [name for bus in self.bus for name in bus.module_names]
         refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis] + named)
         refuse_duplicates("sim", [line.name for line in self.sim])
         ports = [bus.port for bus in self.bus]
         refuse_duplicates("port", ports)
         self._check_heartbeat()
-        lines = {line.name for line in self.sim}
-        for port in ports:
-            if port.startswith("sim:") and port.removeprefix("sim:") not in lines:
-                known = ", ".join(sorted(lines)) or "none"
-                raise ValueError(f"port {port!r}: no [[sim]] of that name; there are: {known}")
-        units = {line.name for line in self.sim if line.unit}
+        lines = {line.name: line for line in self.sim}
         for bus in self.bus:
-            if bus.port.startswith("sim:") and (bus.family == "smartstep") is not (bus.port[4:] in units):
-                raise ValueError(f"bus {bus.name}: SmartSteps are simulated by units, other drives by modules")
+            if not bus.simulated:
+                continue
+            if bus.simulated not in lines:
+                names = ", ".join(sorted(lines)) or "none"
+                raise ValueError(f"port {bus.port!r}: no [[sim]] of that name; there are: {names}")
+            expected = known.FAMILIES[bus.family]
+            if not isinstance(lines[bus.simulated], expected.simulated_line):
+                raise ValueError(  # noqa: TRY004 - of the configuration
+                    f"bus {bus.name}: drives of family {bus.family} are simulated by {expected.simulated_key}s"
+                )
         return self
 
     def _check_heartbeat(self) -> None:

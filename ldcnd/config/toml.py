@@ -2,15 +2,45 @@
 
 import difflib
 import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from ldcnd.errors import ConfigError
 from ldcnd.model.frozen import Frozen
 
 DocumentT = TypeVar("DocumentT", bound=Frozen)
+
+
+@dataclass(frozen=True, slots=True)
+class Variants:
+    """Marks a table that different models read; what they have in common is the annotated model.
+
+    Attributes:
+        choose: returns the model that reads a table; raises ValueError when there is none.
+        models: returns all of them by name.
+    """
+
+    choose: Callable[[Mapping[str, Any]], type[BaseModel]]
+    models: Callable[[], Mapping[str, type[BaseModel]]]
+
+    def __get_pydantic_core_schema__(self, source: type[BaseModel], handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Read a table by its own model before it is taken for the common one."""
+
+        def read(document: object) -> object:
+            return self.choose(document).model_validate(document) if isinstance(document, dict) else document
+
+        return core_schema.no_info_before_validator_function(read, handler(source))
+
+    def __get_pydantic_json_schema__(self, _common: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Describe all of them."""
+        return {"anyOf": [handler(model.__pydantic_core_schema__) for model in self.models().values()]}
+
 
 REMOVED_KEYS = {
     "idle": "`telemetry.on_demand` is gone; delete this key",
@@ -68,25 +98,30 @@ def _unknown_key(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> 
     name = str(loc[-1])
     if name in REMOVED_KEYS:
         return f"no longer supported: {REMOVED_KEYS[name]}"
-    close = difflib.get_close_matches(name, _keys_at(document_type, loc[:-1]), n=1)
+    keys = _keys_at(document_type, loc[:-1])
+    if name in keys:
+        return "drives of another family have this key"
+    close = difflib.get_close_matches(name, keys, n=1)
     return f"there is no such key{f'; did you mean {close[0]!r}?' if close else ''}"
 
 
 def _keys_at(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Return the keys of the table at this place; empty where the place is not a single kind of table."""
-    table: object = document_type
+    tables: list[type[BaseModel]] = [document_type]
     for part in loc:
-        if isinstance(part, int):
-            continue
-        field = table.model_fields.get(part) if isinstance(table, type) and issubclass(table, BaseModel) else None
-        table = _table_in(field.annotation) if field else None
-    return list(table.model_fields) if isinstance(table, type) and issubclass(table, BaseModel) else []
+        if not isinstance(part, int):
+            fields = [table.model_fields[part] for table in tables if part in table.model_fields]
+            tables = [table for field in fields for table in _tables_in(field.annotation)]
+    return [key for table in tables for key in table.model_fields]
 
 
-def _table_in(annotation: object) -> type[BaseModel] | None:
+def _tables_in(annotation: object) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((found for each in get_args(annotation) if (found := _table_in(each))), None)
+        return [annotation]
+    if isinstance(annotation, Variants):
+        return list(annotation.models().values())
+    inner = (*get_args(annotation), *getattr(annotation, "__metadata__", ()))
+    return [table for each in inner for table in _tables_in(each)]
 
 
 NAME_CHARACTERS = 63
@@ -95,7 +130,7 @@ Name = Annotated[str, Field(pattern=rf"^[a-z0-9][a-z0-9_]{{0,{NAME_CHARACTERS - 
 """One chunk of a key: lower-case letters, digits, underscores."""
 
 DeviceIdentity = tuple[Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]]
-"""Id and version, as an LDCN or NMC module reports them."""
+"""Id and version, as a module reports them."""
 
 
 def refuse_duplicates(what: str, names: list[str]) -> None:

@@ -1,7 +1,7 @@
 """The last value of every key of every rig, ready to be spliced into frames for pages.
 
-A path is a key below `ldcn/`: `sim/tele/x/position`. An entry is the msgpack array of rig, topic and sample; samples
-stay the bytes that the daemon has sent.
+A path is a key without its root: `sim/tele/x/position`. An entry is the msgpack array of rig, topic and sample;
+samples stay the bytes that the daemon has sent.
 """
 
 import json

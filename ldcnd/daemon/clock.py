@@ -10,11 +10,12 @@ class Clock:
     """Turns instants of the event loop's clock into UTC nanoseconds.
 
     Attributes:
+        now_ns: returns the wall time, UTC in ns since 1970.
         started_s: what the loop's clock showed when the daemon was built, in seconds.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
-        self._now_ns = now_ns
+        self.now_ns = now_ns
         self._loop = asyncio.get_running_loop()
         self.started_s = self._loop.time()
 
@@ -22,17 +23,15 @@ class Clock:
         """Return the loop's time, in seconds."""
         return self._loop.time()
 
-    def now_ns(self) -> int:
-        """Return the wall time, UTC in ns since 1970."""
-        return self._now_ns()
-
     def wall_ns(self, at_s: float) -> int:
         """Return the wall time of an instant of the loop's clock."""
-        return self._now_ns() - round((self._loop.time() - at_s) * 1e9)
+        return self.now_ns() - round((self._loop.time() - at_s) * 1e9)
 
     def stamp(self, timing: Timing) -> tuple[int, int]:
         """Return when the values of an exchange were true and how far off that can be, both in ns."""
-        return self.stamp_between(timing.true_from_s, timing.true_until_s)
+        from_s, until_s = timing.true_from_s, timing.true_until_s
+        ago_s = self._loop.time() - (from_s + until_s) / 2
+        return self.now_ns() - round(ago_s * 1e9), round((until_s - from_s) / 2 * 1e9)
 
     def stamp_between(self, from_s: float, until_s: float) -> tuple[int, int]:
         """Return the middle of two instants of the loop's clock and how far off it can be, both in ns."""

@@ -1,4 +1,4 @@
-"""The contract between the daemon and one drive: an `AxisDriver` for each that is configured.
+"""The contracts between the daemon and one drive: a `Drive` for each that is configured, and what it can do.
 
 The line that it is on is a `Network`, in network.py. Values are encoder counts and
 seconds; units, limits, states and authority are the daemon's.
@@ -14,7 +14,7 @@ from ldcnd.bus.poller import Poller
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.drivers.tracer import Tracer
-from ldcnd.errors import BusError, NotSupported
+from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.model.commands import HomeMethod, PinMode, Verb
 from ldcnd.model.meta import Provenance
@@ -217,8 +217,8 @@ class ReadingListeners:
     alarmed: Callable[[Fault], None]
 
 
-class AxisDriver(ABC):
-    """One drive. Commands raise the `BusError` that befell them; none of them is repeated when that could move twice.
+class Drive(ABC):
+    """One drive, as far as all are alike; what it can do it inherits from the contracts below.
 
     What can make a motor move says so (`Exchange.moves`): the bus asks for permission when the turn of it has come.
 
@@ -227,29 +227,42 @@ class AxisDriver(ABC):
         identity: what the drive said it is; None before bring-up.
         capabilities: the truth about what the family and the model can do.
         adc_full_scale: counts of the A/D converter at full scale; None without one.
-        home_methods: what can mark the reference position.
-        retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
-        capture_s: how often the drive looks at the inputs that capture: a shorter pulse can be missed, and what is
-            captured is up to the way of so long behind the edge.
         shows_inputs: its readings carry the levels of its inputs.
         monitors: what is published beside the common items.
-        tracer: the drive's own recorder; None where the host has to sample.
     """
 
     spec: AxisSpec
     identity: str | None
     capabilities: frozenset[Verb]
-    adc_full_scale: int | None
-    home_methods: frozenset[HomeMethod]
-    capture_s: float = 0.0
-    retargets: bool = False
+    adc_full_scale: int | None = None
     shows_inputs: bool = False
     monitors: tuple[MonitorName, ...] = ()
-    tracer: Tracer | None = None
+
+
+class Readable(Drive):
+    """One exchange reads it."""
 
     @abstractmethod
     def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
         """Build the exchange that reads these items besides position, velocity and the drive's state."""
+
+
+class PollsItself(Drive):
+    """One exchange cannot read it: its family has a poller for it."""
+
+    @abstractmethod
+    def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any]:
+        """Return the poller, which begins at an instant of the loop's clock."""
+
+
+class Moves(Readable):
+    """It moves. Commands raise the `BusError` that befell them; none is repeated when that could move twice.
+
+    Attributes:
+        retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
+    """
+
+    retargets: bool = False
 
     @abstractmethod
     def quantise(self, motion: Motion) -> Motion:
@@ -259,9 +272,13 @@ class AxisDriver(ABC):
             ValueOutOfRange: a value does not fit its register; says which one would.
         """
 
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:  # noqa: ARG002 - for families that have some
+    @abstractmethod
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
         """Return what `load` and `start` would send for a motion, for looking at only."""
-        return ()
+
+    def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
+        """Return how far the position counter reaches in a direction, from where the axis was last."""
+        return LARGEST_COUNT
 
     @abstractmethod
     async def power(self, *, on: bool) -> None:
@@ -286,55 +303,99 @@ class AxisDriver(ABC):
         """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing."""
 
     @abstractmethod
+    async def reset(self) -> None:
+        """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
+
+
+class Tracks(ABC):
+    """It follows set-points."""
+
+    @abstractmethod
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once, without a profile; never repeated."""
+
+
+class TakesGains(ABC):
+    """The registers of its position loop can be loaded."""
+
+    @abstractmethod
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the registers; they act at once."""
+
+
+class Records(ABC):
+    """It has a recorder of its own.
+
+    Attributes:
+        tracer: of the recorder.
+    """
+
+    tracer: Tracer
+
+
+class HasParameters(ABC):
+    """Its parameters can be read."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> ParameterAccess:
+        """The drive's parameters."""
+
+
+class RemembersRegisters(ABC):
+    """It has registers that cannot be read back."""
+
+    @abstractmethod
+    def registers(self) -> tuple[Register, ...]:
+        """Return what is known of them."""
+
+
+class Homes(ABC):
+    """It captures its position at a mark.
+
+    Attributes:
+        home_methods: what can mark the reference position.
+        capture_s: how often the drive looks at the inputs that capture: a shorter pulse can be missed, and what is
+            captured is up to the way of so long behind the edge.
+    """
+
+    home_methods: frozenset[HomeMethod]
+    capture_s: float = 0.0
+
+    @abstractmethod
     async def captured_home(self) -> int:
         """Return the captured home position, in counts."""
 
     @abstractmethod
-    async def reset(self) -> None:
-        """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
+        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
+
+
+class Warns(ABC):
+    """It remembers what has not stopped anything."""
 
     @abstractmethod
-    async def set_gains(self, gains: Gains) -> None:
-        """Load the position loop's registers; they act at once."""
+    async def clear_warnings(self) -> None:
+        """Clear what is remembered; the loop stays as it is."""
 
-    # -- what only some drives have: refused by default, announced by a capability -----------------------------------
 
-    def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
-        """Return how far the position counter reaches in a direction, from where the axis was last."""
-        return LARGEST_COUNT
+class HasOutputs(ABC):
+    """Its limit switch pins can be outputs."""
 
-    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:  # noqa: ARG002 - part of the contract
-        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
-        return False
-
-    async def clear_warnings(self) -> None:  # noqa: B027 - a drive without warnings has nothing to do
-        """Clear what is remembered without having stopped anything; the loop stays as it is."""
-
-    async def track(self, position_counts: int) -> None:
-        """Go to a position at once, without a profile; never repeated.
-
-        Raises:
-            NotSupported: the drive cannot.
-        """
-        raise NotSupported(f"axis {self.spec.name}: {self.spec.model} cannot track ({position_counts})")
-
+    @abstractmethod
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """Use limit switch pins as outputs or inputs; None leaves a pin as it is.
 
         Raises:
-            NotSupported: the drive cannot.
+            NotSupported: the model cannot.
         """
-        raise NotSupported(f"axis {self.spec.name}: {self.spec.model} has no such outputs ({limit1}, {limit2})")
 
-    @property
-    def parameters(self) -> ParameterAccess | None:
-        """The drive's parameters; None where they cannot be read."""
-        return None
 
-    def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any] | None:  # noqa: ARG002
-        """Return the family's poller, where one exchange cannot read an axis; None for the common one."""
-        return None
+def registers_of(drive: Drive) -> tuple[Register, ...]:
+    """Return what is known of the registers of a drive that cannot be read back."""
+    return drive.registers() if isinstance(drive, RemembersRegisters) else ()
 
-    def registers(self) -> tuple[Register, ...]:
-        """Return what is known of the registers that cannot be read back."""
-        return ()
+
+def parameters_of(drive: Drive) -> ParameterAccess | None:
+    """Return the parameters of a drive; None for one without."""
+    return drive.parameters if isinstance(drive, HasParameters) else None

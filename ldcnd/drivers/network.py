@@ -8,7 +8,7 @@ from typing import Any
 
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
-from ldcnd.drivers.driver import AxisDriver, Motion, StopMode
+from ldcnd.drivers.driver import Drive, Motion, StopMode
 from ldcnd.drivers.line import FoundModule
 from ldcnd.errors import NotSupported
 from ldcnd.exchange import Timing
@@ -112,7 +112,7 @@ class Network(ABC):
         io: its I/O modules that have a name, by name.
     """
 
-    axes: Mapping[str, AxisDriver]
+    axes: Mapping[str, Drive]
     resync: Resync
     io: Mapping[str, IoDriver] = MappingProxyType({})
 

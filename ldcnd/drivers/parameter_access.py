@@ -118,5 +118,10 @@ class ParameterAccess(ABC):
 
     @property
     @abstractmethod
+    def eeprom_writes(self) -> int | None:
+        """How many writes the drive's EEPROM has taken in all; None where they are not counted."""
+
+    @property
+    @abstractmethod
     def self_hearing(self) -> bool:
         """Whether the drive takes its own replies for commands."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 UNLISTED_ALARM = "alarm_unlisted"
-"""The page of all SmartStep alarms that no manual lists."""
+"""The page of all alarms that no manual lists."""
 
 
 @cache

@@ -127,7 +127,11 @@ class MemorySession(Session):
     def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
         """Offer the sample to every subscription that matches; quality of service makes no difference here."""
         del qos
-        self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+        if self._closed:
+            raise SessionError("the session is closed")
+        subscriptions = self._broker.subscriptions
+        if subscriptions:
+            self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
 
     def delete(self, key: str) -> None:
         """Offer the news to every subscription that matches."""

@@ -84,6 +84,11 @@ class BusPlan(Frozen):
     polls: tuple[PollPlan, ...]
     """What is asked of it."""
 
+    @property
+    def stops(self) -> bool:
+        """Whether the line can stop its drives: a stop has an exchange of its own."""
+        return self.stop_s > self.stop_wait_s
+
 
 class RigBudget(Frozen):
     """All lines of a rig: `meta/budget`."""

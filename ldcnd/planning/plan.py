@@ -5,38 +5,19 @@ polls. Reckoned with the longest replies and waits; see docs/explanation/timing.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from collections.abc import Sequence
+from dataclasses import replace
 
-from ldcnd.bus.settings import ServoCycle
-from ldcnd.config.axis import AxisConfig, RatesConfig
-from ldcnd.config.bus import BAUDS, BusConfig
+from ldcnd.config.axis import AxisConfig
+from ldcnd.config.bus import BusConfig
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.costs import price_list
-from ldcnd.drivers.ldcn.profiles import CYCLE_CLOCKS
-from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
-from ldcnd.drivers.price_list import PriceList
 from ldcnd.errors import ConfigError, ValueOutOfRange
+from ldcnd.families.family import Demand
+from ldcnd.families.known import FAMILIES
 from ldcnd.model.plan import BusPlan, ItemPlan, PollPlan, RigBudget
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.planning import smartstep as smartstep_plan
-from ldcnd.planning.cost import LineTiming, cost_of
-from ldcnd.planning.line_plan import LinePlan, Poll, Urgent, in_time, largest, plan_line
-from ldcnd.planning.response_times import PeriodicTask
+from ldcnd.planning.line_plan import LinePlan, Poll, largest, plan_line
 
 SLOWEST_HZ = 0.01
-
-
-def wanted_rates_hz(rates: RatesConfig, *, adc: bool) -> Mapping[TelemetryItem, float]:
-    """Return the items that are polled and how often; `adc` tells whether the drive has a converter."""
-    wanted = {
-        TelemetryItem.POSITION: rates.position,
-        TelemetryItem.VELOCITY: rates.velocity,
-        TelemetryItem.ADC: rates.adc if adc else 0.0,
-        TelemetryItem.STATE: rates.state,
-    }
-    return {item: rate for item, rate in wanted.items() if rate > 0}
 
 
 def plan_rig(config: RigConfig) -> RigBudget:
@@ -60,133 +41,34 @@ def require_plan(config: RigConfig) -> RigBudget:
 
 def plan_bus(bus: BusConfig) -> BusPlan:
     """Plan one line."""
-    bus = with_probes_that_fit(bus)
-    line = _line(bus)
-    by_deadline = bus.family == "ldcn"
-    plan = plan_line(line.polls, line.urgent, by_deadline=by_deadline, cycle=servo_cycle(bus))
+    demand = demand_of(bus)
+    timing = demand.timing
+    plan = plan_line(demand.polls, demand.urgent, by_deadline=demand.by_deadline, cycle=demand.cycle)
     return BusPlan(
         bus=bus.name,
         family=bus.family,
-        baud=round(line.timing.host_baud),
-        node_baud=line.timing.node_baud,
-        turnaround_s=line.timing.turnaround_s,
-        adapter_latency_s=line.timing.adapter_latency_s,
+        baud=round(timing.host_baud),
+        node_baud=timing.node_baud,
+        turnaround_s=timing.turnaround_s,
+        adapter_latency_s=timing.adapter_latency_s,
         load=plan.load,
         mean_load=plan.mean_load,
         commands_per_s=plan.commands_per_s,
         stop_wait_s=plan.stop_wait_s,
         stop_s=plan.stop_s,
         stop_after_loss_s=plan.stop_after_loss_s,
-        stop_probe_hz=bus.stop_probe_hz if by_deadline else 0.0,
+        stop_probe_hz=demand.stop_probe_hz,
         holds=plan.holds,
         overload="skip" if bus.skips else "refuse",
-        remedies=() if plan.holds else tuple(_remedies(_without_probes(bus))),
+        remedies=() if plan.holds else tuple(_remedies(bus)),
         polls=tuple(_described(bus, plan)),
     )
 
 
-def servo_cycle(bus: BusConfig) -> ServoCycle | None:
-    """Return the cycle that polls of the line are ordered by; None where they are not."""
-    if bus.family != "ldcn" or bus.order != "phase":
-        return None
-    divisor = baud_divisor(bus.baud, BaudCodes(bus.divisors), bus.clock_hz)
-    return ServoCycle(CYCLE_CLOCKS / bus.clock_hz, bus.baud / actual_baud(divisor, bus.clock_hz))
-
-
-def with_probes_that_fit(bus: BusConfig) -> BusConfig:
-    """Return the line without probes of its stop lane if nothing but them would make polls miss their turns."""
-    if bus.family != "ldcn" or not bus.stop_probe_hz or _line(bus).fits:
-        return bus
-    return _without_probes(bus) if _line(_without_probes(bus)).fits else bus
-
-
-def _without_probes(bus: BusConfig) -> BusConfig:
-    return bus.model_copy(update={"stop_probe_hz": 0.0})
-
-
-# -- what the line is asked to carry ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """What a line is asked to carry, and how fast it is."""
-
-    timing: LineTiming
-    polls: list[Poll]
-    urgent: Urgent
-    by_deadline: bool
-
-    @property
-    def fits(self) -> bool:
-        probes = [self.urgent.probe] if self.urgent.probe else []
-        return in_time(self.polls, probes, by_deadline=self.by_deadline)
-
-
-def _line(bus: BusConfig) -> _Line:
-    if bus.family == "smartstep":
-        timing = smartstep_plan.line_timing(bus)
-        return _Line(
-            timing, smartstep_plan.polls_of(bus, timing), smartstep_plan.urgent_of(bus, timing), by_deadline=False
-        )
-    prices = _prices(bus, bus.baud)
-    timing = _timing(bus, bus.baud, prices)
-    return _Line(timing, _polls(bus, timing, prices), _urgent(bus, timing, prices), by_deadline=True)
-
-
-def _prices(bus: BusConfig, baud: int) -> Mapping[str, PriceList]:
-    codes = BaudCodes(bus.divisors)
-    models = {axis.model for axis in bus.axis}
-    return MappingProxyType({model: price_list(model, baud, codes, bus.clock_hz) for model in sorted(models)})
-
-
-def _timing(bus: BusConfig, baud: int, prices: Mapping[str, PriceList]) -> LineTiming:
-    return LineTiming(
-        host_baud=baud,
-        node_baud=min(price.node_baud for price in prices.values()),
-        adapter_latency_s=bus.adapter_latency_ms / 1000,
-    )
-
-
-def _polls(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> list[Poll]:
-    polls = []
-    for axis in bus.axis:
-        price = prices[axis.model]
-        rates_hz = wanted_rates_hz(axis.rates, adc=True)
-        rate_hz = max(rates_hz.values())
-        bare_s = cost_of(price.reading(frozenset()), timing).mean_s
-        extra_s = {item: cost_of(price.reading(frozenset([item])), timing).mean_s - bare_s for item in rates_hz}
-        mean_s = bare_s + math.fsum(extra_s[item] * rates_hz[item] / rate_hz for item in rates_hz)
-        items = tuple(item.value for item in rates_hz)
-        # drives in analog positioning send their converter's value with every reply
-        longest = price.reading(frozenset(TelemetryItem))
-        size = len(longest.request), longest.reply_bytes
-        polls.append(Poll(axis.name, items, rate_hz, cost_of(longest, timing), mean_s, *size))
-    return polls
-
-
-def _urgent(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> Urgent:
-    commands = [cost_of(exchange, timing) for price in prices.values() for exchange in price.commands.values()]
-    stops = [cost_of(price.stop, timing) for price in prices.values() if price.stop]
-    byte_s = timing.bits_per_byte / timing.host_baud
-    at_reset = baud_at_reset(bus.clock_hz)
-    return Urgent(
-        command_s=max(command.longest_s for command in commands),
-        stop_s=max((stop.longest_s for stop in stops), default=0.0),
-        recovery_s=max(len(price.flush) * byte_s + price.settle_s for price in prices.values()),
-        margin_s=bus.margin_ms / 1000,
-        search_s=cost_of(_slowest(prices).probe, replace(timing, host_baud=at_reset, node_baud=at_reset)).longest_s,
-        probe=_probe(bus, timing, prices),
-    )
-
-
-def _slowest(prices: Mapping[str, PriceList]) -> PriceList:
-    return next(iter(prices.values()))  # asking who somebody is costs the same whoever it is
-
-
-def _probe(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> PeriodicTask | None:
-    if not bus.stop_probe_hz:
-        return None
-    return PeriodicTask(1.0 / bus.stop_probe_hz, cost_of(_slowest(prices).probe, timing).longest_s)
+def demand_of(bus: BusConfig) -> Demand:
+    """Return what a line is asked to carry; without probes if nothing but them would make polls miss their turns."""
+    demand = FAMILIES[bus.family].plan(bus)
+    return demand.without_probes if not demand.fits and demand.without_probes.fits else demand
 
 
 # -- what would make it fit ------------------------------------------------------------------------------------------
@@ -194,38 +76,39 @@ def _probe(bus: BusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) 
 
 def _remedies(bus: BusConfig) -> list[str]:
     """Return changes of one setting each, any of which is enough."""
-    line, remedies = _line(bus), []
+    demand, remedies = _bare(bus), []
     cap = largest(
-        lambda hz: replace(line, polls=_capped(line.polls, hz)).fits,
+        lambda hz: replace(demand, polls=_capped(demand.polls, hz)).fits,
         SLOWEST_HZ,
-        max(poll.rate_hz for poll in line.polls),
+        max(poll.rate_hz for poll in demand.polls),
     )
     if cap is not None:
         shown = math.floor(cap * 100) / 100 if cap < 10 else math.floor(cap * 10) / 10  # noqa: PLR2004 - digits
         remedies.append(f"no rate above {shown:g} Hz")
-    for baud in BAUDS:
-        faster = bus.model_copy(update={"baud": baud})
-        if bus.family == "ldcn" and baud > bus.baud and _reached(bus, baud) and _line(faster).fits:
+    for baud in FAMILIES[bus.family].bauds:
+        if baud > bus.baud and _fits_at(bus, baud):
             remedies.append(f"baud = {baud}")
             break
-    if bus.adapter_latency_ms and _line(bus.model_copy(update={"adapter_latency_ms": 0.0})).fits:
+    if bus.adapter_latency_ms and _bare(bus.model_copy(update={"adapter_latency_ms": 0.0})).fits:
         remedies.append("adapter_latency_ms = 0, with an adapter that passes replies on at once")
     remedies.append('overload = "skip": polls then come as often as the line allows')
     return remedies
+
+
+def _bare(bus: BusConfig) -> Demand:
+    return FAMILIES[bus.family].plan(bus).without_probes
 
 
 def _capped(polls: Sequence[Poll], most_hz: float) -> list[Poll]:
     return [replace(poll, rate_hz=min(poll.rate_hz, most_hz)) for poll in polls]
 
 
-def _reached(bus: BusConfig, baud: int) -> bool:
-    """Tell whether every drive of the line has this rate."""
+def _fits_at(bus: BusConfig, baud: int) -> bool:
+    """Tell whether every drive of the line has this rate, and whether it is enough."""
     try:
-        BusConfig.model_validate(bus.model_dump() | {"baud": baud})
-        _prices(bus, baud)
+        return _bare(type(bus).model_validate(bus.model_dump() | {"baud": baud})).fits
     except (ValueError, ValueOutOfRange):
         return False
-    return True
 
 
 # -- saying it -------------------------------------------------------------------------------------------------------
@@ -261,7 +144,7 @@ def _items(axis: AxisConfig, poll: Poll, response_s: float) -> list[ItemPlan]:
             rate_hz=rate_hz,
             response_s=_bounded(response_s if rate_hz == poll.rate_hz else response_s + riding_s),
         )
-        for item, rate_hz in wanted_rates_hz(axis.rates, adc=True).items()
+        for item, rate_hz in axis.rates.wanted_hz(adc=True).items()
     ]
 
 

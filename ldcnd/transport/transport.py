@@ -25,14 +25,11 @@ class Transport(ABC):
 
     Attributes:
         fixed_baud: the rate cannot be changed from here (a TCP serial server).
+        lag_s: how much later than the line has it the next reply may come out of this pipe; known delays only.
     """
 
     fixed_baud = False
-
-    @property
-    def lag_s(self) -> float:
-        """How much later than the line has it the next reply may come out of this pipe; known delays only."""
-        return 0.0
+    lag_s = 0.0
 
     def offers(self, baud: int) -> bool:  # noqa: ARG002 - the general answer
         """Tell whether the pipe can be set to a rate, as far as is known before it is tried."""

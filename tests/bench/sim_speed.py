@@ -21,13 +21,13 @@ from pathlib import Path
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.config.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.drivers.driver import AxisSpec, Gains, Motion
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.profiles import LS_182AP
 from ldcnd.drivers.ldcn.status import StatusItem
+from ldcnd.families.ldcn.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import build_chain

@@ -8,17 +8,20 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli.accept import command
-from ldcnd.daemon.line.acceptance import ASSUMPTIONS, TrialMove, accept, capture_of, replayed, trial_bus
+from ldcnd.cli.accept import capture_of, command
 from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
+from ldcnd.families.family import TrialMove
+from ldcnd.families.known import FAMILIES
+from ldcnd.families.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
+from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
-from ldcnd.sim.smartstep.cable import simulated_units, smartstep_chain
+from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.wirelog.capture import Capture, parse_capture
+from ldcnd.wirelog.replay import Replay
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.plugged_rig import MODELS
 from tests.support.serial_adapter import Plug
@@ -38,6 +41,26 @@ def fresh() -> Chain:
     return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
 
 
+def replayed(capture: Capture) -> tuple[Finding, ...]:
+    """Play a capture without a move to the sequence again; return what it finds."""
+
+    async def play() -> tuple[Finding, ...]:
+        replay = Replay(capture.records, capture.header.until_s, lambda _text: None, slow_host=True)
+        (line,) = capture.header.config["bus"] if capture.header.config else [{"axis": []}]
+        units = [axis["address"] for axis in line["axis"]]
+        trial = FAMILIES[capture.header.family].trial("/dev/replayed", units, None, lambda: False, replay.open)
+        async with asyncio.TaskGroup() as group:
+            owner = group.create_task(trial.bus.run(), name="bus accept")
+            await trial.bus.wait_opened()
+            found = tuple([finding async for finding in trial.findings])
+            owner.cancel()
+        replay.close()
+        return found
+
+    with asyncio.Runner(loop_factory=lambda: JumpingLoop(capture.header.started_s)) as runner:
+        return runner.run(play())
+
+
 async def tried(chain: Chain, move: TrialMove | None = None, held=lambda: True) -> tuple[list[Finding], Capture]:
     bus = trial_bus(Plug(chain).open)
     async with asyncio.TaskGroup() as group:
@@ -45,7 +68,7 @@ async def tried(chain: Chain, move: TrialMove | None = None, held=lambda: True) 
         await bus.wait_opened()
         found = [finding async for finding in accept(bus, move, held)]
         owner.cancel()
-    return found, capture_of(bus, "/dev/ttyUSB0", 0)
+    return found, capture_of(bus, "ldcn", "/dev/ttyUSB0", 0)
 
 
 async def test_drives_that_are_as_the_documents_say_confirm_every_assumption_that_reading_can():

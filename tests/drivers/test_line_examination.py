@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.daemon.line.examination import LineAsConfigured, adapter_findings, examine
-from ldcnd.daemon.line.ldcn_line import build_ldcn_line
+from ldcnd.families.ldcn.examination import LineAsConfigured, adapter_findings, examine
+from ldcnd.families.ldcn.family import open_ldcn_line
 from ldcnd.model.health import Finding, Verdict
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -35,7 +35,8 @@ async def addressed_chain() -> Chain:
 
 async def examined(chain: Chain, holding: Holding = AT_ONCE) -> dict[str, Finding]:
     config = slow_config()
-    bus, network = build_ldcn_line(config, config.bus[0], {}, Plug(chain, holding).open)
+    line = open_ldcn_line(config.bus[0], Plug(chain, holding).open)
+    bus, network = line.bus, line.network
     bus.resync = network.resync
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name="bus")

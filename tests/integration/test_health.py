@@ -9,8 +9,8 @@ import pytest
 from ldcnd.bus.queue import Lane
 from ldcnd.bus.statistics import bucket_limit_s
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.line.smartstep_line import LEDGER_FILE
 from ldcnd.daemon.publish.health import _Rate
+from ldcnd.families.smartstep.family import LEDGER_FILE
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import PENDING_QUERIES, SampleKind

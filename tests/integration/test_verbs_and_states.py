@@ -101,7 +101,7 @@ async def put(axis: AxisService, name: str) -> None:
     elif kind in ("tracking", "pwm"):
         await axis.execute(MOTIONS["track" if kind == "tracking" else "set_pwm"])
         if kind == "tracking":
-            commands._procedure._due_s = float("-inf")  # as if it had come long ago
+            commands.procedure._due_s = float("-inf")  # as if it had come long ago
     elif kind == "error":
         tracker.state, tracker.enabled = AxisState.ERROR_STOP, name == "error, moving"
     elif kind == "disabled":

@@ -21,14 +21,19 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import (
     AnalogMotion,
-    AxisDriver,
     AxisReading,
     AxisSpec,
     Gains,
+    HasOutputs,
     HomeCapture,
+    Homes,
     Motion,
+    Moves,
     PwmOutput,
     StopMode,
+    TakesGains,
+    Tracks,
+    Warns,
 )
 from ldcnd.errors import LdcndError
 from ldcnd.exchange import Exchange, ReplyVerdict, Timing
@@ -59,7 +64,7 @@ STANDING: dict[str, Any] = {"profile_done": True, "velocity_counts_per_s": 0.0}
 Happening = Callable[[], Awaitable[None]]
 
 
-class FakeDrive(AxisDriver):
+class FakeDrive(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs):
     """A drive that records what it is told.
 
     Attributes:
@@ -99,6 +104,10 @@ class FakeDrive(AxisDriver):
         return motion
 
     @override
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        return ()
+
+    @override
     async def power(self, *, on: bool) -> None:
         await self._take("power", on)
         self.shown = replace(self.shown, enabled=on)
@@ -114,6 +123,10 @@ class FakeDrive(AxisDriver):
     @override
     async def stop(self, mode: StopMode) -> None:
         await self._take("stop", mode)
+
+    @override
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
+        return False
 
     @override
     async def captured_home(self) -> int:

@@ -29,13 +29,8 @@ class RecordingTurn(Turn):
         super().__init__(exchange, lane, 0.0)
         self.story = story
         self.send_again = False
-        self.works_long = False
         self.timing: Timing | None = None
         self.error: BusError | None = None
-
-    @property
-    def laborious(self) -> bool:
-        return self.works_long
 
     def completed(self, reply: bytes, timing: Timing) -> None:
         self.timing = timing
@@ -73,7 +68,7 @@ class PlainUsers:
     def sent(self, turn: Turn) -> None:
         pass
 
-    def look_ahead(self, turn: Turn, asked_at_s: float) -> None:
+    def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
         pass
 
     def next_due_s(self) -> float:
@@ -129,7 +124,7 @@ class Bench:
         exchange = toy.exchange(number, reply_bytes=reply_bytes, response_s=response_s, repeatable=repeatable)
         turn = RecordingTurn(exchange, self.users.story, lane)
         turn.then_baud, turn.at_baud = then_baud, at_baud
-        turn.works_long = laborious
+        turn.laborious = laborious
         self.users.waiting.append(turn)
         self.line.kick()
         return turn

@@ -12,9 +12,9 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.axis import AxisConfig, RatesConfig
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.drivers.smartstep.config import SmartStepUnitConfig
 from ldcnd.drivers.smartstep.parameters import PN000
 from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint
+from ldcnd.families.smartstep.config import SmartStepAxisConfig, SmartStepUnitConfig
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
@@ -85,6 +85,7 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
     }
 
     def traced(axis: AxisConfig) -> AxisConfig:
+        assert isinstance(axis, SmartStepAxisConfig)
         monitors = axis.smartstep.monitors if loaded else {}
         unit = SmartStepUnitConfig.model_validate({**axis.smartstep.model_dump(), "trace": trace, "monitors": monitors})
         rates = axis.rates if loaded else RatesConfig(position=0.2, velocity=0.2, state=0.2)

@@ -9,7 +9,6 @@ from ldcnd.config.axis import RatesConfig
 from ldcnd.daemon.axis.polling import AGAIN_S, AxisPoller
 from ldcnd.exchange import Timing
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.planning.plan import wanted_rates_hz
 
 POSITION, VELOCITY, ADC, STATE = (
     TelemetryItem.POSITION,
@@ -73,8 +72,8 @@ def test_missed_turns_are_skipped_and_not_made_up_for():
 def test_items_that_are_switched_off_and_converters_that_do_not_exist_are_not_polled():
     rates = RatesConfig(position=10, velocity=0, adc=2, state=5)
 
-    assert wanted_rates_hz(rates, adc=False) == {POSITION: 10, STATE: 5}
-    assert wanted_rates_hz(rates, adc=True) == {POSITION: 10, ADC: 2, STATE: 5}
+    assert rates.wanted_hz(adc=False) == {POSITION: 10, STATE: 5}
+    assert rates.wanted_hz(adc=True) == {POSITION: 10, ADC: 2, STATE: 5}
 
 
 def test_to_prepare_a_poll_changes_nothing_but_when_the_work_is_done():

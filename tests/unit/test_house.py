@@ -1,8 +1,11 @@
 """A poll, a move and a trace request pass no more files than they are known to need."""
 
+import re
+
 import pytest
 
 from tests.house import FLOWS, way_of
+from tests.support.process import ROOT
 
 MOST_FILES = {"poll": 25, "move": 44, "trace": 38}
 """Today; these bounds come down as the house gets simpler, and never go up."""
@@ -13,3 +16,19 @@ def test_a_flow_passes_few_files(name):
     way = way_of(name)
 
     assert 5 < len(way.files) <= MOST_FILES[name]
+
+
+FAMILIES = re.compile(r"smartstep|\bldcn\b|\bldcn_", re.IGNORECASE)
+NAMED = {
+    "ldcnd/families/known.py": "lists the families",
+    "ldcnd/families/dissector.py": "Wireshark has one plugin for all lines",
+    "ldcnd/messaging/keys.py": "the root of all keys",
+}
+"""Files that may name a family, and why."""
+
+
+def test_nothing_outside_its_folders_names_a_family():
+    files = [path.relative_to(ROOT) for path in (ROOT / "ldcnd").rglob("*.py")]
+    outside = [path for path in files if not {"ldcn", "smartstep"} & set(path.parts) and str(path) not in NAMED]
+
+    assert [str(path) for path in outside if FAMILIES.search((ROOT / path).read_text(encoding="utf-8"))] == []

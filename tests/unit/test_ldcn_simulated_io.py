@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.config.simulation import SimulatedChainConfig
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.pic_io import (
     IoItem,
@@ -21,6 +20,7 @@ from ldcnd.drivers.ldcn.pic_io import (
     send_io_command,
 )
 from ldcnd.errors import ValueOutOfRange
+from ldcnd.families.ldcn.simulation import SimulatedChainConfig
 from ldcnd.sim.ldcn.chain import Analog, ChainSpec, Line, ModuleSpec, TimedEvent, build_chain, model
 from ldcnd.sim.ldcn.io import IoWiring
 from tests.support.simulated_host import SimulatedHost

@@ -1,12 +1,13 @@
 """What `ldcnd sim --wire-log` writes about a foreign host."""
 
 from ldcnd.cli.sim import WireLogFile
+from ldcnd.drivers.ldcn.packet import PacketReader
 from ldcnd.wirelog.capture import parse_capture
 from ldcnd.wirelog.recorder import WireEvent
 
 
 def written(path, deeds):
-    with WireLogFile.open(path) as log:
+    with WireLogFile.open(path, "ldcn", PacketReader()) as log:
         for deed, *arguments in deeds:
             getattr(log, deed)(*arguments)
     return parse_capture(path.read_text())

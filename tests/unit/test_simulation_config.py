@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.sim import command
-from ldcnd.config.simulation import FaultPlanConfig, PlantConfig, Quirks, SimulatedChainConfig, SimulationConfig
+from ldcnd.config.simulated_line import FaultPlanConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.errors import ConfigError
+from ldcnd.families.ldcn.simulation import PlantConfig, Quirks, SimulatedChainConfig, SimulationConfig
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain

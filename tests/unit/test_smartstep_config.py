@@ -51,8 +51,11 @@ def test_unit_0_is_a_unit(tmp_path):
         (("address = 1", "address = 16"), ["address", "0 to 15"]),
         (("address = 1", "address = 1\nvelocity = 3"), ["velocity", "no motion"]),
         (("address = 1", "address = 1\ngains = { kp = 1, el = 1 }"), ["gains", "no motion"]),
-        (('model = "smartstep"', 'model = "ls-182ap"\nvelocity = 1\nacceleration = 1'), ["feed", "family smartstep"]),
-        (('family = "smartstep"', 'family = "ldcn"'), ["feed", "family ldcn"]),
+        (('model = "smartstep"', 'model = "ls-182ap"\nvelocity = 1\nacceleration = 1'), ["model", "family smartstep"]),
+        (
+            ('family = "smartstep"', 'family = "ldcn"'),
+            ["model", "family ldcn", "another family"],
+        ),
         (('framing = "8n1-soft-parity"', 'wiring = "2-wire"'), ["2-wire", "accept_two_wire"]),
         (('framing = "8n1-soft-parity"', 'echo = "expect"'), ["echo", "four wires"]),
         (("torque_reference", "torque"), ["monitors", "torque"]),

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.cli.doctor import SOFT_PARITY, scan_line
 from ldcnd.drivers.smartstep.network import smartstep_opener
 from ldcnd.drivers.smartstep.profiles import Framing, Wiring
+from ldcnd.families.smartstep.tools import SOFT_PARITY, scan_line
 from ldcnd.model.health import Verdict
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line

@@ -10,15 +10,15 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.smartstep.commands import FLUSH, Refusal, probe, reference, string_reference, write_eeprom, write_ram
-from ldcnd.drivers.smartstep.config import SimulatedUnitConfig
 from ldcnd.drivers.smartstep.packet import DAMAGED, ResponseStatus, add_parity, strip_parity
 from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN102
 from ldcnd.drivers.smartstep.profiles import Framing, TraceWordLayout, Wiring
 from ldcnd.errors import OutcomeUnknown, ReplyTimeout
+from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.sim.smartstep.cable import SimulatedCable, simulated_units, smartstep_chain
+from ldcnd.sim.smartstep.cable import SimulatedCable, smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

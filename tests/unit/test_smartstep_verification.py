@@ -5,7 +5,6 @@ from itertools import product
 
 import pytest
 
-from ldcnd.cli.doctor import verified_tables
 from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import load_config
 from ldcnd.drivers.smartstep.parameters import PN202, PN203
@@ -18,6 +17,7 @@ from ldcnd.drivers.smartstep.profiles import (
     TraceWordLayout,
 )
 from ldcnd.drivers.smartstep.verification import Stimulus, verify_traces
+from ldcnd.families.smartstep.tools import verified_tables
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.process import ROOT
 from tests.support.smartstep_line import simulated, smartstep_line

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.trace import command
-from ldcnd.drivers.smartstep.config import SmartStepTraceConfig
+from ldcnd.families.smartstep.config import SmartStepTraceConfig
 from ldcnd.messaging.codec import decode
 from ldcnd.model.traces import TakeTrace
 

@@ -18,7 +18,7 @@ from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.motion import AxisMotion, preview
 from ldcnd.daemon.axis.parameters import Parameters
-from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right
+from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.state import REST_COUNTS, AxisTracker, Ended, ObservedTracker
@@ -27,9 +27,10 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
 from ldcnd.daemon.trace.recorder import TraceRecorder
-from ldcnd.drivers.driver import AxisDriver, AxisReading, Fault, StopMode
+from ldcnd.drivers.driver import AxisReading, Drive, Fault, Moves, Readable, Records, StopMode, parameters_of
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
+from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
@@ -172,7 +173,7 @@ class AxisService:
         self,
         config: AxisConfig,
         bus: Bus,
-        driver: AxisDriver,
+        driver: Drive,
         publisher: Publisher,
         clock: Clock,
         next_command_id: Callable[[], str],
@@ -194,19 +195,19 @@ class AxisService:
             shows_inputs=driver.shows_inputs,
             modulo=config.modulo,
         )
-        self._gate = Gate(driver, self.tracker)
+        self._moves = moves = driver if isinstance(driver, Moves) else Unmoved(driver)
+        self._gate = Gate(moves, self.tracker)
         self._bus = bus
         self._clock = clock
         self._next_command_id = next_command_id
         self._note = note
-        self._motion = AxisMotion(config, driver, self.scale, self.tracker, self.telemetry, clock, self._read)
+        self._motion = AxisMotion(config, moves, self.scale, self.tracker, self.telemetry, clock, self._read)
         self._commands = AxisCommands(self._motion)
         self._plausibility = PlausibilityGate(config, self.scale)
         self._turns = AxisTurns(config.name)
-        self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
-        channels = host_channels(driver, config.unit, self.scale, self.telemetry.position)
-        tracer = driver.tracer or HostTracer(bus, driver, channels, self._require_reachable)
-        self.traces = TraceRecorder(config.name, tracer, publisher, clock)
+        parameters = parameters_of(driver)
+        self._parameters = Parameters(driver, parameters) if parameters else None
+        self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
         self.stop_wanted = asyncio.Event()
         self.returned: Callable[[], None] | None = None
         self._pending: StopMode | None = None
@@ -216,6 +217,14 @@ class AxisService:
         self._seen = False
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
+
+    def _tracer(self, driver: Drive) -> Tracer:
+        """Return the drive's own recorder, or the host's."""
+        if isinstance(driver, Records):
+            return driver.tracer
+        readable = driver if isinstance(driver, Readable) else self._moves
+        channels = host_channels(readable, self.config.unit, self.scale, self.telemetry.position)
+        return HostTracer(self._bus, readable, channels, self._require_reachable)
 
     # -- life --------------------------------------------------------------------------------------------------------
 
@@ -281,7 +290,7 @@ class AxisService:
         """Digest a reading that is believed."""
         was_away = self._seen and self.tracker.link is LinkState.DOWN
         self._seen = True
-        if self.stop_is_pending:
+        if self._pending is not None and self.tracker.stop_pending:
             self.stop_wanted.set()  # it answers again
         was_referenced = self.tracker.referenced
         self.tracker.observed(reading, timing, self._clock.now_ns())
@@ -290,9 +299,11 @@ class AxisService:
         if was_referenced and not self.tracker.referenced:
             log.warning("reference lost", axis=self.config.name, faults=[fault.code for fault in reading.faults])
         self._changed.set()
-        self._commands.observed(reading, timing)
-        if self._commands.step_due:
-            self._turns.wake()
+        self._motion.reading = reading
+        if self._commands.procedure is not None:
+            self._commands.observed(reading, timing)
+            if self._commands.step_due:
+                self._turns.wake()
         if self._inherited:
             self._end_what_has_no_end(reading, timing.sent_at_s)
         t, t_error_ns = self._clock.stamp(timing)
@@ -525,7 +536,7 @@ class AxisService:
             mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
         for _ in range(rounds):
             try:
-                await self.driver.stop(mode)
+                await self._moves.stop(mode)
             except BusError as error:
                 log.error("stop not confirmed", axis=self.config.name, reason=error.message)
                 if self._bus.is_open:
@@ -564,7 +575,7 @@ class AxisService:
             BadReply: they do not.
             BusError: the line failed.
         """
-        exchange = self.driver.reading(frozenset())
+        exchange = self._moves.reading(frozenset())
         before = await self._bus.execute(exchange)
         for _ in range(ROUNDS):
             reading = await self._bus.execute(exchange)

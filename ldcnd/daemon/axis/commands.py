@@ -4,6 +4,7 @@ import math
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
+from ldcnd.daemon.axis.permit import cannot
 from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
@@ -13,7 +14,7 @@ from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, StopMode
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, StopMode, TakesGains, Warns
 from ldcnd.errors import (
     DriveFault,
     NotSupported,
@@ -61,7 +62,8 @@ class AxisCommands:
     """The verbs of one axis, and the procedure that the last one may have begun.
 
     Attributes:
-        step_due: the procedure's next step is due.
+        procedure: what is under way and takes more than one step; None otherwise.
+        step_due: its next step is due.
     """
 
     def __init__(self, motion: AxisMotion) -> None:
@@ -71,7 +73,7 @@ class AxisCommands:
         self._driver = motion.driver
         self._tracker = motion.tracker
         self._gains = motion.driver.spec.gains
-        self._procedure: Procedure | None = None
+        self.procedure: Procedure | None = None
         self._retry_s: float | None = None  # when the step that was not taken is taken again
 
     async def carry_out(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
@@ -122,7 +124,7 @@ class AxisCommands:
             case MoveVelocity() if jogs(self._tracker) and not self._driver.retargets:
                 return Jog(self._motion, turn, request)
             case Track():
-                return SetPoint(self._motion, turn, request, self._procedure)
+                return SetPoint(self._motion, turn, request, self.procedure)
             case _:
                 return None
 
@@ -136,14 +138,13 @@ class AxisCommands:
     @property
     def deadline_s(self) -> float:
         """When the procedure takes its next step at the latest, in loop time; infinite without one."""
-        if self._procedure is None:
+        if self.procedure is None:
             return NEVER_S
-        return self._procedure.deadline_s if self._retry_s is None else self._retry_s
+        return self.procedure.deadline_s if self._retry_s is None else self._retry_s
 
     def observed(self, reading: AxisReading, timing: Timing) -> None:
-        """Take the latest reading, after the tracker has."""
-        self._motion.reading = reading
-        procedure = self._procedure
+        """Let the procedure under way take the latest reading, after the tracker has."""
+        procedure = self.procedure
         if procedure is None:
             return
         if procedure.outlived(self._tracker):
@@ -158,7 +159,7 @@ class AxisCommands:
             StopLatched: a stop has overtaken it.
             BusError: the line failed; the step is taken again.
         """
-        procedure, self.step_due = self._procedure, False
+        procedure, self.step_due = self.procedure, False
         if procedure is None:
             return
         if procedure.outlived(self._tracker):
@@ -171,7 +172,7 @@ class AxisCommands:
         finally:
             self.step_due = False  # what was read during the step called for the one that is over
         self._retry_s = None
-        if procedure is self._procedure and not goes_on:
+        if procedure is self.procedure and not goes_on:
             self._drop_procedure()
         self._motion.publish_state()
 
@@ -196,7 +197,7 @@ class AxisCommands:
         self._take_up(None)
 
     def _take_up(self, procedure: Procedure | None) -> None:
-        self._procedure, self._retry_s, self.step_due = procedure, None, False
+        self.procedure, self._retry_s, self.step_due = procedure, None, False
 
     async def _undertake(self, procedure: Procedure) -> CommandReply:
         """Begin a procedure; it takes steps only from then on, also when nobody knows whether the drive has begun."""
@@ -217,7 +218,7 @@ class AxisCommands:
         if on:
             guards.check_may_power_on(view)
             guards.check_stands(view)
-            if self._gains is None:
+            if self._gains is None and isinstance(self._driver, TakesGains):
                 raise WrongState(
                     f"axis {view.name} has no gains: its loop cannot close",
                     axis=view.name,
@@ -261,7 +262,7 @@ class AxisCommands:
             await self._driver.reset()
             self._drop_procedure()
             tracker.switched(on=False, now_s=self._motion.clock.now_s())
-        elif tracker.active_faults:
+        elif tracker.active_faults and isinstance(self._driver, Warns):
             await self._driver.clear_warnings()
         tracker.cleared(self._motion.clock.now_s())
         self._motion.publish_state()
@@ -428,5 +429,7 @@ class AxisCommands:
 
     async def _set_outputs(self, turn: Turn, request: SetOutputs) -> CommandReply:
         guards.check_reachable(self._tracker.view())
+        if not isinstance(self._driver, HasOutputs):
+            raise cannot(self._driver.spec, "set outputs")
         await self._driver.set_outputs(request.limit1, request.limit2)
         return self._motion.reply(turn)

@@ -1,6 +1,6 @@
 """The verbs of a drive whose parameters can be read: from a request to the drive's answer."""
 
-from ldcnd.drivers.driver import AxisDriver
+from ldcnd.drivers.driver import Drive
 from ldcnd.drivers.parameter_access import ParameterAccess
 from ldcnd.errors import NotSupported
 from ldcnd.model.commands import AxisCommand, CommandReply
@@ -31,7 +31,7 @@ from ldcnd.model.parameters import (
 class Parameters:
     """The parameter verbs of one axis; the caller sees to it that they come one after the other."""
 
-    def __init__(self, driver: AxisDriver, access: ParameterAccess) -> None:
+    def __init__(self, driver: Drive, access: ParameterAccess) -> None:
         self._driver = driver
         self._access = access
 

@@ -9,25 +9,31 @@ is true when it would start, not what was true when it came.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
+
+from typing_extensions import override
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.driver import (
     AnalogMotion,
-    AxisDriver,
     AxisReading,
     AxisSpec,
+    Drive,
     Gains,
     HomeCapture,
+    Homes,
     Motion,
+    Moves,
     PwmOutput,
     StopMode,
+    TakesGains,
+    Tracks,
 )
 from ldcnd.drivers.network import Network
-from ldcnd.errors import Remedy, RequestRefused, ShuttingDown, StopLatched, step
+from ldcnd.errors import NotSupported, Remedy, RequestRefused, ShuttingDown, StopLatched, step
 from ldcnd.exchange import Condition, Exchange, only_while
-from ldcnd.model.commands import HomeMethod, PinMode
+from ldcnd.model.samples import TelemetryItem
 
 
 def always() -> None:
@@ -56,20 +62,77 @@ class QuietDrive(Protocol):
 
     spec: AxisSpec
     adc_full_scale: int | None
-    home_methods: frozenset[HomeMethod]
     retargets: bool
 
-    @property
-    def capture_s(self) -> float: ...  # noqa: D102 - of `AxisDriver`, as all of these
-    def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `AxisDriver`, as all of these
+    def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
-    async def stop(self, mode: StopMode) -> None: ...  # noqa: D102
-    async def captured_home(self) -> int: ...  # noqa: D102
     def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
-    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool: ...  # noqa: D102
+    async def stop(self, mode: StopMode) -> None: ...  # noqa: D102
     async def reset(self) -> None: ...  # noqa: D102
-    async def clear_warnings(self) -> None: ...  # noqa: D102
-    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None: ...  # noqa: D102
+
+
+def homing(drive: QuietDrive) -> Homes:
+    """Return a drive as one that captures its position.
+
+    Raises:
+        NotSupported: it does not.
+    """
+    if isinstance(drive, Homes):
+        return drive
+    raise cannot(drive.spec, "home")
+
+
+def cannot(spec: AxisSpec, what: str) -> NotSupported:
+    """Return the refusal of what a drive cannot do."""
+    return NotSupported(f"axis {spec.name}: {spec.model} cannot {what}", axis=spec.name)
+
+
+class Unmoved(Moves):
+    """Stands for the motion of a drive that takes none over its line: everything is refused."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.spec = drive.spec
+        self.identity = drive.identity
+        self.capabilities = drive.capabilities
+
+    @override
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        self._refuse(f"read {', '.join(sorted(items))} at once")
+
+    @override
+    def quantise(self, motion: Motion) -> Motion:
+        self._refuse("move")
+
+    @override
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        return ()
+
+    @override
+    async def power(self, *, on: bool) -> None:
+        self._refuse("be enabled" if on else "be disabled")
+
+    @override
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        self._refuse("move")
+
+    @override
+    async def start(self) -> None:
+        self._refuse("move")
+
+    @override
+    async def stop(self, mode: StopMode) -> None:
+        self._refuse("be stopped")
+
+    @override
+    async def reset(self) -> None:
+        self._refuse("be reset")
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise NotSupported(
+            f"axis {self.spec.name}: {self.spec.model} cannot {what} over its line",
+            axis=self.spec.name,
+            remedy="use the drive's own inputs",
+        )
 
 
 class Permit:
@@ -138,23 +201,26 @@ class Permit:
     # -- what can move -----------------------------------------------------------------------------------------------
 
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
-        """Prepare a motion; see `AxisDriver.load`. Part of it may start the drive's profile generator."""
+        """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
         self.ask_to_move()
         with only_while(self.to_move()):
             await self._gate.driver.load(motion, home=home)
 
     async def start(self) -> None:
-        """Start what was loaded; see `AxisDriver.start`."""
+        """Start what was loaded; see `Moves.start`."""
         with self._beginning():
             await self._gate.driver.start()
 
     async def track(self, position_counts: int) -> None:
-        """Go to a position at once; see `AxisDriver.track`."""
+        """Go to a position at once; see `Tracks`."""
+        drive = self._gate.driver
+        if not isinstance(drive, Tracks):
+            raise cannot(drive.spec, "track")
         with self._beginning():
-            await self._gate.driver.track(position_counts)
+            await drive.track(position_counts)
 
     async def power_on(self) -> None:
-        """Close the loop; see `AxisDriver.power`. It takes several packets: a stop among them leaves it open."""
+        """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
         self.ask_to_move()
         was_on = self._gate.tracker.enabled
         try:
@@ -167,10 +233,13 @@ class Permit:
             raise
 
     async def set_gains(self, gains: Gains) -> None:
-        """Load the registers of the loop, which act at once; see `AxisDriver.set_gains`."""
+        """Load the registers of the loop, which act at once; see `TakesGains`."""
         self.ask()
+        drive = self._gate.driver
+        if not isinstance(drive, TakesGains):
+            raise cannot(drive.spec, "take gains")
         with only_while(self.ask):
-            await self._gate.driver.set_gains(gains)
+            await drive.set_gains(gains)
 
     def _beginning(self) -> only_while:
         """Return the context of the packets that begin a motion; from now on the command is not late any more."""
@@ -189,7 +258,7 @@ class Gate:
         closed: the daemon ends; no permit holds.
     """
 
-    def __init__(self, driver: AxisDriver, tracker: AxisTracker) -> None:
+    def __init__(self, driver: Moves, tracker: AxisTracker) -> None:
         self.driver = driver
         self.tracker = tracker
         self.epoch = 0

@@ -27,7 +27,7 @@ APART_S = 0.1
 ROUNDS = 4
 """So many readings in a row that contradict each other count as one lost reply."""
 
-_COUNTER = 1 << 32
+_COUNTER, _HALF = 1 << 32, 1 << 31
 
 
 class Verdict(Enum):
@@ -97,7 +97,8 @@ class PlausibilityGate:
             if self._doubtful:
                 self.withheld += self._rounds
             self._sure = True
-            return self._believe(reading, timing)
+            self._known, self._doubtful, self._rounds = _Seen(reading, timing), None, 0
+            return Verdict.BELIEVED
         if self._doubtful and self._follows(self._doubtful, reading, timing, None):
             self.jumped = self._sure and self._is_jump(known, reading, timing)
             self._sure = True
@@ -141,7 +142,7 @@ class PlausibilityGate:
         changed = abs(velocity - before.velocity_counts_per_s)
         if changed > self._acceleration * passed_s + 2 * resolution:
             return False
-        way = _way(before, reading)
+        way = (reading.position_counts - before.position_counts + _HALF) % _COUNTER - _HALF
         if within_counts is not None:
             return abs(way) <= within_counts
         expected = (velocity + before.velocity_counts_per_s) / 2 * passed_s
@@ -165,4 +166,4 @@ def agree(one: AxisReading, other: AxisReading) -> bool:
 
 def _way(before: AxisReading, after: AxisReading) -> int:
     """Return the shortest way between two counts, which wrap."""
-    return (after.position_counts - before.position_counts + _COUNTER // 2) % _COUNTER - _COUNTER // 2
+    return (after.position_counts - before.position_counts + _HALF) % _COUNTER - _HALF

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing_extensions import override
 
 from ldcnd.bus.poller import Poller, next_on_grid
-from ldcnd.drivers.driver import AxisDriver, AxisReading
+from ldcnd.drivers.driver import AxisReading, Readable
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.model.samples import TelemetryItem
@@ -44,7 +44,7 @@ class AxisPoller(Poller[AxisReading]):
 
     def __init__(
         self,
-        driver: AxisDriver,
+        driver: Readable,
         rates_hz: Mapping[TelemetryItem, float],
         start_at_s: float,
         deliver: Deliver,
@@ -96,7 +96,8 @@ class AxisPoller(Poller[AxisReading]):
                 item: next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
             }
             asked = asked.union(due)
-        due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
+        behind = max(0, int((now_s - self.due_at_s) / self._period_s))
+        due_at_s = self.due_at_s + (behind + 1) * self._period_s
         return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:

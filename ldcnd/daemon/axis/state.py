@@ -82,6 +82,11 @@ def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None
     pass
 
 
+StateShown = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None]
+QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
+"""What a value read just now is worth, by the drive's link."""
+
+
 class RestJudge:
     """Decides from readings whether a shaft stands.
 
@@ -177,6 +182,21 @@ class AxisTracker:
             self.stop_pending,
         )
 
+    def shown(self) -> "StateShown":
+        """Return what a state sample says besides when; compared after every poll, so no model is built for it."""
+        return (
+            QUALITIES[self.link],
+            self.state,
+            self.enabled,
+            self.referenced,
+            self.moving,
+            self.link,
+            self.stop_latched,
+            self.stop_pending,
+            self.command,
+            self.last_error,
+        )
+
     @property
     def moving(self) -> Moving:
         """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
@@ -189,13 +209,7 @@ class AxisTracker:
     @property
     def quality(self) -> Quality:
         """What a value read just now is worth."""
-        match self.link:
-            case LinkState.UP:
-                return Quality.GOOD
-            case LinkState.DEGRADED:
-                return Quality.UNCERTAIN
-            case LinkState.DOWN:
-                return Quality.BAD
+        return QUALITIES[self.link]
 
     @property
     def at_rest(self) -> bool:
@@ -223,7 +237,7 @@ class AxisTracker:
         self.position_lost = bool(faults) and any(fault.loses_position for fault in faults)
         if self.position_lost:
             self.referenced = False
-        if not self.concerns(timing):
+        if timing.sent_at_s < self._effective_from_s:
             return  # asked before the latest command took effect: says nothing about it
         self._rest.observed(reading, timing.sent_at_s)
         if reading.cut_short and self.command:
@@ -393,7 +407,7 @@ class ObservedTracker(AxisTracker):
         self._faults(reading.faults, now_ns)
         if not self.active_faults:
             self.first_fault = None
-        # SmartStep shows the speed in revolutions a minute, and its position comes from another poll
+        # such a drive shows the speed in coarse steps, and its position comes from another poll
         self._rest.rests = abs(reading.velocity_counts_per_s) <= reading.velocity_resolution_counts_per_s
         self.enabled = reading.enabled
         self.state = self._shown(reading)

@@ -15,8 +15,8 @@ from pathlib import Path
 from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
-from ldcnd.drivers.transcript import describer
 from ldcnd.errors import ConfigError
+from ldcnd.families.known import FAMILIES
 from ldcnd.log import get_logger
 from ldcnd.version import version
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
@@ -152,7 +152,7 @@ def lines_of(capture: Capture, config: RigConfig) -> Iterator[str]:
     """Yield the lines of a capture's text, with each packet in words."""
     line = next(line for line in config.bus if line.name == capture.header.bus)
     models = {axis.address: axis.model for axis in line.axis}
-    return capture_lines(capture.header, capture.records, describer(line.family, models))
+    return capture_lines(capture.header, capture.records, FAMILIES[line.family].describe(models))
 
 
 def of_one_line(config: RigConfig, bus: str) -> RigConfig:

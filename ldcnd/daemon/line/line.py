@@ -10,14 +10,13 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.polling import AxisPoller
 from ldcnd.daemon.clock import Clock
-from ldcnd.drivers.driver import ReadingListeners, StopMode
+from ldcnd.drivers.driver import PollsItself, Readable, ReadingListeners, StopMode
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import BusDown, BusError, LdcndError, WrongState
 from ldcnd.log import get_logger
 from ldcnd.model.commands import Verb
 from ldcnd.model.rig_commands import SnapshotReply
 from ldcnd.model.samples import TelemetryItem
-from ldcnd.planning.plan import wanted_rates_hz
 from ldcnd.wirelog.recorder import WireEvent
 
 log = get_logger("bus")
@@ -280,9 +279,15 @@ class BusService:
         """Ask the axis from now on; a poller that it had is replaced."""
         if previous := self._pollers.get(axis.config.name):
             self.bus.remove_poller(previous)
-        own = axis.driver.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed, axis.alarmed))
-        rates_hz = wanted_rates_hz(axis.config.rates, adc=bool(axis.driver.adc_full_scale))
-        poller = own or AxisPoller(axis.driver, rates_hz, now_s, axis.judged, axis.missed, self.bus.add_poller)
+        poller: Poller[Any]
+        drive = axis.driver
+        if isinstance(drive, PollsItself):
+            poller = drive.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed, axis.alarmed))
+        elif isinstance(drive, Readable):
+            rates_hz = axis.config.rates.wanted_hz(adc=bool(drive.adc_full_scale))
+            poller = AxisPoller(drive, rates_hz, now_s, axis.judged, axis.missed, self.bus.add_poller)
+        else:
+            raise TypeError(f"axis {axis.config.name}: its drive can be read in no way")
         poller.priority = Priority[axis.config.priority.upper()]
         self._pollers[axis.config.name] = poller
         self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from itertools import count
 from types import MappingProxyType
+from typing import Any
 
 from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
@@ -18,23 +19,22 @@ from ldcnd.daemon.command.dispatch import Dispatcher
 from ldcnd.daemon.command.events import EventLog
 from ldcnd.daemon.command.ledger import Ledger
 from ldcnd.daemon.command.requests import EarlyStops
-from ldcnd.daemon.line.ldcn_line import build_ldcn_line
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.modules import ModuleService
 from ldcnd.daemon.line.rig import Rig
-from ldcnd.daemon.line.smartstep_line import build_line, open_ledger
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.process.heartbeat import Heartbeat
 from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.drivers.driver import AxisDriver
-from ldcnd.drivers.smartstep.ledger import EepromLedger
+from ldcnd.drivers.driver import Drive
+from ldcnd.families.family import OpenLine
+from ldcnd.families.known import FAMILIES, chain_of
 from ldcnd.messaging.codec import Encoding
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.events import CommandStatus
-from ldcnd.planning.plan import with_probes_that_fit
+from ldcnd.planning.plan import demand_of
 from ldcnd.sim.chain import Chain
 from ldcnd.transport.transport import Opener
 
@@ -95,12 +95,12 @@ def build_daemon(
     def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         events.note(next_command_id(), axis, verb, status, reason, code=code)
 
-    def make_axis(axis: AxisConfig, bus: Bus, driver: AxisDriver) -> AxisService:
+    def make_axis(axis: AxisConfig, bus: Bus, driver: Drive) -> AxisService:
         return AxisService(axis, bus, driver, publisher, clock, next_command_id, ledger.ended, note)
 
-    eeprom = open_ledger(config.state_dir)
+    open_lines = {name: FAMILIES[name].open_lines(config.state_dir) for name in {bus.family for bus in config.bus}}
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
-    buses = tuple(_build_bus(config, bus, make_axis, chains, openers, eeprom) for bus in config.bus)
+    buses = tuple(_build_bus(config, bus, open_lines[bus.family], make_axis, chains, openers) for bus in config.bus)
     modules = tuple(
         ModuleService(driver, publisher, clock, tuple(axis.config.name for axis in bus.axes))
         for bus in buses
@@ -110,34 +110,29 @@ def build_daemon(
     authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
     dispatcher = Dispatcher(rig, authority, ledger, events, clock, next_command_id, instance)
 
-    def eeprom_writes(axis: AxisService) -> int | None:
-        return eeprom.total(axis.config.name) if eeprom and axis.driver.parameters else None
-
     heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
-    return Daemon(
-        config, session, rig, dispatcher, publisher, clock, instance, eeprom_writes, stops=stops, heartbeat=heartbeat
-    )
+    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, stops=stops, heartbeat=heartbeat)
 
 
 def _build_bus(
     config: RigConfig,
     settings: BusConfig,
-    make_axis: Callable[[AxisConfig, Bus, AxisDriver], AxisService],
+    open_line: OpenLine[Any],
+    make_axis: Callable[[AxisConfig, Bus, Drive], AxisService],
     chains: Mapping[str, Chain],
     openers: Mapping[str, Opener],
-    eeprom: EepromLedger | None,
 ) -> BusService:
-    if settings.family == "smartstep":
-        line, units = build_line(config, settings, eeprom, chains, openers.get(settings.name))
-        services = tuple(make_axis(axis, line, units.axes[axis.name]) for axis in settings.axis)
-        return BusService(line, units, services, port=settings.port, family=settings.family)
-    bus, network = build_ldcn_line(config, settings, chains, openers.get(settings.name))
-    axes = tuple(make_axis(axis, bus, network.axes[axis.name]) for axis in settings.axis)
+    opener = openers.get(settings.name)
+    chain = None
+    if opener is None:
+        chain = chains.get(settings.simulated) or chain_of(settings, config.sim)
+    line = open_line(settings, opener, chain)
+    axes = tuple(make_axis(axis, line.bus, line.network.axes[axis.name]) for axis in settings.axis)
     return BusService(
-        bus,
-        network,
+        line.bus,
+        line.network,
         axes,
         port=settings.port,
         family=settings.family,
-        stop_probe_hz=with_probes_that_fit(settings).stop_probe_hz,
+        stop_probe_hz=demand_of(settings).stop_probe_hz,
     )

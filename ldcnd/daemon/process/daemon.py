@@ -14,7 +14,7 @@ from ldcnd.daemon.command.loss import apply_policy
 from ldcnd.daemon.command.requests import EarlyStops, Requests
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.process.heartbeat import Heartbeat
-from ldcnd.daemon.publish.health import EepromWrites, HealthWatch
+from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.daemon.publish.meta import Describing
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.log import get_logger
@@ -53,7 +53,6 @@ class Daemon:
         publisher: Publisher,
         clock: Clock,
         instance: str,
-        eeprom_writes: EepromWrites,
         *,
         stops: EarlyStops | None = None,
         heartbeat: Heartbeat | None = None,
@@ -70,7 +69,7 @@ class Daemon:
         self._ending = asyncio.Event()
         self.captures = _capture_watch(self, self._run)
         self._declarations: list[Declaration] = []
-        self._health = HealthWatch(rig, self._keys, publisher, clock, self._load, eeprom_writes)
+        self._health = HealthWatch(rig, self._keys, publisher, clock, self._load)
         plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)
         self._heartbeat = heartbeat
@@ -251,4 +250,4 @@ def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:
 
 
 def _stop_bounds_s(plan: RigBudget) -> dict[str, float]:
-    return {bus.bus: bus.stop_wait_s for bus in plan.buses if bus.family == "ldcn"}
+    return {bus.bus: bus.stop_wait_s for bus in plan.buses if bus.stops}

@@ -15,11 +15,6 @@ from ldcnd.config.bus import BusConfig
 from ldcnd.config.rig import RigConfig
 from ldcnd.errors import ConfigError
 
-APPLICABLE = ("limits", "velocity", "acceleration", "rates", "priority")
-"""Keys of an axis that are looked up anew by every command, or by the poller that is made when they change."""
-FAMILY = "ldcn"
-"""The family whose axes have these keys; the others' take no motion over the line and pace their own polls."""
-
 
 @dataclass(frozen=True, slots=True)
 class Reload:
@@ -52,7 +47,7 @@ def plan_reload(running: RigConfig, wanted: RigConfig) -> Reload:
 
 
 def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
-    if not running.family == wanted.family == FAMILY:
+    if running.family != wanted.family:
         return running
     wanted_axes = {axis.name: axis for axis in wanted.axis}
     axes = tuple(_axis(axis, wanted_axes.get(axis.name, axis)) for axis in running.axis)
@@ -61,15 +56,15 @@ def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
 
 def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
     """Take the keys over, unless a unit means something else than before: then every number does."""
-    if (running.unit, running.counts_per_unit, running.direction) != (
+    if not running.reloadable or (running.unit, running.counts_per_unit, running.direction) != (
         wanted.unit,
         wanted.counts_per_unit,
         wanted.direction,
     ):
         return running
-    merged = running.model_copy(update={key: getattr(wanted, key) for key in APPLICABLE})
+    merged = running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
     try:
-        return AxisConfig.model_validate(merged.model_dump())
+        return type(running).model_validate(merged.model_dump())
     except ValidationError as error:
         reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors())
         raise ConfigError(

@@ -9,6 +9,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.drivers.driver import parameters_of
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Load
 from ldcnd.model.health import (
@@ -21,8 +22,6 @@ from ldcnd.model.health import (
     StopWaitHealth,
 )
 from ldcnd.model.samples import TelemetryItem
-
-EepromWrites = Callable[[AxisService], int | None]
 
 PERIOD_S = 1.0
 TURNS = 4
@@ -73,7 +72,6 @@ class HealthWatch:
         publisher: takes the reports, and knows what else was published.
         clock: as everywhere.
         load: returns how the daemon keeps up with its queries.
-        eeprom_writes: returns how often an axis's EEPROM was written, None where nobody knows.
 
     Attributes:
         latest: the newest report of each key.
@@ -88,7 +86,6 @@ class HealthWatch:
         publisher: Publisher,
         clock: Clock,
         load: Callable[[], Load],
-        eeprom_writes: EepromWrites,
     ) -> None:
         self.latest: dict[str, DaemonHealth | BusHealth] = {}
         self.stop_bounds_s: Mapping[str, float] = {}
@@ -97,7 +94,6 @@ class HealthWatch:
         self._publisher = publisher
         self._clock = clock
         self._load = load
-        self._eeprom_writes = eeprom_writes
         self.heartbeat: Callable[[], HeartbeatHealth | None] = lambda: None
         self._seq = 0
         self._missed = 0
@@ -196,7 +192,7 @@ class HealthWatch:
             rate_wanted_hz=axis.config.rates.position,
             rate_hz=granted_hz[TelemetryItem.POSITION],
             faults=len(axis.tracker.active_faults),
-            eeprom_writes=self._eeprom_writes(axis),
+            eeprom_writes=parameters.eeprom_writes if (parameters := parameters_of(axis.driver)) else None,
             items=tuple(
                 ItemHealth(item=item.value, asked_hz=hz, granted_hz=granted_hz[item]) for item, hz in asked_hz.items()
             ),

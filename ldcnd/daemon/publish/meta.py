@@ -12,7 +12,7 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.contract import all_schemas
 from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.drivers.driver import AxisDriver
+from ldcnd.drivers.driver import Drive, registers_of
 from ldcnd.errors import ErrorCode, MalformedRequest
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
@@ -164,7 +164,7 @@ def _covered(expression: str, keys: tuple[str, ...]) -> tuple[str, ...]:
 def _axis_source(axis: AxisService) -> object:
     """Return what the description of an axis is made of, as far as it changes."""
     driver = axis.driver
-    return axis.config, driver.identity, driver.registers(), driver.adc_full_scale, axis.traces.channels
+    return axis.config, driver.identity, registers_of(driver), driver.adc_full_scale, axis.traces.channels
 
 
 def bus_info(bus: BusService) -> BusInfo:
@@ -222,12 +222,12 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         priority=config.priority,
         registers=tuple(
             RegisterInfo(name=register.name, value=register.value, provenance=register.provenance)
-            for register in driver.registers()
+            for register in registers_of(driver)
         ),
     )
 
 
-def _publishes(driver: AxisDriver, item: TelemetryItem) -> bool:
+def _publishes(driver: Drive, item: TelemetryItem) -> bool:
     match item:
         case TelemetryItem.ADC:
             return bool(driver.adc_full_scale)

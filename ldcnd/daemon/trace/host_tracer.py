@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority, next_on_grid
-from ldcnd.drivers.driver import AxisDriver, AxisReading
+from ldcnd.drivers.driver import AxisReading, Readable
 from ldcnd.drivers.scaling import Scale
 from ldcnd.drivers.tracer import (
     ArmedTrace,
@@ -177,7 +177,7 @@ class HostChannel:
 
 
 def host_channels(
-    driver: AxisDriver, unit: str, scale: Scale, position: Callable[[float], float]
+    driver: Readable, unit: str, scale: Scale, position: Callable[[float], float]
 ) -> tuple[HostChannel, ...]:
     """Return what can be sampled of a drive.
 
@@ -224,7 +224,7 @@ class HostTracer(Tracer):
     source = TraceSource.HOST
 
     def __init__(
-        self, bus: Bus, driver: AxisDriver, channels: tuple[HostChannel, ...], require_reachable: Callable[[], None]
+        self, bus: Bus, driver: Readable, channels: tuple[HostChannel, ...], require_reachable: Callable[[], None]
     ) -> None:
         self.channels = tuple(each.channel.name for each in channels)
         self._bus = bus

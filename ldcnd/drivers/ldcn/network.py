@@ -14,7 +14,7 @@ from typing_extensions import override
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
 from ldcnd.bus.resync import Resync
-from ldcnd.drivers.driver import AxisDriver, AxisSpec, Motion, StopMode
+from ldcnd.drivers.driver import AxisSpec, Drive, Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import (
     ANY_DIALECT,
@@ -116,7 +116,7 @@ class LdcnNetwork(Network):
         self._rejoin = Rejoin(bus, self._rate, self._addressing, self._expected)
         drives = {drive.spec.name: drive for drive in self._drives.values()}
         self._groups = Groups(bus, plan, self._addressing, drives, snapshots=line.snapshot)
-        self.axes: Mapping[str, AxisDriver] = drives
+        self.axes: Mapping[str, Drive] = drives
         self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
         self.io: Mapping[str, IoDriver] = {module.name: module for module in self._io.values()}
         self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)

@@ -124,6 +124,10 @@ class PacketReader:
         """Whether a header has come whose packet is not complete yet."""
         return self._missing > 0
 
+    def begins(self, byte: int) -> bool:
+        """Tell whether this byte would begin a packet."""
+        return byte == HEADER and not self._missing
+
     def reset(self) -> None:
         """Forget a half-received packet."""
         self._body.clear()

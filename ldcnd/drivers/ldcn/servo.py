@@ -1,4 +1,4 @@
-"""One LDCN or NMC servo drive as an `AxisDriver`: which packets a command takes.
+"""One LDCN or NMC servo drive as a `Drive`: which packets a command takes.
 
 What its status packets mean is in faults.py, what its motions are to it in trajectory.py, what is known of its
 registers in registers.py. Versions 1 and 2 of PIC-SERVO do not stop on home by themselves: the host stops them.
@@ -22,14 +22,20 @@ from ldcnd.drivers import driver
 from ldcnd.drivers.driver import (
     LARGEST_COUNT,
     AnalogMotion,
-    AxisDriver,
     AxisReading,
     AxisSpec,
+    HasOutputs,
     HomeCapture,
+    Homes,
     Motion,
+    Moves,
     PwmOutput,
     Register,
+    RemembersRegisters,
     StopMode,
+    TakesGains,
+    Tracks,
+    Warns,
 )
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
@@ -158,7 +164,7 @@ def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusIt
     return mask
 
 
-class LdcnAxis(AxisDriver):
+class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersRegisters):
     """A drive at one address, in the dialect of its profile."""
 
     shows_inputs = True
@@ -215,7 +221,7 @@ class LdcnAxis(AxisDriver):
     # -- reading -----------------------------------------------------------------------------------------------------
 
     def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
-        """See `AxisDriver`. Whether the analog sensor was lost can only be told with its value."""
+        """See `Readable`. Whether the analog sensor was lost can only be told with its value."""
         senses = self.profile.analog_target and self.state.known.absolute is not False
         prepared = self._readings.get((items, senses))
         if prepared is None:
@@ -254,7 +260,7 @@ class LdcnAxis(AxisDriver):
         return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
-        """See `AxisDriver`. Closing the loop is verified; it takes effect at the present position.
+        """See `Moves`. Closing the loop is verified; it takes effect at the present position.
 
         Raises:
             DriveFault: the drive did not close its loop, or holds a fault that only a reset clears.
@@ -340,7 +346,7 @@ class LdcnAxis(AxisDriver):
         await self._load(trajectory)
 
     async def stop(self, mode: StopMode) -> None:
-        """See `AxisDriver`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
+        """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
         self._book.doubt(("velocity",))
         await self._stop_motor(STOP_CONTROLS[mode], Lane.STOP)
         if self.state.homing_armed:
@@ -349,7 +355,7 @@ class LdcnAxis(AxisDriver):
         self.state.guard, self.state.guard_hit = "", False
 
     async def reset(self) -> None:
-        """See `AxisDriver`: power driver off, sticky bits cleared (LS-182AP manual, "To restore the normal operation").
+        """See `Moves`: power driver off, sticky bits cleared (LS-182AP manual, "To restore the normal operation").
 
         Raises:
             DriveFault: the cause still stands.
@@ -359,7 +365,7 @@ class LdcnAxis(AxisDriver):
         await self._refuse_faults("still", " again")
 
     async def clear_warnings(self) -> None:
-        """See `AxisDriver`: Clear Sticky Bits, nothing else."""
+        """See `Warns`: Clear Sticky Bits, nothing else."""
         await self._clear_sticky_bits()
 
     # -- motion ------------------------------------------------------------------------------------------------------
@@ -369,7 +375,7 @@ class LdcnAxis(AxisDriver):
         return quantised(motion, self.state.servo_divisor, self.profile)
 
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
-        """See `AxisDriver`. A motion lock, set by homing on a limit switch, is lifted: moving on is what is asked for.
+        """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: moving on is what is asked for.
 
         Raises:
             NotSupported: an analog target on a drive without absolute positioning.
@@ -550,7 +556,7 @@ class LdcnAxis(AxisDriver):
             )
 
     async def start(self) -> None:
-        """See `AxisDriver`.
+        """See `Moves`.
 
         A drive clears move_done as it starts. An acknowledgement that shows it set is looked into, because a reply to
         something older that came late looks just like that.
@@ -584,7 +590,7 @@ class LdcnAxis(AxisDriver):
         return slow or bool(status.velocity)
 
     async def track(self, position_counts: int) -> None:
-        """See `AxisDriver`: "stop here", the manuals' way to follow a string of positions.
+        """See `Tracks`: "stop here", the manuals' way to follow a string of positions.
 
         Raises:
             NotSupported: PIC-SERVO version 1.
@@ -626,7 +632,7 @@ class LdcnAxis(AxisDriver):
         self.state.servo_divisor = gains.sr
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
-        """See `AxisDriver`; PIC-SERVO version 4 only."""
+        """See `HasOutputs`; PIC-SERVO version 4 only."""
         known = self._book.value(LIMIT_PINS)
         pins = with_modes(INPUTS if known is None else LimitPins(known), limit1, limit2)
         exchange = commands.io_control(self._node, pins)

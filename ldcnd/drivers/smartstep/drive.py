@@ -1,4 +1,4 @@
-"""One SmartStep as an `AxisDriver`: read over its line, moved by pulses and inputs that no command can replace.
+"""One SmartStep as a `Drive`: read over its line, moved by pulses and inputs that no command can replace.
 
 Its state follows from what it shows: RUN closes the loop, an alarm opens it, the speed feedback tells whether it moves.
 Source: manual, introduction ("Omission": no command enables, moves, or resets); 3.
@@ -13,10 +13,17 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller
-from ldcnd.drivers.driver import AxisReading, AxisSpec, Fault, ReadingListeners
+from ldcnd.drivers.driver import (
+    AxisReading,
+    AxisSpec,
+    Fault,
+    HasParameters,
+    PollsItself,
+    ReadingListeners,
+    Records,
+)
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.parameter_access import ParameterAccess
-from ldcnd.drivers.read_only import ReadOnlyAxis
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.monitors import (
     INPUT_SIGNALS,
@@ -43,7 +50,7 @@ from ldcnd.drivers.smartstep.words import Words
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.catalogue import verbs_for
-from ldcnd.model.commands import Capability, HomeMethod
+from ldcnd.model.commands import Capability
 from ldcnd.model.samples import MonitorName, TelemetryItem
 
 log = get_logger("smartstep")
@@ -68,7 +75,7 @@ class UnitSpec:
     eeprom: EepromRules = field(default_factory=EepromRules)
 
 
-class SmartStepAxis(ReadOnlyAxis):
+class SmartStepAxis(PollsItself, HasParameters, Records):
     """A drive at one unit number.
 
     Attributes:
@@ -87,8 +94,6 @@ class SmartStepAxis(ReadOnlyAxis):
         self.profile = spec.profile
         self.identity: str | None = None
         self.capabilities = verbs_for(Capability.PARAMETERS, Capability.TRACES)
-        self.adc_full_scale = None
-        self.home_methods: frozenset[HomeMethod] = frozenset()
         self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
         self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
         self._parameters = UnitParameters(self.words, spec.profile, spec.eeprom, others, self._cleared)

@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.resync import Resync
-from ldcnd.drivers.driver import AxisDriver
+from ldcnd.drivers.driver import Drive
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.drivers.smartstep import commands
 from ldcnd.drivers.smartstep.addresses import Register
@@ -146,7 +146,7 @@ class SmartStepNetwork(Network):
             for number, spec in ((spec.axis.address, spec) for spec in specs)
         }
         self._answering: list[int] = []
-        self.axes: Mapping[str, AxisDriver] = {unit.spec.name: unit for unit in self._units.values()}
+        self.axes: Mapping[str, Drive] = {unit.spec.name: unit for unit in self._units.values()}
         self.resync = Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=self._probe)
 
     async def bring_up(self) -> BringUpReport:

@@ -245,6 +245,11 @@ class UnitParameters(ParameterAccess):
         log.warning("EEPROM count begun anew", axis=self._axis, previous=previous, total=writes)
         return previous
 
+    @property
+    @override
+    def eeprom_writes(self) -> int | None:
+        return self._rules.ledger.total(self._axis) if self._rules.ledger else None
+
     def _ledger(self) -> EepromLedger:
         if self._rules.ledger is None:
             raise NotSupported(

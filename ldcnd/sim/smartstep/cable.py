@@ -8,19 +8,14 @@ Source: manual 1 (4), (5) and 2.2 (6); the two-wire hazards follow from the form
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 
 from typing_extensions import override
 
-from ldcnd.drivers.smartstep.config import SimulatedEventConfig, SimulatedUnitConfig
-from ldcnd.drivers.smartstep.monitors import function_switches
 from ldcnd.drivers.smartstep.packet import DAMAGED, add_parity, strip_parity
-from ldcnd.drivers.smartstep.parameters import PN000, parameter_at
-from ldcnd.drivers.smartstep.profiles import Framing, TriggerMap, Wiring
+from ldcnd.drivers.smartstep.profiles import Framing, Wiring
 from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, Reply
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit, Transmission
-from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 
 
 class SimulatedCable:
@@ -148,44 +143,6 @@ class SimulatedSmartSteps(Module):
             self.next_event_s = now_s
         else:
             self.next_event_s = NEVER_S if begins_s is None else begins_s
-
-
-def simulated_units(settings: Sequence[SimulatedUnitConfig], now_s: float) -> list[SimulatedUnit]:
-    """Return the drives that a configuration describes; their events count from now on."""
-    return [_unit(each, now_s) for each in settings]
-
-
-def _unit(settings: SimulatedUnitConfig, now_s: float) -> SimulatedUnit:
-    bits = settings.variant.trigger_map
-    values = settings.variant.model_dump(exclude={"trigger_map"})
-    variant = SimulatedVariant(**values, trigger_map=TriggerMap(**bits.model_dump()) if bits else BENCH_TRIGGER_MAP)
-    stored = {PN000: settings.number << 8}
-    for name, value in settings.stored.items():
-        stored[parameter_at(int(name.lower().removeprefix("pn"), 16))] = value
-    unit = SimulatedUnit(variant, stored)
-    drive = unit.drive
-    drive.memory.worn = settings.worn
-    drive.gain_switch = settings.gain_switch
-    drive.switches = function_switches(settings.switches)
-    drive.alarm_history[: len(settings.history)] = settings.history
-    drive.set_run(now_s, on=settings.run)
-    drive.set_pulse_rate(settings.pulse_rate, now_s)
-    for event in sorted(settings.event, key=lambda each: each.at_s):
-        unit.schedule(now_s + event.at_s, partial(_happen, unit, event))
-    return unit
-
-
-def _happen(unit: SimulatedUnit, event: SimulatedEventConfig, at_s: float) -> None:
-    if event.power is not None:
-        (unit.power_on if event.power else unit.power_off)(at_s)
-    if event.reset:
-        unit.drive.press_reset(at_s)
-    if event.run is not None:
-        unit.drive.set_run(at_s, on=event.run)
-    if event.pulse_rate is not None:
-        unit.drive.set_pulse_rate(event.pulse_rate, at_s)
-    if event.alarm is not None:
-        unit.drive.provoke(event.alarm, at_s)
 
 
 def smartstep_chain(

@@ -12,11 +12,11 @@ from typing_extensions import override
 from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
-from ldcnd.daemon.axis.permit import QuietDrive
+from ldcnd.daemon.axis.permit import QuietDrive, homing
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.procedures.probe import check_index_is_seen
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode, Warns
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.log import get_logger
@@ -84,10 +84,10 @@ def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSe
             axis=config.name,
             remedy=f"send {missing}, or configure [bus.axis.home]",
         )
-    if method not in driver.home_methods:
+    methods = homing(driver).home_methods
+    if method not in methods:
         raise NotSupported(
-            f"axis {config.name}: {config.model} cannot home on {method}; it can on"
-            f" {', '.join(sorted(driver.home_methods))}",
+            f"axis {config.name}: {config.model} cannot home on {method}; it can on {', '.join(sorted(methods))}",
             axis=config.name,
             value=method.value,
         )
@@ -245,8 +245,9 @@ class HomeSequence(Procedure):
             await driver.reset()  # the drive has tripped, as it was meant to
         else:
             await driver.stop(search.stop)
-        captured = await driver.captured_home()
-        await driver.clear_warnings()  # homing on the current sets one
+        captured = await homing(driver).captured_home()
+        if isinstance(driver, Warns):
+            await driver.clear_warnings()  # homing on the current sets one
         turn.still_wanted()
         closed = search.stop is not StopMode.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:

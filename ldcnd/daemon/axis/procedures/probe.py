@@ -8,9 +8,10 @@ import math
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
+from ldcnd.daemon.axis.permit import homing
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode
+from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode, Warns
 from ldcnd.errors import MalformedRequest, NotSupported, VelocityLimit
 from ldcnd.model.commands import CommandReply, HomeMethod, Probe, ProbeStop
 from ldcnd.model.samples import AxisState, LatchSample
@@ -52,7 +53,7 @@ class ProbeMove(Procedure):
             check_index_is_seen(motion, plan, width)
         target = plan.motion.target_counts or 0
         speed = plan.motion.velocity_counts_per_s
-        self._error_counts = speed * motion.driver.capture_s + 1
+        self._error_counts = speed * homing(motion.driver).capture_s + 1
         self._ahead = HomeMethod.FORWARD_LIMIT if target > here else HomeMethod.REVERSE_LIMIT
         first, *others = self._methods
         capture = HomeCapture(first, self._stop, also=frozenset(others), guarded=True)
@@ -78,11 +79,11 @@ class ProbeMove(Procedure):
         if reading.homing:
             self._end("no input came on the way")
             return False
-        latched = await motion.driver.captured_home()
+        latched = await homing(motion.driver).captured_home()
         self.turn.still_wanted()
-        if HomeMethod.CURRENT in self._methods:
+        if HomeMethod.CURRENT in self._methods and isinstance(motion.driver, Warns):
             await motion.driver.clear_warnings()
-        if self._ahead not in self._methods and motion.driver.stands_on(self._ahead, reading):
+        if self._ahead not in self._methods and homing(motion.driver).stands_on(self._ahead, reading):
             self._end(f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")
             return False
         now_ns = motion.clock.now_ns()
@@ -110,9 +111,9 @@ class ProbeMove(Procedure):
 
     def _check_sources(self) -> None:
         motion = self._motion
-        lacking = [method.value for method in self._methods if method not in motion.driver.home_methods]
+        lacking = [method.value for method in self._methods if method not in homing(motion.driver).home_methods]
         if lacking:
-            able = sorted(method.value for method in motion.driver.home_methods - {HomeMethod.POSITION_ERROR})
+            able = sorted(method.value for method in homing(motion.driver).home_methods - {HomeMethod.POSITION_ERROR})
             raise NotSupported(
                 f"axis {motion.config.name}: {motion.config.model} cannot latch on {', '.join(lacking)}; it can on"
                 f" {', '.join(able)}",
@@ -150,7 +151,7 @@ def check_index_is_seen(motion: AxisMotion, plan: MotionPlan, width: int) -> Non
     Raises:
         VelocityLimit: names the nearest velocity at which no pulse is missed.
     """
-    sample_s = motion.driver.capture_s
+    sample_s = homing(motion.driver).capture_s
     if not sample_s:
         return
     limit = INDEX_SHARE * width / sample_s / motion.scale.counts_per_unit

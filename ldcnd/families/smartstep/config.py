@@ -1,16 +1,24 @@
 """What the configuration file says about SmartStep lines and units, beside what every line and axis has."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from functools import partial
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, find_parameter
+from ldcnd.config.axis import AxisConfig, RatesConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.simulated_line import SimulatedLineConfig
+from ldcnd.config.toml import refuse_duplicates
+from ldcnd.drivers.smartstep.monitors import function_switches
+from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
+from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, find_parameter, parameter_at
 from ldcnd.drivers.smartstep.profiles import (
     ByteOrder,
     CommandPulseGear,
     CountUnit,
+    Echo,
     EepromWrite,
     Framing,
     SmartStepProfile,
@@ -22,6 +30,8 @@ from ldcnd.drivers.smartstep.profiles import (
 )
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import MonitorName
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 
 WORD = 0xFFFF
 
@@ -85,12 +95,10 @@ class SmartStepTraceConfig(Frozen):
 
 
 MODEL = "smartstep"
-"""The one drive model of the family."""
-
+EARLIER = 1.0
+"""Velocity and acceleration that captures of earlier versions have."""
 MOTION_KEYS = ("velocity", "acceleration", "limits", "gains", "reference", "home", "pwm", "tracking", "identity")
 """Keys of an axis that only a drive with commands for motion has."""
-SLOW_RATES = {"position": 1.0, "velocity": 2.0, "state": 1.0, "adc": 0.0}
-"""What is asked for unless the file says otherwise: one word takes about 40 ms."""
 
 
 class SmartStepLineConfig(Frozen):
@@ -241,6 +249,18 @@ class SimulatedUnitConfig(Frozen):
         return values
 
 
+class SimulatedSmartStepLineConfig(SimulatedLineConfig):
+    """A simulated line of SmartSteps."""
+
+    unit: tuple[SimulatedUnitConfig, ...] = Field(min_length=1, max_length=16)
+    """The drives of the line."""
+
+    @model_validator(mode="after")
+    def _different_units(self) -> Self:
+        refuse_duplicates("unit", [str(unit.number) for unit in self.unit])
+        return self
+
+
 class SimulatedSmartStepsConfig(Frozen):
     """A file of `ldcnd sim --smartstep`."""
 
@@ -252,23 +272,135 @@ class SimulatedSmartStepsConfig(Frozen):
     """How the host makes characters; a pseudo-terminal carries no parity bit unless the host makes it."""
 
 
-FILLED_IN = {"velocity": 1.0, "acceleration": 1.0}
+class SlowRatesConfig(RatesConfig):
+    """How often an item is published, in Hz; 0 for never. One word takes about 40 ms."""
+
+    position: float = Field(default=1.0, ge=0, le=2000)
+    """Position."""
+    velocity: float = Field(default=2.0, ge=0, le=2000)
+    """Velocity."""
+    adc: float = Field(default=0.0, ge=0, le=2000)
+    """It has no analog input."""
+    state: float = Field(default=1.0, gt=0, le=2000)
+    """The drive's status and state; cannot be switched off, faults come with it."""
 
 
-def as_axis(document: object) -> object:
-    """Return an axis as the file has it, completed where the drive is a SmartStep.
+def _known_model(model: str) -> str:
+    if model != MODEL:
+        raise ValueError("no such drive model on a line of family smartstep; known is smartstep")
+    return model
 
-    Such a drive takes no motion over its line, so keys for it are refused; what every axis must have is filled with
-    values that nothing reads.
 
-    Raises:
-        ValueError: a key for motion.
-    """
-    if not isinstance(document, dict) or document.get("model") != MODEL:
+class SmartStepAxisConfig(AxisConfig):
+    """One SmartStep, which takes no motion over its line."""
+
+    model: Annotated[str, AfterValidator(_known_model)]
+    """The drive model: smartstep."""
+    address: int = Field(ge=0)
+    """The unit number, 0 to 15."""
+    rates: SlowRatesConfig = SlowRatesConfig()
+    """How often each item is published."""
+    smartstep: SmartStepUnitConfig = SmartStepUnitConfig()
+    """What only a SmartStep has."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_motion(cls, document: object) -> object:
+        """Refuse keys for motion."""
+        for key in MOTION_KEYS:
+            if isinstance(document, dict) and document.get("model") == MODEL and key in document:
+                if key in {"velocity", "acceleration"} and document[key] in {0.0, EARLIER}:
+                    document = {name: value for name, value in document.items() if name != key}
+                    continue
+                raise ValueError(f"{key}: a SmartStep takes no motion over its line; remove it")
         return document
-    for key in MOTION_KEYS:
-        if key in document and document[key] != FILLED_IN.get(key):  # a capture's configuration was completed before
-            raise ValueError(f"{key}: a SmartStep takes no motion over its line; remove it")
-    rates = document.get("rates", {})
-    slow = {**SLOW_RATES, **rates} if isinstance(rates, dict) else rates
-    return {**document, **FILLED_IN, "rates": slow}
+
+    @field_validator("address")
+    @classmethod
+    def _is_a_unit(cls, address: int) -> int:
+        if address > HIGHEST_UNIT:
+            raise ValueError("a SmartStep has a unit number from 0 to 15")
+        return address
+
+
+class SmartStepBusConfig(BusConfig):
+    """One line of SmartSteps; its rate is always 9600."""
+
+    skips_by_default: ClassVar[bool] = True
+
+    family: Literal["smartstep"]
+    """The drive family on it."""
+    smartstep: SmartStepLineConfig = SmartStepLineConfig()
+    """How the line is wired."""
+    axis: tuple[SmartStepAxisConfig, ...] = Field(min_length=1, max_length=31)
+    """The drives that are axes."""
+
+    @model_validator(mode="after")
+    def _released_transmitters(self) -> Self:
+        if len(self.axis) > 1 and any(axis.address == 0 for axis in self.axis):
+            raise ValueError("unit 0 never releases its transmitter: it must be alone on its line")
+        return self
+
+    @model_validator(mode="after")
+    def _known_echo(self) -> Self:
+        echo = self.smartstep.echo == "expect"
+        if self.rs485 and self.smartstep.wiring is Wiring.TWO_WIRE and echo is not self.rs485.receive_own:
+            raise ValueError('rs485: on two wires receive_own = true goes with echo = "expect", false with "none"')
+        return self
+
+    def profile(self, axis: SmartStepAxisConfig) -> SmartStepProfile:
+        """Return how one of its drives is taken to behave."""
+        line, unit = self.smartstep, axis.smartstep
+        profile = SmartStepProfile(
+            framing=line.framing,
+            wiring=line.wiring,
+            echo=Echo(line.echo),
+            first_character_s=unit.first_character_s,
+            eeprom_write=unit.eeprom_write,
+            encoder_counts_per_rev=unit.encoder_counts_per_rev,
+            run_active_low=unit.run_active_low,
+            reset_active_low=unit.reset_active_low,
+            alarm_output_high=unit.alarm_output_high,
+        )
+        profile = unit.trace.assumed_of(profile)
+        for key, verification in unit.verified.items():
+            profile = profile.verified(key, verification)
+        return profile
+
+
+def simulated_units(settings: Sequence[SimulatedUnitConfig], now_s: float) -> list[SimulatedUnit]:
+    """Return the drives that a configuration describes; their events count from now on."""
+    return [_unit(each, now_s) for each in settings]
+
+
+def _unit(settings: SimulatedUnitConfig, now_s: float) -> SimulatedUnit:
+    bits = settings.variant.trigger_map
+    values = settings.variant.model_dump(exclude={"trigger_map"})
+    variant = SimulatedVariant(**values, trigger_map=TriggerMap(**bits.model_dump()) if bits else BENCH_TRIGGER_MAP)
+    stored = {PN000: settings.number << 8}
+    for name, value in settings.stored.items():
+        stored[parameter_at(int(name.lower().removeprefix("pn"), 16))] = value
+    unit = SimulatedUnit(variant, stored)
+    drive = unit.drive
+    drive.memory.worn = settings.worn
+    drive.gain_switch = settings.gain_switch
+    drive.switches = function_switches(settings.switches)
+    drive.alarm_history[: len(settings.history)] = settings.history
+    drive.set_run(now_s, on=settings.run)
+    drive.set_pulse_rate(settings.pulse_rate, now_s)
+    for event in sorted(settings.event, key=lambda each: each.at_s):
+        unit.schedule(now_s + event.at_s, partial(_happen, unit, event))
+    return unit
+
+
+def _happen(unit: SimulatedUnit, event: SimulatedEventConfig, at_s: float) -> None:
+    if event.power is not None:
+        (unit.power_on if event.power else unit.power_off)(at_s)
+    if event.reset:
+        unit.drive.press_reset(at_s)
+    if event.run is not None:
+        unit.drive.set_run(at_s, on=event.run)
+    if event.pulse_rate is not None:
+        unit.drive.set_pulse_rate(event.pulse_rate, at_s)
+    if event.alarm is not None:
+        unit.drive.provoke(event.alarm, at_s)

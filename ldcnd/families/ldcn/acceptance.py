@@ -5,16 +5,12 @@ somebody holds the dead-man. What was on the wire is kept as a capture that can 
 """
 
 import asyncio
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.line.examination import Held
-from ldcnd.daemon.line.smartstep_line import build_line
-from ldcnd.drivers.driver import AxisSpec, Gains, Motion, StopMode
+from ldcnd.drivers.driver import AxisSpec, Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import (
     ANY_DIALECT,
@@ -32,15 +28,11 @@ from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem
-from ldcnd.drivers.smartstep.commissioning import examine
-from ldcnd.drivers.smartstep.drive import SmartStepAxis
 from ldcnd.errors import BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
+from ldcnd.families.family import TrialMove
+from ldcnd.families.ldcn.examination import Held
 from ldcnd.model.health import Finding, Verdict
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.transport.transport import Opener
-from ldcnd.version import version
-from ldcnd.wirelog.capture import Capture, CaptureHeader
-from ldcnd.wirelog.replay import Replay
 
 MARGIN_S = 0.05
 """An adapter that nobody has examined yet may keep replies back for 16 ms."""
@@ -137,25 +129,6 @@ ASSUMPTIONS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class TrialMove:
-    """What a drive may be asked to move.
-
-    Attributes:
-        address: of the drive.
-        gains: loaded first.
-        counts: there and back, at most `MOST_COUNTS`.
-        velocity_counts_per_s: positive.
-        acceleration_counts_per_s2: positive.
-    """
-
-    address: int
-    gains: Gains
-    counts: int
-    velocity_counts_per_s: float
-    acceleration_counts_per_s2: float
-
-
 Part = Callable[[], Awaitable[Finding]]
 """One thing that is tried, named for the assumption that it verifies."""
 
@@ -194,47 +167,6 @@ async def accept(
     if move:
         async for finding in _moved(bus, found, move, held):
             yield finding
-
-
-def smartstep_rig(port: str, units: Iterable[int]) -> RigConfig:
-    """Return a rig with these SmartSteps on one line.
-
-    Raises:
-        ValueError: there is no such port or unit.
-    """
-    axes = [{"name": f"unit{unit}", "address": unit, "model": "smartstep", "unit": "count"} for unit in units]
-    line = {"name": "accept", "port": port, "family": "smartstep", "axis": axes}
-    return RigConfig.model_validate({"rig": "accept", "bus": [line]})
-
-
-def accept_smartsteps(rig: RigConfig, opener: Opener | None = None) -> tuple[Bus, AsyncIterator[Finding]]:
-    """Return the bus of a rig's only line, to be run by the caller, and what trying its SmartSteps finds.
-
-    It reads only.
-
-    Args:
-        rig: has one line of SmartSteps.
-        opener: opens the line instead of its port.
-    """
-    bus, network = build_line(rig, rig.bus[0], None, {}, opener)
-    bus.resync = network.resync
-
-    async def findings() -> AsyncIterator[Finding]:
-        for axis in network.axes.values():
-            if isinstance(axis, SmartStepAxis):
-                async for finding in examine(bus, axis):
-                    yield finding
-
-    return bus, findings()
-
-
-async def _tried(part: Part, address: int) -> Finding:
-    """Return what a part finds; that the line refuses it is a finding, too."""
-    try:
-        return await part()
-    except LdcndError as error:
-        name = getattr(part, "__name__", "part")
-        return Finding(axis=str(address), what=name, verdict=Verdict.WRONG, text=error.message, verifies=name)
 
 
 class _Line:
@@ -488,65 +420,13 @@ class _Trial:
             raise DeadManReleased("the dead-man was released")
 
 
-# -- what is kept of it ----------------------------------------------------------------------------------------------
-
-
-def capture_of(bus: Bus, port: str, zero_ns: int, smartsteps: RigConfig | None = None) -> Capture:
-    """Return what was on the line from its opening on.
-
-    Args:
-        bus: after the sequence.
-        port: where it was.
-        zero_ns: the wall time at which the loop's clock was 0.
-        smartsteps: the line that was tried, if it has SmartSteps.
-    """
-    records = tuple(bus.wire_log.records())
-    header = CaptureHeader(
-        version=version(),
-        bus=bus.settings.name,
-        family="smartstep" if smartsteps else "ldcn",
-        port=port,
-        baud=bus.baud,
-        instance="accept",
-        zero_ns=zero_ns,
-        started_s=records[0].at_s,
-        until_s=records[-1].at_s + 1.0,
-        first_record=0,
-        cause="acceptance of drives",
-        config=smartsteps.model_dump(mode="json", exclude_defaults=True) if smartsteps else None,
-    )
-    return Capture(header, records)
-
-
-def replayed(capture: Capture) -> tuple[Finding, ...]:
-    """Play a capture without a move to the sequence again, in no time; return what it finds.
-
-    Raises:
-        ReplayDeviation: the sequence is another one than that of the capture.
-    """
-    with asyncio.Runner(loop_factory=lambda: JumpingLoop(capture.header.started_s)) as runner:
-        return runner.run(_replayed(capture))
-
-
-async def _replayed(capture: Capture) -> tuple[Finding, ...]:
-    replay = Replay(capture.records, capture.header.until_s, lambda _text: None, slow_host=True)
-    if capture.header.family == "smartstep":
-        bus, findings = accept_smartsteps(RigConfig.model_validate(capture.header.config), replay.open)
-    else:
-        bus = trial_bus(replay.open)
-        findings = accept(bus)
-    async with asyncio.TaskGroup() as group:
-        owner = group.create_task(bus.run(), name="bus accept")
-        await bus.wait_opened()
-        found = tuple([finding async for finding in findings])
-        owner.cancel()
-    replay.close()
-    return found
-
-
-def zero_ns() -> int:
-    """Return the wall time at which the running loop's clock was 0."""
-    return time.time_ns() - round(asyncio.get_running_loop().time() * 1e9)
+async def _tried(part: Part, address: int) -> Finding:
+    """Return what a part finds; that the line refuses it is a finding, too."""
+    try:
+        return await part()
+    except LdcndError as error:
+        name = getattr(part, "__name__", "part")
+        return Finding(axis=str(address), what=name, verdict=Verdict.WRONG, text=error.message, verifies=name)
 
 
 def _words(status: Status) -> str:

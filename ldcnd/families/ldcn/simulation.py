@@ -9,12 +9,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from ldcnd.config.simulated_line import SimulatedFaultConfig, SimulatedLineConfig
 from ldcnd.drivers.ldcn.pic_io import LINES
 from ldcnd.drivers.ldcn.profiles import PIC_IO, Support, identify
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.model.frozen import Frozen
 from ldcnd.sim.chain import Delivery
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, Line, ModuleSpec, TimedEvent
 from ldcnd.sim.ldcn.io import IoWiring
 from ldcnd.sim.ldcn.power import Condition
@@ -43,7 +44,6 @@ ModuleName = Annotated[str, AfterValidator(_known_module)]
 """A module as in `ldcnd sim --chain`."""
 LineNumber = Annotated[int, Field(ge=1, le=LINES)]
 Byte = Annotated[int, Field(ge=0, le=255)]
-Probability = Annotated[float, Field(ge=0, le=1)]
 CountRange = tuple[int, int]
 
 
@@ -297,41 +297,6 @@ class SimulatedEventConfig(Frozen):
         return TimedEvent(starts_at_s + self.at_s, self.module, what, present=present)
 
 
-class SimulatedFaultConfig(Frozen):
-    """Something that may go wrong on the wires."""
-
-    kind: FaultKind
-    """What happens."""
-    probability: Probability = 1.0
-    """Of it happening to one request or reply."""
-    from_s: float = Field(default=0.0, ge=0)
-    """Possible from this time on, in seconds after the line was opened first."""
-    until_s: float | None = Field(default=None, gt=0)
-    """Possible before this time."""
-    longest_s: float = Field(default=0.0, ge=0)
-    """For reply_delayed the longest delay, for unplugged the duration."""
-
-    @model_validator(mode="after")
-    def _has_a_length(self) -> Self:
-        if self.kind in {FaultKind.REPLY_DELAYED, FaultKind.UNPLUGGED} and self.longest_s == 0.0:
-            raise ValueError(f"{self.kind} needs longest_s above 0")
-        if self.until_s is not None and self.until_s <= self.from_s:
-            raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
-        return self
-
-    def spec(self, starts_at_s: float) -> Fault:
-        """Return what the simulator plays."""
-        fault = Fault(self.kind, self.probability, starts_at_s + self.from_s, longest_s=self.longest_s)
-        return fault if self.until_s is None else replace(fault, until_s=starts_at_s + self.until_s)
-
-
-class FaultPlanConfig(Frozen):
-    """A file of its own for what may go wrong on the wires."""
-
-    fault: tuple[SimulatedFaultConfig, ...] = ()
-    """Added to those of the line."""
-
-
 class SimulatedChainConfig(Frozen):
     """A simulated line, the first module next to the host."""
 
@@ -385,3 +350,10 @@ class SimulationConfig(SimulatedChainConfig):
     """Bytes at another rate than a module's are garbage to it."""
     delivery: Delivery = Delivery.WHOLE
     """Replies reach the host in one piece, or byte by byte."""
+
+
+class SimulatedLdcnLineConfig(SimulatedChainConfig, SimulatedLineConfig):
+    """A simulated line of modules."""
+
+    module: tuple[SimulatedModuleConfig, ...] = Field(min_length=1, max_length=31)
+    """In daisy-chain order."""

@@ -1,0 +1,29 @@
+"""The records of a SmartStep line in words."""
+
+from ldcnd.drivers.smartstep.packet import decode_command, decode_reply
+from ldcnd.drivers.transcript import Parts
+from ldcnd.errors import BadReply
+from ldcnd.wirelog.recorder import WireEvent, WireRecord
+
+
+class SmartStepTranscript:
+    """Reads the records of one SmartStep line, oldest first."""
+
+    def __init__(self) -> None:
+        self._parts = Parts()
+
+    def describe(self, record: WireRecord) -> str:
+        """Return the record's packet in words; empty when there is none."""
+        data = self._parts.whole(record)
+        if record.event is WireEvent.SENT:
+            command = decode_command(data)
+            if command is None:
+                return ""
+            return f"unit {command.unit}: {command.function.name} {command.address:04X}H, {command.data:04X}H"
+        if record.event is not WireEvent.RECEIVED:
+            return ""
+        try:
+            reply = decode_reply(data)
+        except BadReply as error:
+            return error.message
+        return f"unit {reply.unit}: {reply.status.name} {reply.address:04X}H, {reply.data:04X}H"

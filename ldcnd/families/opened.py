@@ -1,0 +1,47 @@
+"""A line opened by itself, without a daemon: for tools that examine it or try its drives."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import TypeVar
+
+from ldcnd.bus.bus import Bus
+from ldcnd.errors import BusDown
+from ldcnd.model.health import Finding
+
+OPEN_TIME_S = 5.0
+ResultT = TypeVar("ResultT")
+
+
+async def with_line(bus: Bus, port: str, use: Callable[[], Awaitable[ResultT]]) -> ResultT:
+    """Open a line, use it, and close it.
+
+    Raises:
+        BusDown: the port does not open.
+    """
+    name = bus.settings.name
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name=f"bus {name}")
+        try:
+            try:
+                async with asyncio.timeout(OPEN_TIME_S):
+                    await bus.wait_opened()
+            except TimeoutError:
+                why = bus.loss_reason or f"{port} did not open within {OPEN_TIME_S:g} s"
+                raise BusDown(f"bus {name}: {why}", remedy="end the daemon that has it, or correct the port") from None
+            return await use()
+        finally:
+            owner.cancel()
+
+
+async def show_findings(bus: Bus, port: str, findings: AsyncIterator[Finding], show: Callable[[Finding], None]) -> None:
+    """Open a line, show what is found on it, and close it.
+
+    Raises:
+        BusDown: the port does not open.
+    """
+
+    async def show_all() -> None:
+        async for finding in findings:
+            show(finding)
+
+    await with_line(bus, port, show_all)

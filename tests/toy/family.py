@@ -1,0 +1,314 @@
+"""The toy family: a stage that goes straight to where it is sent, on a line of twelve bytes each way.
+
+Request: A5, node, operation, position and velocity (4 bytes each), sum. Reply: 5A, node, flags, both, sum.
+"""
+
+import struct
+from collections.abc import Mapping
+from enum import IntEnum, IntFlag
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+from typing_extensions import override
+
+from ldcnd.bus.bus import Bus
+from ldcnd.bus.resync import Resync
+from ldcnd.config.axis import MovedAxisConfig
+from ldcnd.config.bus import BusConfig
+from ldcnd.config.simulated_line import SimulatedLineConfig
+from ldcnd.drivers.driver import (
+    AnalogMotion,
+    AxisReading,
+    AxisSpec,
+    Drive,
+    HomeCapture,
+    Motion,
+    Moves,
+    PwmOutput,
+    StopMode,
+)
+from ldcnd.drivers.network import BringUpReport, Network
+from ldcnd.drivers.transcript import Describe
+from ldcnd.errors import BadReply, NetworkMismatch, NotSupported, ReplyTimeout
+from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.families.family import Demand, Family, Line, OpenLine, bus_settings
+from ldcnd.model.catalogue import verbs_for
+from ldcnd.model.commands import Capability, Verb
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.samples import TelemetryItem
+from ldcnd.planning.cost import LineTiming, cost_of
+from ldcnd.planning.line_plan import Poll, Urgent
+from ldcnd.sim.chain import NEVER_S, Chain, Module, Reply
+from ldcnd.sim.line import open_simulated_line
+from ldcnd.transport.port_url import port_opener
+from ldcnd.transport.transport import Opener
+from ldcnd.wirelog.recorder import WireRecord
+
+BAUD = 57_600
+FRAME = struct.Struct("<BBBii")
+FRAME_BYTES = FRAME.size + 1
+RESPONSE_S = 0.001
+REQUEST, REPLY = 0xA5, 0x5A
+
+
+REFUSED = frozenset(
+    {Verb.HOME, Verb.TRACK, Verb.SET_PWM, Verb.SET_GAINS, Verb.SET_OUTPUTS, Verb.MOVE_ANALOG, Verb.MOVE_VELOCITY}
+)
+
+
+class Op(IntEnum):
+    STATUS, ENABLE, DISABLE, LOAD, START, STOP = range(6)
+
+
+class Flag(IntFlag):
+    ENABLED = 1
+    AT_REST = 2
+
+
+def frame(head: int, node: int, code: int, position: int = 0, velocity: int = 0) -> bytes:
+    body = FRAME.pack(head, node, code, position, velocity)
+    return body + bytes([sum(body) & 0xFF])
+
+
+def check(data: bytes) -> ReplyVerdict:
+    whole = data[0] == REPLY and sum(data[:-1]) & 0xFF == data[-1]
+    return ReplyVerdict.INTACT if whole else ReplyVerdict.CORRUPT
+
+
+def decode(data: bytes) -> AxisReading:
+    _head, _node, flags, position, velocity = FRAME.unpack(data[:-1])
+    if flags & ~(Flag.ENABLED | Flag.AT_REST):
+        raise BadReply(f"unknown flags {flags}")
+    return AxisReading(
+        position_counts=position,
+        following_error_counts=0,
+        velocity_counts_per_s=velocity,
+        velocity_resolution_counts_per_s=1.0,
+        adc_counts=None,
+        enabled=bool(flags & Flag.ENABLED),
+        profile_done=bool(flags & Flag.AT_REST),
+        homing=False,
+        faults=(),
+        asked=frozenset(TelemetryItem),
+    )
+
+
+def exchange(node: int, op: Op, position: int = 0, velocity: int = 0) -> Exchange[AxisReading]:
+    return Exchange(
+        node, frame(REQUEST, node, op, position, velocity), FRAME_BYTES, check, decode, RESPONSE_S, op is not Op.START
+    )
+
+
+class ToyStage(Moves):
+    """One stage."""
+
+    def __init__(self, spec: AxisSpec, bus: Bus) -> None:
+        self.spec = spec
+        self.identity: str | None = None
+        self.capabilities = verbs_for(Capability.MOTION, Capability.TRACES) - REFUSED
+        self._bus = bus
+
+    @override
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        return exchange(self.spec.address, Op.STATUS)
+
+    @override
+    def quantise(self, motion: Motion) -> Motion:
+        return motion
+
+    @override
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        node = self.spec.address
+        return exchange(node, Op.LOAD), exchange(node, Op.START)
+
+    @override
+    async def power(self, *, on: bool) -> None:
+        await self._ask(Op.ENABLE if on else Op.DISABLE)
+
+    @override
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        if not isinstance(motion, Motion) or motion.target_counts is None or home:
+            raise NotSupported("a toy goes to a position and nowhere else")
+        await self._ask(Op.LOAD, motion.target_counts, round(motion.velocity_counts_per_s))
+
+    @override
+    async def start(self) -> None:
+        await self._ask(Op.START)
+
+    @override
+    async def stop(self, mode: StopMode) -> None:
+        await self._ask(Op.DISABLE if mode is StopMode.OFF else Op.STOP)
+
+    @override
+    async def reset(self) -> None:
+        await self._ask(Op.STOP)
+
+    async def _ask(self, op: Op, position: int = 0, velocity: int = 0) -> AxisReading:
+        return await self._bus.execute(exchange(self.spec.address, op, position, velocity))
+
+
+class ToyNetwork(Network):
+    """The stages of one line."""
+
+    def __init__(self, bus: Bus, specs: tuple[AxisSpec, ...]) -> None:
+        self._bus = bus
+        self._stages = {spec.name: ToyStage(spec, bus) for spec in specs}
+        self.axes: Mapping[str, Drive] = self._stages
+        self.resync = Resync()
+
+    @override
+    async def bring_up(self) -> BringUpReport:
+        for name, stage in self._stages.items():
+            try:
+                await self._bus.execute(stage.reading(frozenset()))
+            except ReplyTimeout as error:
+                raise NetworkMismatch(f"axis {name} does not answer") from error
+            stage.identity = "Toy stage"
+        return BringUpReport(BAUD, dict.fromkeys(self._stages, "Toy stage"), reset=False)
+
+
+class SimulatedStage(Module):
+    """A stage that moves at constant velocity."""
+
+    baud = float(BAUD)
+    yields_to_host = False
+
+    def __init__(self, node: int) -> None:
+        self._node = node
+        self._heard = bytearray()
+        self._replies: list[Reply] = []
+        self._enabled = False
+        self._from = self._to = 0
+        self._loaded = (0, 1)
+        self._velocity = 1
+        self._began_s = 0.0
+
+    def hear(self, value: int | None, at_s: float) -> None:
+        self._heard.append(value or 0)
+        if self._heard[0] != REQUEST:
+            self._heard.clear()
+        if len(self._heard) < FRAME_BYTES:
+            return
+        packet, self._heard = bytes(self._heard), bytearray()
+        _head, node, op, position, velocity = FRAME.unpack(packet[:-1])
+        if node != self._node or sum(packet[:-1]) & 0xFF != packet[-1]:
+            return
+        self._obey(Op(op), position, velocity, at_s)
+        now = self._position(at_s)
+        moves = now != self._to
+        flags = (Flag.ENABLED if self._enabled else 0) | (0 if moves else Flag.AT_REST)
+        speed = 0 if not moves else self._velocity if self._to > now else -self._velocity
+        self.next_event_s = at_s + RESPONSE_S / 2
+        self._replies.append(Reply(frame(REPLY, node, flags, now, speed), self.next_event_s, 10 / BAUD))
+
+    def advance(self, to_s: float) -> Reply | None:
+        if not self._replies or self._replies[0].starts_at_s > to_s:
+            return None
+        reply = self._replies.pop(0)
+        self.next_event_s = self._replies[0].starts_at_s if self._replies else NEVER_S
+        return reply
+
+    def _obey(self, op: Op, position: int, velocity: int, at_s: float) -> None:
+        if op in {Op.ENABLE, Op.DISABLE}:
+            self._enabled = op is Op.ENABLE
+        if op in {Op.STOP, Op.DISABLE}:
+            self._from = self._to = self._position(at_s)
+        if op is Op.LOAD:
+            self._loaded = position, max(1, velocity)
+        if op is Op.START and self._enabled:
+            self._from, self._began_s = self._position(at_s), at_s
+            self._to, self._velocity = self._loaded
+
+    def _position(self, at_s: float) -> int:
+        gone = round(self._velocity * (at_s - self._began_s))
+        if gone >= abs(self._to - self._from):
+            return self._to
+        return self._from + (gone if self._to > self._from else -gone)
+
+
+class ToyAxisConfig(MovedAxisConfig):
+    """One stage."""
+
+    model: Literal["toy-stage"]
+    """The drive model."""
+
+
+class ToyBusConfig(BusConfig):
+    """One line of stages."""
+
+    family: Literal["toy"]
+    """The drive family on it."""
+    axis: tuple[ToyAxisConfig, ...] = Field(min_length=1, max_length=9)
+    """The drives that are axes."""
+
+
+class SimulatedStageConfig(Frozen):
+    """One simulated stage."""
+
+    node: int = Field(ge=1, le=9)
+    """Its address."""
+
+
+class SimulatedToyLineConfig(SimulatedLineConfig):
+    """A simulated line of stages."""
+
+    stage: tuple[SimulatedStageConfig, ...] = Field(min_length=1, max_length=9)
+    """The drives of the line."""
+
+
+class ToyFamily(Family[ToyBusConfig, SimulatedToyLineConfig]):
+    """The toys."""
+
+    name = "toy"
+    bus_config = ToyBusConfig
+    simulated_line = SimulatedToyLineConfig
+    simulated_key = "stage"
+
+    @override
+    def open_lines(self, state_dir: Path | None) -> OpenLine[ToyBusConfig]:
+        return open_toy_line
+
+    @override
+    def plan(self, settings: ToyBusConfig) -> Demand:
+        timing = LineTiming(BAUD, BAUD, adapter_latency_s=settings.adapter_latency_ms / 1000)
+        cost = cost_of(exchange(1, Op.STATUS), timing)
+        polls = [
+            Poll(axis.name, tuple(rates), max(rates.values()), cost, cost.mean_s, FRAME_BYTES, FRAME_BYTES)
+            for axis in settings.axis
+            if (rates := axis.rates.wanted_hz(adc=False))
+        ]
+        return Demand(timing, polls, Urgent(cost.longest_s, cost.longest_s, 0.0, settings.margin_ms / 1000))
+
+    @override
+    def describe(self, models: Mapping[int, str]) -> Describe:
+        return _words
+
+    @override
+    def simulate(self, line: SimulatedToyLineConfig, settings: ToyBusConfig, starts_at_s: float) -> Chain:
+        chain = Chain([SimulatedStage(each.node) for each in line.stage], line.faults(starts_at_s))
+        chain.baud = BAUD
+        return chain
+
+
+TOY = ToyFamily()
+
+
+def open_toy_line(settings: ToyBusConfig, opener: Opener | None = None, chain: Chain | None = None) -> Line:
+    if chain is not None and opener is None:
+        opener = _simulated(chain)
+    bus = Bus(bus_settings(settings, BAUD), opener or port_opener(settings.port, BAUD))
+    specs = tuple(AxisSpec(axis.name, axis.address, axis.model, None) for axis in settings.axis)
+    return Line(bus, ToyNetwork(bus, specs))
+
+
+def _simulated(chain: Chain) -> Opener:
+    return lambda: open_simulated_line(chain)
+
+
+def _words(record: WireRecord) -> str:
+    if len(record.data) != FRAME_BYTES:
+        return ""
+    head, node, code, position, velocity = FRAME.unpack(record.data[:-1])
+    name = Op(code).name.lower() if head == REQUEST else str(Flag(code))
+    return f"stage {node}: {name} {position} {velocity}"
