@@ -63,7 +63,7 @@ def test_an_axis_without_a_scale_works_in_counts(tmp_path):
         (("velocity = 10", "velocity = nan"), ["velocity"]),
         (('rig = "bench"', 'rig = "Bench 1"'), ["rig", "Bench 1"]),
         (('rig = "bench"', 'rigg = "bench"'), ["rigg", "rig"]),
-        (('port = "/dev/ttyUSB0"', 'port = "/dev/ttyUSB0"\nbaud = 4800'), ["bus[0].baud", "4800", "19200"]),
+        (('port = "/dev/ttyUSB0"', 'port = "/dev/ttyUSB0"\nbaud = 4800'), ["bus[0]: baud", "4800", "19200"]),
         (
             ("acceleration = 100", "acceleration = 100\nlimits = { position_min = 5, position_max = 5 }"),
             ["bus[0].axis[0]", "position_min 5"],

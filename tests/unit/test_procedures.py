@@ -319,7 +319,7 @@ async def test_the_preset_completes_a_request_and_the_request_outranks_it():
 async def test_a_search_that_cannot_be_is_refused_before_anything_is_sent(request_, refusal):
     async with axis_bench(limits={"position_max": 100.0, "velocity": 30.0}) as bench:
         bench.drive.home_methods = frozenset(HomeMethod) - {HomeMethod.CURRENT}
-        bench.drive.index_sample_s = 0.0001  # 7.5 mm/s with an index of one count
+        bench.drive.capture_s = 0.0001  # 7.5 mm/s with an index of one count
 
         with pytest.raises(refusal):
             await bench.send(request_)
@@ -330,7 +330,7 @@ async def test_a_search_that_cannot_be_is_refused_before_anything_is_sent(reques
 
 async def test_an_index_search_as_fast_as_the_drive_can_see_is_taken_and_other_captures_do_not_care():
     async with axis_bench() as bench:
-        bench.drive.index_sample_s = 0.0001
+        bench.drive.capture_s = 0.0001
         with pytest.raises(VelocityLimit) as refusal:
             await bench.send(INDEX.model_copy(update={"velocity": -8.0}))
         assert refusal.value.nearest == -7.5
