@@ -56,6 +56,17 @@ def test_a_drive_takes_what_its_capabilities_stand_for():
     assert Verb.HALT not in verbs_for(Capability.PARAMETERS, Capability.TRACES)
 
 
+def contains(now: object, recorded: object) -> bool:
+    """Tell whether everything that was recorded is still said, perhaps beside more."""
+    match now, recorded:
+        case dict(), dict():
+            return all(name in now and contains(now[name], value) for name, value in recorded.items())
+        case list(), list():
+            return len(now) == len(recorded) and all(map(contains, now, recorded))
+        case _:
+            return now == recorded
+
+
 @pytest.mark.parametrize("verb", VECTORS)
 def test_a_payload_of_before_means_what_it_always_did(verb: str):
     """Fields are only ever added: what was recorded is understood, and still sent under the same names."""
@@ -67,7 +78,7 @@ def test_a_payload_of_before_means_what_it_always_did(verb: str):
     now = msgpack.unpackb(payload)
 
     assert encoding == vector["encoding"]
-    assert {name: now.get(name) for name in recorded} == recorded
+    assert contains(now, recorded)
     assert decode(BY_VERB[verb], bytes.fromhex(vector["msgpack"]), vector["encoding"]) == command
     assert decode(BY_VERB[verb], vector["json"].encode(), Encoding.JSON) == command
 

@@ -37,7 +37,7 @@ from ldcnd.drivers.ldcn.packet import (
     encode_packet,
 )
 from ldcnd.drivers.ldcn.path import PathPoint, encode_points
-from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, Profile, Support
+from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, Gains, baud_divisor, encode_gains
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusItem, check_status, status_bytes, status_decoder
 from ldcnd.drivers.ldcn.trajectory import Trajectory, encode_trajectory
@@ -107,7 +107,7 @@ class Node(Destination[Status]):
             reply_bytes=reply_bytes,
             check=check_status,
             decode=status_decoder(self.profile, asked),
-            response_s=self.profile.servo_cycle_s,
+            response_s=CYCLE_CLOCKS / self.profile.clock_hz,
             repeatable=repeatable,
             total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),
             moves=moves,

@@ -147,7 +147,7 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
             limit=1 if servo_divisor < 1 else MOST_DIVISOR,
             nearest=min(max(servo_divisor, 1), MOST_DIVISOR),
         )
-    return profile.servo_cycle_s * (servo_divisor if profile.divisor_slows_profile else 1)
+    return CYCLE_CLOCKS / profile.clock_hz * (servo_divisor if profile.divisor_slows_profile else 1)
 
 
 def _programmed(what: str, unit: str, value: float, factor: float, most_register: int) -> int:
