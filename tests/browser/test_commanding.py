@@ -85,9 +85,9 @@ async def test_a_group_is_moved_together_from_the_rig_page_by_keyboard(house):
         group = desk.panel("Group gantry")
         await expect(group).to_contain_text("x: Take control first.")
         for name in ("Take control of all", "Enable all"):
+            await expect(every.get_by_role("button", name=name)).to_be_enabled()
             await every.get_by_role("button", name=name).focus()
             await desk.page.keyboard.press("Enter")
-            await house.sim.until("x", lambda _: True)
         for axis in ("x", "y"):
             await house.sim.until(axis, lambda state: state.enabled)
 
@@ -95,7 +95,7 @@ async def test_a_group_is_moved_together_from_the_rig_page_by_keyboard(house):
         await desk.page.keyboard.type("3")
         await desk.page.keyboard.press("Tab")
         await desk.page.keyboard.type("-2")
-        await expect(desk.button("Move x and y together")).to_be_enabled()
+        await expect(group.get_by_role("button", name="Move x and y together")).to_be_enabled()
         await desk.page.keyboard.press("Enter")
 
         await house.sim.reaches("x", 3, within=0.05)
