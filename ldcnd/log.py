@@ -25,20 +25,26 @@ PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERR
 
 def get_logger(name: str) -> "structlog.typing.FilteringBoundLogger":
     """Return the logger of one part of the daemon; `name` is its noun."""
-    return cast("structlog.typing.FilteringBoundLogger", _Logger(f"ldcnd.{name}"))
+    import structlog  # noqa: PLC0415 - a client never comes here
+
+    logger: structlog.typing.FilteringBoundLogger = structlog.get_logger(f"ldcnd.{name}")
+    return logger
 
 
-class _Logger:
-    """Loads structlog with the first record: that takes as long as a call, and most programs log nothing."""
+def get_lazy_logger(name: str) -> "structlog.typing.FilteringBoundLogger":
+    """Return a logger of what clients load, too: structlog takes longer to load than many a call runs."""
+    return cast("structlog.typing.FilteringBoundLogger", _LazyLogger(name))
+
+
+class _LazyLogger:
+    """Loads structlog with its first record."""
 
     def __init__(self, name: str) -> None:
         self._name = name
 
     def __getattr__(self, method: str) -> object:
         if method == "_logger":
-            import structlog  # noqa: PLC0415 - see the class
-
-            self._logger = structlog.get_logger(self._name)
+            self._logger = get_logger(self._name)
             return self._logger
         return getattr(self._logger, method)
 

@@ -20,7 +20,7 @@ import zenoh
 from zenoh.handlers import Callback, RingChannel
 
 from ldcnd.errors import SessionError, ValueOutOfRange
-from ldcnd.log import LogLimit, get_logger
+from ldcnd.log import LogLimit, get_lazy_logger
 from ldcnd.messaging import zenoh_failures
 from ldcnd.messaging.codec import Encoding, encode, error_reply
 from ldcnd.messaging.hand_over import Collector, HandOver, Intake, QueryIntake, TokenChanges
@@ -51,7 +51,7 @@ from ldcnd.printable import printable
 
 __all__ = ["ZenohSession", "ZenohSettings", "open_zenoh_session"]
 
-log = get_logger("zenoh")
+log = get_lazy_logger("zenoh")
 _LOST_ANSWERS = LogLimit()
 
 OPEN_TIME_S = 10.0
