@@ -104,7 +104,12 @@ class Remedy(str):
 
     def __new__(cls, text: str, *steps: Step) -> Self:
         """Return the text with what the steps are called."""
-        return cls.of(text.format(*(each.said for each in steps)), steps)
+        said = []
+        for each in steps:  # a stop makes a remedy: no generator, no call more
+            said.append(each.said)  # noqa: PERF401
+        made = super().__new__(cls, text.format(*said))
+        made.steps = steps
+        return made
 
     @classmethod
     def of(cls, text: str, steps: tuple[Step, ...]) -> Self:
@@ -157,8 +162,13 @@ class LdcndError(Exception):
         self.value = printable(value) if isinstance(value, str) else value
         self.limit = printable(limit) if isinstance(limit, str) else limit
         self.nearest = nearest
-        steps = remedy.steps if isinstance(remedy, Remedy) else ()
-        self.remedy = remedy if remedy is None else Remedy.of(printable(remedy, keep="\n"), steps)
+        self.remedy: Remedy | None = None
+        if remedy is not None:
+            text = printable(remedy, keep="\n")
+            if isinstance(remedy, Remedy):
+                self.remedy = remedy if text == remedy else Remedy.of(text, remedy.steps)
+            else:
+                self.remedy = Remedy.of(text, ())
 
     @property
     def page(self) -> str | None:
