@@ -4,10 +4,7 @@ Nothing is implemented twice: a call runs the asyncio client's own method on a l
 arguments, its result and its errors. Safe to use from several threads. An interrupted wait for a motion halts the axis.
 """
 
-import asyncio
-import concurrent.futures
-import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, contextmanager
 from functools import wraps
 from pathlib import Path
@@ -16,6 +13,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 from ldcnd.client import axis as asynchronous
 from ldcnd.client import motion, rig
 from ldcnd.client.fleet import RigReport, survey
+from ldcnd.client.loop_thread import LoopThread, loop_thread
 from ldcnd.client.notebook import table
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
@@ -27,60 +25,10 @@ ResultT = TypeVar("ResultT")
 WrappedT = TypeVar("WrappedT")
 
 
-class _Loop:
-    """An event loop in a thread."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-
-    # Any: what a coroutine yields and is sent is nobody's business but the loop's
-    def run(self, work: Coroutine[Any, Any, ResultT]) -> ResultT:
-        """Run a coroutine to its end; an interrupted wait cancels it."""
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        try:
-            return future.result()
-        except BaseException:
-            future.cancel()
-            raise
-
-    @contextmanager
-    def inside(self, context: AbstractAsyncContextManager[ResultT]) -> Iterator[ResultT]:
-        """Stay inside an asyncio context; one task enters and leaves it, as task groups want it."""
-        entered: concurrent.futures.Future[ResultT] = concurrent.futures.Future()
-        leaving = asyncio.Event()
-
-        async def stay() -> None:
-            async with context as value:
-                entered.set_result(value)
-                await leaving.wait()
-
-        staying = asyncio.run_coroutine_threadsafe(stay(), self._loop)
-        try:
-            first: set[concurrent.futures.Future[Any]] = {entered, staying}
-            concurrent.futures.wait(first, return_when=concurrent.futures.FIRST_COMPLETED)
-            if not entered.done():
-                staying.result()  # raises why it could not be entered
-            yield entered.result()
-        finally:
-            self._loop.call_soon_threadsafe(leaving.set)
-            staying.result()
-
-    def each(self, items: AsyncIterator[ResultT]) -> Iterator[ResultT]:
-        """Yield what an asyncio iterator yields."""
-
-        async def following() -> tuple[ResultT, ...]:
-            async for item in items:
-                return (item,)
-            return ()
-
-        while item := self.run(following()):
-            yield item[0]
-
-
 class Facade(Generic[WrappedT]):
     """What the facades have in common: an object of the asyncio client, and the loop that it lives on."""
 
-    def __init__(self, loop: _Loop, wrapped: WrappedT) -> None:
+    def __init__(self, loop: LoopThread, wrapped: WrappedT) -> None:
         self._loop = loop
         self._wrapped = wrapped
 
@@ -194,6 +142,7 @@ class Rig(Facade[rig.Rig]):
     faults = _waiting(rig.Rig.faults)
     holders = _waiting(rig.Rig.holders)
     outcome = _waiting(rig.Rig.outcome)
+    latest = _waiting(rig.Rig.latest)
 
     @property
     def name(self) -> str:
@@ -266,13 +215,13 @@ class Rig(Facade[rig.Rig]):
 @contextmanager
 def connect(endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None) -> Iterator[Rig]:
     """Use one rig for as long as the context lasts; see `ldcnd.connect`."""
-    with _running_loop() as loop, loop.inside(_connect(endpoint, rig=rig, config=config)) as found:
+    with loop_thread() as loop, loop.inside(_connect(endpoint, rig=rig, config=config)) as found:
         yield Rig(loop, found)
 
 
 def fleet(settings: ZenohSettings, rig: str | None = None) -> tuple[RigReport, ...]:
     """Return how every rig is that can be reached."""
-    with _running_loop() as loop, loop.inside(open_zenoh_session(settings)) as session:
+    with loop_thread() as loop, loop.inside(open_zenoh_session(settings)) as session:
         return loop.run(survey(session, rig))
 
 
@@ -283,23 +232,3 @@ _connect = rig.connect
 def _only(axes: AbstractContextManager[tuple[Axis, ...]]) -> Iterator[Axis]:
     with axes as found:
         yield found[0]
-
-
-@contextmanager
-def _running_loop() -> Iterator[_Loop]:
-    """Run an event loop in a thread for as long as the context lasts."""
-    running: concurrent.futures.Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = concurrent.futures.Future()
-
-    async def stay() -> None:
-        ending = asyncio.Event()
-        running.set_result((asyncio.get_running_loop(), ending))
-        await ending.wait()
-
-    thread = threading.Thread(target=lambda: asyncio.run(stay()), name="ldcnd client")
-    thread.start()
-    loop, ending = running.result()
-    try:
-        yield _Loop(loop)
-    finally:
-        loop.call_soon_threadsafe(ending.set)
-        thread.join()

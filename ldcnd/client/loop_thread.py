@@ -1,0 +1,89 @@
+"""An event loop in a thread of its own, for programs that wait and for those that have another loop already."""
+
+import asyncio
+import concurrent.futures
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import AbstractAsyncContextManager, contextmanager
+from typing import Any, TypeVar, TypeVarTuple
+
+ResultT = TypeVar("ResultT")
+ArgumentsT = TypeVarTuple("ArgumentsT")
+
+
+class LoopThread:
+    """An event loop that runs in a thread; made by `loop_thread`. Every method may be called from any other thread."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+
+    # Any: what a coroutine yields and is sent is nobody's business but the loop's
+    def start(self, work: Coroutine[Any, Any, ResultT]) -> concurrent.futures.Future[ResultT]:
+        """Run a coroutine without waiting for it; cancelling the future cancels it."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def call(self, callback: Callable[[*ArgumentsT], object], *args: *ArgumentsT) -> None:
+        """Call a function on the loop, soon, without waiting for it."""
+        self._loop.call_soon_threadsafe(callback, *args)
+
+    def run(self, work: Coroutine[Any, Any, ResultT]) -> ResultT:
+        """Run a coroutine to its end; an interrupted wait cancels it."""
+        future = self.start(work)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    @contextmanager
+    def inside(self, context: AbstractAsyncContextManager[ResultT]) -> Iterator[ResultT]:
+        """Stay inside an asyncio context; one task enters and leaves it, as task groups want it."""
+        entered: concurrent.futures.Future[ResultT] = concurrent.futures.Future()
+        leaving = asyncio.Event()
+
+        async def stay() -> None:
+            async with context as value:
+                entered.set_result(value)
+                await leaving.wait()
+
+        staying = asyncio.run_coroutine_threadsafe(stay(), self._loop)
+        try:
+            first: set[concurrent.futures.Future[Any]] = {entered, staying}
+            concurrent.futures.wait(first, return_when=concurrent.futures.FIRST_COMPLETED)
+            if not entered.done():
+                staying.result()  # raises why it could not be entered
+            yield entered.result()
+        finally:
+            self._loop.call_soon_threadsafe(leaving.set)
+            staying.result()
+
+    def each(self, items: AsyncIterator[ResultT]) -> Iterator[ResultT]:
+        """Yield what an asyncio iterator yields."""
+
+        async def following() -> tuple[ResultT, ...]:
+            async for item in items:
+                return (item,)
+            return ()
+
+        while item := self.run(following()):
+            yield item[0]
+
+
+@contextmanager
+def loop_thread() -> Iterator[LoopThread]:
+    """Run an event loop in a thread for as long as the context lasts."""
+    running: concurrent.futures.Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = concurrent.futures.Future()
+
+    async def stay() -> None:
+        ending = asyncio.Event()
+        running.set_result((asyncio.get_running_loop(), ending))
+        await ending.wait()
+
+    thread = threading.Thread(target=lambda: asyncio.run(stay()), name="ldcnd client")
+    thread.start()
+    loop, ending = running.result()
+    try:
+        yield LoopThread(loop)
+    finally:
+        loop.call_soon_threadsafe(ending.set)
+        thread.join()
