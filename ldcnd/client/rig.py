@@ -32,7 +32,7 @@ from ldcnd.model.rig_commands import (
     Snapshot,
     SnapshotReply,
 )
-from ldcnd.model.samples import FaultSample
+from ldcnd.model.samples import FaultSample, Sample
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE = "LDCND_CONNECT"
@@ -251,8 +251,12 @@ class Rig:
         """
         return follow_events(self._client, axis, history=history)
 
+    async def latest(self, axis: str, item: str) -> Sample | None:
+        """Return the last sample of an item, such as `velocity` or `monitor/speed_feedback`; None without one."""
+        return await self._client.last(axis, item)
+
     def samples(self, axis: str = "*", item: str = "*") -> AbstractAsyncContextManager[Samples]:
-        """Take telemetry of any item: pairs of the axis and its sample."""
+        """Take telemetry of any item, `*` for all but monitors: pairs of the axis and its sample."""
         return self._client.samples(axis, item)
 
     # -- making axes -------------------------------------------------------------------------------------------------

@@ -27,7 +27,6 @@ from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import (
-    SAMPLE_MODELS,
     FaultSample,
     LinkState,
     MonitorName,
@@ -35,6 +34,7 @@ from ldcnd.model.samples import (
     PositionSample,
     StateSample,
     TelemetryItem,
+    sample_model,
 )
 from ldcnd.model.samples import Sample as Measurement
 from ldcnd.model.traces import TraceChunk, TraceHeader
@@ -42,7 +42,6 @@ from ldcnd.model.traces import TraceChunk, TraceHeader
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
 
-ITEMS = frozenset(item.value for item in TelemetryItem)
 KEPT_SAMPLES = 256
 """A watcher that is too slow keeps so many samples; the oldest give way."""
 
@@ -59,11 +58,10 @@ class Samples:
             begins with number 0; what its former run said last is not counted.
     """
 
-    def __init__(self, keys: Keys) -> None:
+    def __init__(self) -> None:
         self.dropped = 0
         self.missed = 0
         self._next: dict[str, int] = {}
-        self._keys = keys
         self._kept: deque[tuple[str, Measurement]] = deque(maxlen=KEPT_SAMPLES)
         self._ready = asyncio.Event()
 
@@ -71,14 +69,15 @@ class Samples:
         """Take a sample from the session."""
         if sample.kind is SampleKind.DELETE:
             return
-        address = self._keys.parse_telemetry(sample.key)
-        if address.item not in ITEMS:
+        axis, _, item = sample.key.rpartition("/tele/")[2].partition("/")
+        model = sample_model(item)
+        if model is None:
             return  # events, and what newer daemons publish
-        measurement = decode_received(SAMPLE_MODELS[TelemetryItem(address.item)], sample.payload, sample.encoding)
+        measurement = decode_received(model, sample.payload, sample.encoding)
         self.missed += max(0, measurement.seq - self._next.get(sample.key, measurement.seq))
         self._next[sample.key] = measurement.seq + 1
         self.dropped += len(self._kept) == KEPT_SAMPLES
-        self._kept.append((address.axis, measurement))
+        self._kept.append((axis, measurement))
         self._ready.set()
 
     def __aiter__(self) -> "Samples":
@@ -140,10 +139,11 @@ class RigClient:
         answers = await self._session.query(self._keys.commands)
         return self._decoded(answers[0], CommandList) if answers else None
 
-    async def last(self, axis: str, item: TelemetryItem) -> Measurement | None:
-        """Return the last value of an item, or None when there is none yet."""
-        answers = await self._session.query(self._keys.telemetry(axis, item))
-        return self._decoded(answers[0], SAMPLE_MODELS[item]) if answers else None
+    async def last(self, axis: str, item: str) -> Measurement | None:
+        """Return the last value of an item, or None when there is none (yet)."""
+        model = sample_model(item)
+        answers = await self._session.query(self._keys.telemetry_pattern(axis, item)) if model else []
+        return self._decoded(answers[0], model) if model and answers else None
 
     async def monitors(self, axis: str) -> dict[MonitorName, MonitorSample]:
         """Return the last value of every monitor that an axis publishes."""
@@ -262,7 +262,7 @@ class RigClient:
     @asynccontextmanager
     async def samples(self, axis: str = "*", item: str = "*") -> AsyncIterator[Samples]:
         """Subscribe to telemetry for the time of the context."""
-        samples = Samples(self._keys)
+        samples = Samples()
         declaration = await self._session.subscribe(self._keys.telemetry_pattern(axis, item), samples.take)
         try:
             yield samples

@@ -162,9 +162,9 @@ class Keys:
         return f"{self._root}/meta/buses/*"
 
     def telemetry_pattern(self, axis: str, item: str) -> str:
-        """Return a telemetry key in which either name may be `*`."""
-        axis = axis if axis == "*" else _chunk("axis", axis)
-        return f"{self._root}/tele/{axis}/{item if item == '*' else _chunk('item', item)}"
+        """Return a telemetry key in which either name may be `*`; an item such as `monitor/speed_feedback` has two."""
+        names = "/".join(name if name == "*" else _chunk("item", name) for name in item.split("/"))
+        return f"{self._root}/tele/{axis if axis == '*' else _chunk('axis', axis)}/{names}"
 
     def schema(self, name: str) -> str:
         """Return the key of a model's JSON Schema."""

@@ -271,3 +271,12 @@ SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {
     TelemetryItem.FAULT: FaultSample,
     TelemetryItem.STATE: StateSample,
 }
+
+_ITEMS = frozenset(item.value for item in TelemetryItem)
+
+
+def sample_model(item: str) -> type[Sample] | None:
+    """Return what an item such as `position` or `monitor/speed_feedback` is; None for one that only others know."""
+    if item.startswith("monitor/"):
+        return MonitorSample
+    return SAMPLE_MODELS[TelemetryItem(item)] if item in _ITEMS else None
