@@ -5,7 +5,9 @@ PYTHON ?= python3
 # where byte code must not be written, each of the hundreds of programs that tests start would compile every module anew
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run test tests check fix docs dist soak mutants newcomer bench screenshots clean
+PYTHONS ?= python3.11 python3.12 python3.13 python3.14
+
+.PHONY: run test tests test-edges test-pythons check fix docs dist soak mutants newcomer bench screenshots clean
 
 # what `make test` needs is nine times as large as what `make run` needs
 run: $(if $(wildcard .venv/ready),.venv/ready,.venv/small)
@@ -55,6 +57,19 @@ soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
 	$(PY) -m pytest -m soak -n 2 --timeout 3600
 
+# other people's clients, unmodified, in an environment of their own: Bluesky, EPICS, ROS 2; minutes
+test-edges: .venv-edges/ready
+	.venv-edges/bin/python -m pytest tests/edges -m edges --timeout 600
+
+.venv-edges/ready: .venv/ready
+	$(PYTHON) -m venv .venv-edges
+	.venv/bin/uv pip install --quiet --python .venv-edges/bin/python -c constraints.txt -e '.[edges]'
+	@touch $@
+
+# what needs no wall clock, on every interpreter of PYTHONS that is there
+test-pythons: .venv/ready
+	PATH=$(CURDIR)/.venv/bin:$$PATH tests/support/pythons.sh $(PYTHONS)
+
 # changes safety-relevant code in 300 ways and prints what no test notices, see CONTRIBUTING.md
 mutants: .venv/ready
 	$(PY) -m tests.mutants
@@ -84,4 +99,4 @@ screenshots: .venv/ready
 	@touch $@
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .hypothesis dist build
+	rm -rf .venv .venv-edges .mypy_cache .ruff_cache .hypothesis dist build

@@ -32,6 +32,7 @@ COMMANDS = {
     "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),
     "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),
     "plot": ("ldcnd.cli.plot", "Draw an axis of a recording."),
+    "epics": ("ldcnd.cli.epics", "Serve axes as EPICS motor records."),
     "foxglove": ("ldcnd.cli.foxglove", "Show a running rig live in Foxglove, read-only."),
     "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
     "trace": ("ldcnd.cli.trace", "Record an axis against time, look at the result, draw it."),

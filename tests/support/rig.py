@@ -72,3 +72,10 @@ async def running_rig(
             finally:
                 daemon.end()
                 await running
+
+
+def two_axes() -> RigConfig:
+    """Return the simulated rig with its first two axes only."""
+    config = load_config(SIMULATED)
+    (bus,) = config.bus
+    return config.model_copy(update={"bus": (bus.model_copy(update={"axis": bus.axis[:2]}),)})

@@ -10,8 +10,24 @@ from tests.support.process import ROOT
 
 CLIENT = ROOT / "ldcnd" / "client"
 MODULES = sorted(f"ldcnd.client.{file.stem}" for file in CLIENT.glob("[!_]*.py"))
-OURS = {"bus", "cli", "config", "daemon", "drivers", "exchange", "metrics", "pki", "recording", "sim", "transport"}
+OURS = {
+    "bluesky",
+    "bus",
+    "cli",
+    "config",
+    "daemon",
+    "drivers",
+    "epics",
+    "exchange",
+    "metrics",
+    "pki",
+    "recording",
+    "sim",
+    "transport",
+}
 OTHERS = {
+    "bluesky",
+    "caproto",
     "click",
     "cryptography",
     "logging_journald",

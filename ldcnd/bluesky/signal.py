@@ -1,0 +1,111 @@
+"""An item of an axis's telemetry as a Bluesky device that is read and monitored."""
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from ldcnd.bluesky.status import Status
+from ldcnd.bluesky.values import number_key, reading, text_key
+from ldcnd.client.loop_thread import LoopThread
+from ldcnd.client.rig import Rig
+from ldcnd.errors import SessionError
+from ldcnd.model.meta import AxisInfo
+from ldcnd.model.samples import (
+    AdcSample,
+    FaultSample,
+    MonitorSample,
+    PositionSample,
+    Sample,
+    StateSample,
+    VelocitySample,
+)
+
+if TYPE_CHECKING:
+    from bluesky.protocols import Callback, Hints, Reading
+    from event_model.documents import DataKey
+
+TEXTS = frozenset({"state", "fault"})
+
+
+class Signal:
+    """One item of one axis; made by `Devices.signal`. Faults are their codes with commas between, empty for none.
+
+    Attributes:
+        name: of the device, and of its reading in documents.
+        parent: None; it is part of no other device.
+    """
+
+    parent = None
+
+    def __init__(self, name: str, rig: Rig, info: AxisInfo, item: str, loop: LoopThread) -> None:
+        self.name = name
+        self._rig = rig
+        self._axis = info.axis
+        self._item = item
+        self._source = f"ldcnd://{rig.name}/{info.axis}/{item}"
+        self._loop = loop
+        self._followers: dict[Callback[float | str], Status] = {}
+
+    @property
+    def hints(self) -> "Hints":
+        """Plot the value if it is a number."""
+        return {"fields": [] if self._item in TEXTS else [self.name]}
+
+    async def read(self) -> "dict[str, Reading[float | str]]":
+        """Return the last value, stamped with the time at which it was true.
+
+        Raises:
+            SessionError: there is none yet, or the daemon does not answer.
+        """
+        return self._of(await self._latest())
+
+    async def describe(self) -> "dict[str, DataKey]":
+        """Return what the value is."""
+        if self._item in TEXTS:
+            return {self.name: text_key(self._source)}
+        _, unit = _value(await self._latest())
+        return {self.name: number_key(self._source, unit)}
+
+    def subscribe(self, function: "Callback[float | str]") -> None:
+        """Call `function` with every value that comes, on the devices' own thread."""
+
+        async def follow() -> None:
+            async with self._rig.samples(self._axis, self._item) as samples:
+                async for _, sample in samples:
+                    function(self._of(sample))
+
+        self._followers[function] = Status(f"subscription of {self.name}", self._loop.start(follow()))
+
+    def clear_sub(self, function: "Callback[float | str]") -> None:
+        """End a subscription."""
+        status = self._followers.pop(function, None)
+        if status:
+            status.cancel()
+
+    async def _latest(self) -> Sample:
+        sample = await asyncio.wrap_future(self._loop.start(self._rig.latest(self._axis, self._item)))
+        if sample is None:
+            raise SessionError(
+                f"axis {self._axis}: there is no {self._item} yet", axis=self._axis, remedy="see `ldcnd top`"
+            )
+        return sample
+
+    def _of(self, sample: Sample) -> "dict[str, Reading[float | str]]":
+        value, _ = _value(sample)
+        return {self.name: reading(value, sample.t * 1e-9, sample.quality)}
+
+    def __repr__(self) -> str:
+        return f"<signal {self.name}: {self._source}>"
+
+
+def _value(sample: Sample) -> tuple[float | str, str]:
+    """Return the value of a sample, and its unit."""
+    match sample:
+        case PositionSample() | VelocitySample() | MonitorSample():
+            return sample.value, sample.unit
+        case AdcSample():
+            return sample.volts, "V"
+        case StateSample():
+            return sample.state.value, ""
+        case FaultSample():
+            return ",".join(fault.code for fault in sample.active), ""
+    raise TypeError(f"{type(sample).__name__} is no item of an axis")

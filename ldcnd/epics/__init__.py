@@ -1,0 +1,1 @@
+"""Axes as EPICS motor records: a gateway between a rig and Channel Access clients."""

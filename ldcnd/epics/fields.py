@@ -1,0 +1,171 @@
+"""Channels of a gateway: what Channel Access clients see of a value, and what happens when they put one.
+
+A field without an action is read-only, and says so to its clients. An action raises what it refuses; its client then
+gets a failed put.
+"""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from caproto import (
+    AccessRights,
+    AlarmSeverity,
+    AlarmStatus,
+    ChannelChar,
+    ChannelData,
+    ChannelDouble,
+    ChannelEnum,
+    ChannelInteger,
+    ChannelString,
+)
+
+LONGEST_TEXT = 512
+"""Characters of a text that is longer than an EPICS string, which has 39."""
+LONGEST_STRING = 39
+
+Value = float | int | str
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """What came of a put that was not refused.
+
+    Attributes:
+        value: what the field shows now; None to leave it as it is.
+        end: what a client waits for that wants to know when the put has had its effect; None for nothing.
+    """
+
+    value: Value | None = None
+    end: Awaitable[None] | None = None
+
+
+Action = Callable[[Value], Awaitable[Put]]
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """What a field is worth."""
+
+    status: AlarmStatus = AlarmStatus.NO_ALARM
+    severity: AlarmSeverity = AlarmSeverity.NO_ALARM
+
+
+NO_ALARM = Alarm()
+
+
+class Field(ChannelData):  # type: ignore[misc] # caproto has no types
+    """A caproto channel whose puts go to an action; clients put with `write`, the gateway shows values with `show`."""
+
+    action: Action | None = None
+
+    # Any: caproto has no types
+    def check_access(self, hostname: str, username: str) -> Any:  # noqa: ANN401, ARG002
+        """Say who may do what: puts need an action."""
+        return AccessRights.READ | AccessRights.WRITE if self.action else AccessRights.READ
+
+    async def write(self, value: Any, **_metadata: Any) -> None:  # noqa: ANN401
+        """Take a put, and return when it has had its effect."""
+        if self.action is None:
+            raise PermissionError("this field is read-only")
+        put = await self.action(self.native(self.preprocess_value(value)))
+        if put.value is not None:
+            await self.show(put.value)
+        if put.end is not None:
+            await put.end
+
+    async def show(self, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+        """Publish a value.
+
+        Args:
+            value: the value.
+            alarm: what it is worth.
+            at_s: when it was true, in seconds since 1970; now when missing.
+        """
+        if at_s is None and (value, alarm) == (self.value, Alarm(self.status, self.severity)):
+            return
+        stamp = {} if at_s is None else {"timestamp": at_s}
+        await super().write(value, verify_value=False, status=alarm.status, severity=alarm.severity, **stamp)
+
+    def native(self, value: Any) -> Value:  # noqa: ANN401
+        """Return a value as this channel has it."""
+        return value.decode(self.string_encoding) if isinstance(value, bytes) else value
+
+
+class Number(Field, ChannelDouble):  # type: ignore[misc]
+    """A number with a unit."""
+
+
+class Integer(Field, ChannelInteger):  # type: ignore[misc]
+    """A whole number."""
+
+
+class Choice(Field, ChannelEnum):  # type: ignore[misc]
+    """One of some words."""
+
+    def native(self, value: Any) -> Value:  # noqa: ANN401
+        """Return a number or a word as the word.
+
+        Raises:
+            ValueError: it is neither.
+        """
+        word = super().native(value)
+        if isinstance(word, str):
+            if word not in self.enum_strings:
+                raise ValueError(f"{word!r} is none of {', '.join(self.enum_strings)}")
+            return word
+        if not 0 <= word < len(self.enum_strings):
+            raise ValueError(f"{word} is none of 0 to {len(self.enum_strings) - 1}")
+        return str(self.enum_strings[int(word)])
+
+
+class String(Field, ChannelString):  # type: ignore[misc]
+    """A short text."""
+
+    async def show(self, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+        """Publish a text, cut to what an EPICS string holds."""
+        await super().show(str(value)[:LONGEST_STRING], alarm, at_s)
+
+
+class Text(Field, ChannelChar):  # type: ignore[misc]
+    """A text longer than EPICS strings."""
+
+    async def show(self, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+        """Publish a text, cut to what the channel holds."""
+        await super().show(str(value)[:LONGEST_TEXT], alarm, at_s)
+
+
+def number(
+    value: float = 0.0, unit: str = "", *, precision: int = 4, limits: tuple[float, float] = (0.0, 0.0)
+) -> Number:
+    """Return a number; limits are those of puts, 0 and 0 for none."""
+    low, high = limits
+    return Number(
+        value=value,
+        units=unit,
+        precision=precision,
+        lower_ctrl_limit=low,
+        upper_ctrl_limit=high,
+        lower_disp_limit=low,
+        upper_disp_limit=high,
+    )
+
+
+def integer(value: int = 0) -> Integer:
+    """Return a whole number."""
+    return Integer(value=value)
+
+
+def choice(value: str, *words: str) -> Choice:
+    """Return one of some words."""
+    return Choice(value=value, enum_strings=words)
+
+
+def string(value: str = "") -> String:
+    """Return a short text."""
+    return String(value=value[:LONGEST_STRING])
+
+
+def text(value: str = "") -> Text:
+    """Return a longer text."""
+    return Text(value=value, max_length=LONGEST_TEXT, string_encoding="utf-8", report_as_string=True)

@@ -1,0 +1,418 @@
+"""An axis as a motor record: its fields, and what puts to them do.
+
+Fields follow the motor record of the EPICS collaboration. What the gateway cannot do has no field: retries, backlash,
+jogs. Limit switches are not published by the daemon, so HLS and LLS are always 0.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+
+from caproto import AlarmSeverity, AlarmStatus
+
+from ldcnd.client.axis import Axis
+from ldcnd.client.motion import Motion
+from ldcnd.epics.fields import NO_ALARM, Action, Alarm, Field, Put, Value, choice, integer, number, string, text
+from ldcnd.errors import CommandAborted, LdcndError, LeaseRequired, ValueOutOfRange, WrongState
+from ldcnd.model.commands import BufferMode, Verb
+from ldcnd.model.meta import AxisInfo
+from ldcnd.model.samples import (
+    AdcSample,
+    AxisState,
+    FaultSample,
+    LinkState,
+    MonitorSample,
+    Moving,
+    PositionSample,
+    Quality,
+    Sample,
+    StateSample,
+    VelocitySample,
+)
+
+NO_LIMIT = 1e30
+"""Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
+SILENT = Alarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
+QUALITIES = {
+    Quality.GOOD: NO_ALARM,
+    Quality.UNCERTAIN: Alarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
+    Quality.BAD: SILENT,
+}
+SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
+MSTA_PLUS, MSTA_DONE, MSTA_POSITION, MSTA_PROBLEM, MSTA_MOVING, MSTA_COMM = 0x1, 0x2, 0x100, 0x200, 0x400, 0x1000
+MSTA_GAIN, MSTA_HOMED = 0x800, 0x4000
+"""Bits of MSTA that the gateway knows."""
+
+
+class MotorRecord:
+    """One axis; its fields are in `fields`, by the names of their process variables behind the prefix.
+
+    Args:
+        info: what the axis is.
+        defaults: its velocity and acceleration, in units a second and a second squared, when nobody says otherwise.
+        start: keeps a task until its end.
+        stop: stops the axis and latches, without control.
+        moves: whether puts move it at all.
+    """
+
+    def __init__(
+        self,
+        info: AxisInfo,
+        defaults: tuple[float, float],
+        start: Callable[[Coroutine[object, object, None], str], asyncio.Future[None]],
+        stop: Callable[[str], Awaitable[object]],
+        *,
+        moves: bool,
+    ) -> None:
+        self.info = info
+        self.fields: dict[str, Field] = {}
+        self._axis: Axis | None = None
+        self._start = start
+        self._stop = stop
+        self._pending = 0
+        self._stopping = False
+        self._synchronised = False
+        self._moving = Moving.UNKNOWN
+        self._alarm = SILENT
+        velocity, acceleration = defaults
+        self._highest_velocity = info.limits.velocity or NO_LIMIT
+        self._make(velocity, acceleration)
+        if moves:
+            self._let_move()
+
+    # -- fields ------------------------------------------------------------------------------------------------------
+
+    def _make(self, velocity: float, acceleration: float) -> None:
+        info, unit = self.info, self.info.unit
+        low, high = info.limits.position_min, info.limits.position_max
+        limits = (0.0, 0.0) if low is None and high is None else (_or(low, -NO_LIMIT), _or(high, NO_LIMIT))
+        step = 1.0 / info.counts_per_unit if info.counts_per_unit else 1.0
+        precision = max(0, min(9, len(f"{step:.9f}".rstrip("0").partition(".")[2])))
+
+        def here(value: float = 0.0, limits: tuple[float, float] = (0.0, 0.0)) -> Field:
+            return number(value, unit, precision=precision, limits=limits)
+
+        self._val = here(limits=limits)
+        record: dict[str, Field] = {
+            "VAL": self._val,
+            "DVAL": here(),
+            "RBV": here(),
+            "DRBV": here(),
+            "RRBV": integer(),
+            "DMOV": integer(1),
+            "MOVN": integer(),
+            "TDIR": integer(),
+            "MSTA": integer(),
+            "VELO": number(velocity, f"{unit}/s", precision=precision),
+            "VMAX": number(info.limits.velocity or 0.0, f"{unit}/s", precision=precision),
+            "VBAS": number(0.0, f"{unit}/s", precision=precision),
+            "HVEL": number(0.0, f"{unit}/s", precision=precision),
+            "ACCL": number(velocity / acceleration, "s", precision=3),
+            "HLM": here(limits[1]),
+            "LLM": here(limits[0]),
+            "DHLM": here(limits[1]),
+            "DLLM": here(limits[0]),
+            "HLS": integer(),
+            "LLS": integer(),
+            "LVIO": integer(),
+            "EGU": string(unit),
+            "PREC": integer(precision),
+            "MRES": number(step, unit, precision=9),
+            "ERES": number(step, unit, precision=9),
+            "SREV": integer(1),
+            "UREV": number(step, unit, precision=9),
+            "RDBD": here(0.0),
+            "OUT": string(f"{info.bus} {info.address}"),
+            "DESC": string(f"{info.axis}, {info.model}"),
+            "RTYP": string("motor"),
+            "STAT": string("NO_ALARM"),
+            "SEVR": choice("INVALID", *SEVERITIES),
+            "STOP": integer(),
+            "SPMG": choice("Go", "Stop", "Pause", "Move", "Go"),
+            "HOMF": integer(),
+            "HOMR": integer(),
+            "TWV": here(1.0),
+            "TWF": integer(),
+            "TWR": integer(),
+            "SET": choice("Use", "Use", "Set"),
+            "OFF": here(0.0),
+            "FOFF": choice("Frozen", "Variable", "Frozen"),
+            "DIR": choice("Pos", "Pos", "Neg"),
+            "CNEN": choice("Disable", "Disable", "Enable"),
+        }
+        name = info.axis
+        self.fields |= {f"{name}.{field}": channel for field, channel in record.items()}
+        self.fields[name] = self._val
+        self.fields |= {
+            f"{name}:state": string(),
+            f"{name}:velocity": number(0.0, f"{unit}/s", precision=precision),
+            f"{name}:faults": text(),
+            f"{name}:first_fault": string(),
+            f"{name}:message": text(),
+            f"{name}:control": string("none"),
+        }
+        if info.adc_full_scale:
+            self.fields[f"{name}:adc"] = number(0.0, "V")
+        for monitor in info.monitors:
+            self.fields[f"{name}:{monitor}"] = number(0.0, precision=0)
+        if "input_signals" in info.monitors:
+            self.fields[f"{name}:inputs"] = text()
+
+    def _let_move(self) -> None:
+        can = set(self.info.capabilities)
+        actions: dict[str, Action] = {"STOP": self._put_stop, "SPMG": self._put_spmg}
+        if Verb.MOVE_ABSOLUTE in can:
+            actions |= {
+                "VAL": self._put_val,
+                "TWV": self._keep,
+                "TWF": lambda asked: self._put_tweak(asked, 1),
+                "TWR": lambda asked: self._put_tweak(asked, -1),
+                "VELO": self._put_velo,
+                "ACCL": self._put_positive,
+                "SET": self._keep,
+            }
+        if Verb.HOME in can:
+            actions |= {
+                "HVEL": self._put_positive,
+                "HOMF": lambda asked: self._put_home(asked, 1),
+                "HOMR": lambda asked: self._put_home(asked, -1),
+            }
+        if Verb.POWER in can:
+            actions["CNEN"] = self._put_cnen
+        for field, action in actions.items():
+            self[field].action = self._explained(action)
+
+    def __getitem__(self, field: str) -> Field:
+        return self.fields[f"{self.info.axis}.{field}"]
+
+    def beside(self, name: str) -> Field | None:
+        """Return a variable beside the record, such as `adc`."""
+        return self.fields.get(f"{self.info.axis}:{name}")
+
+    # -- what the axis says ------------------------------------------------------------------------------------------
+
+    async def take(self, sample: Sample, item: str = "") -> None:
+        """Show a sample; the item names monitors."""
+        alarm, at_s = QUALITIES[sample.quality], sample.t * 1e-9
+        match sample:
+            case PositionSample():
+                worst = max(alarm, self._alarm, key=lambda each: each.severity)
+                for field in ("RBV", "DRBV"):
+                    await self[field].show(sample.value, worst, at_s)
+                await self["RRBV"].show(sample.counts, worst, at_s)
+                if not self._synchronised:
+                    self._synchronised = True
+                    await self._val.show(sample.value)
+            case VelocitySample():
+                await self._show_extra("velocity", sample.value, alarm, at_s)
+                if sample.value:
+                    await self["TDIR"].show(int(sample.value > 0))
+            case AdcSample():
+                await self._show_extra("adc", sample.volts, alarm, at_s)
+            case FaultSample():
+                await self._show_extra("faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
+                await self._show_extra("first_fault", sample.first.code if sample.first else "")
+            case StateSample():
+                await self._take_state(sample)
+            case MonitorSample():
+                await self._show_extra(item, sample.value, alarm, at_s)
+                if item == "input_signals":
+                    await self._show_extra(
+                        "inputs", ", ".join(sample.active if sample.active is not None else sample.high)
+                    )
+
+    async def _take_state(self, sample: StateSample) -> None:
+        self._moving = sample.moving
+        if sample.link is LinkState.DOWN or sample.moving is Moving.UNKNOWN:
+            self._alarm = SILENT
+        elif sample.state is AxisState.ERROR_STOP:
+            self._alarm = Alarm(AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM)
+        elif sample.stop_latched or sample.stop_pending or sample.link is LinkState.DEGRADED:
+            self._alarm = Alarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
+        else:
+            self._alarm = NO_ALARM
+        await self._show_extra("state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
+        await self["CNEN"].show("Enable" if sample.enabled else "Disable")
+        await self["MSTA"].show(
+            (MSTA_DONE if sample.moving is Moving.NO else MSTA_MOVING)
+            | MSTA_GAIN * sample.enabled
+            | MSTA_HOMED * sample.referenced
+            | MSTA_PROBLEM * (sample.state is AxisState.ERROR_STOP)
+            | MSTA_COMM * (sample.link is LinkState.DOWN)
+        )
+        await self.show_motion()
+
+    async def silent(self) -> None:
+        """Show that nothing is known of the axis: the daemon does not publish."""
+        self._moving, self._alarm = Moving.UNKNOWN, SILENT
+        await self["RBV"].show(self["RBV"].value, SILENT)
+        await self.show_motion()
+
+    async def show_motion(self) -> None:
+        """Show whether the axis moves: an axis of which that is not known has not arrived."""
+        stands = self._moving is Moving.NO and not self._pending
+        await self["MOVN"].show(int(not stands))
+        await self["DMOV"].show(int(stands))
+        await self["STAT"].show(self._alarm.status.name)
+        await self["SEVR"].show(SEVERITIES[self._alarm.severity])
+
+    async def controlled(self, axis: Axis | None, holder: str) -> None:
+        """Take or lose control of the axis."""
+        self._axis = axis
+        await self._show_extra("control", holder)
+
+    async def _show_extra(self, name: str, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+        field = self.beside(name)
+        if field:
+            await field.show(value, alarm, at_s)
+
+    # -- puts --------------------------------------------------------------------------------------------------------
+
+    def _explained(self, action: Action) -> Action:
+        """Show why a put was refused beside the record: Channel Access says only that it was."""
+
+        async def explained(asked: Value) -> Put:
+            try:
+                put = await action(asked)
+            except (LdcndError, ValueError) as error:
+                await self._show_extra("message", str(error))
+                raise
+            await self._show_extra("message", "")
+            return put
+
+        return explained
+
+    async def _put_val(self, asked: Value) -> Put:
+        axis, target = self._movable(), float(asked)
+        if self["SET"].value == "Set":
+            await axis.set_position(target)
+            return Put(target)
+        return await self._moved(lambda: self._absolute(axis, target), target)
+
+    async def _put_tweak(self, asked: Value, sign: int) -> Put:
+        if not asked:
+            return Put(0)
+        axis = self._movable()
+        step = sign * float(self["TWV"].value)
+        target = (float(self._val.value) if self._pending else axis.position.value) + step
+        put = await self._moved(lambda: self._absolute(axis, target), target)
+        await self._val.show(target)
+        return Put(0, put.end)
+
+    async def _put_home(self, asked: Value, sign: int) -> Put:
+        if not asked:
+            return Put(0)
+        axis, velocity = self._movable(), float(self["HVEL"].value)
+        if not velocity:
+            raise ValueOutOfRange(
+                f"axis {self.info.axis}: HVEL is 0", axis=self.info.axis, remedy="put the velocity of the search there"
+            )
+        put = await self._moved(lambda: axis.home(velocity=sign * velocity))
+        self._synchronised = False
+        return Put(0, put.end)
+
+    async def _put_stop(self, asked: Value) -> Put:
+        if asked:
+            await self._halt()
+        return Put(0)
+
+    async def _put_spmg(self, asked: Value) -> Put:
+        if asked in ("Stop", "Pause"):
+            await self._halt()
+        return Put(asked)
+
+    async def _put_cnen(self, asked: Value) -> Put:
+        await self._controlled().power(on=asked == "Enable")
+        return Put()
+
+    async def _put_velo(self, asked: Value) -> Put:
+        if float(asked) > self._highest_velocity:
+            raise ValueOutOfRange(
+                f"axis {self.info.axis}: {asked} {self.info.unit}/s is above its limit",
+                axis=self.info.axis,
+                value=asked,
+                limit=self._highest_velocity,
+            )
+        return await self._put_positive(asked)
+
+    async def _put_positive(self, asked: Value) -> Put:
+        if not 0 < float(asked) < NO_LIMIT:
+            raise ValueOutOfRange(f"axis {self.info.axis}: {asked} is not above 0", axis=self.info.axis, value=asked)
+        return Put(asked)
+
+    @staticmethod
+    async def _keep(asked: Value) -> Put:
+        return Put(asked)
+
+    async def _absolute(self, axis: Axis, target: float) -> Motion:
+        velocity = float(self["VELO"].value)
+        return await axis.move_absolute(
+            target,
+            buffer_mode=BufferMode.ABORTING,
+            velocity=velocity,
+            acceleration=velocity / float(self["ACCL"].value),
+        )
+
+    async def _moved(self, starting: Callable[[], Awaitable[Motion]], target: float | None = None) -> Put:
+        """Begin a motion; DMOV is 0 from here to its end, however short it is."""
+        self._pending += 1
+        self._stopping = False
+        await self.show_motion()
+        try:
+            motion = await starting()
+        except BaseException as error:
+            self._pending -= 1
+            await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
+            await self.show_motion()
+            raise
+        await self["LVIO"].show(0)
+        # the motion goes on when the client is gone that has put it, as it does with every motor record
+        end = asyncio.shield(self._start(self._until_end(motion), f"motion of {self.info.axis}"))
+        return Put(target, end)
+
+    async def _until_end(self, motion: Motion) -> None:
+        try:
+            await motion.done()
+        except CommandAborted as error:
+            if not self._stopping and self._pending == 1:  # neither halted nor sent elsewhere over this record
+                await self._show_extra("message", str(error))
+                raise
+        except LdcndError as error:
+            await self._show_extra("message", str(error))
+            raise
+        finally:
+            self._pending -= 1
+            await self.show_motion()
+
+    async def _halt(self) -> None:
+        """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""
+        self._stopping = True
+        if self._axis is None:
+            await self._stop(self.info.axis)
+            return
+        if self._moving is not Moving.NO or self._pending:
+            await self._axis.halt()
+
+    def _controlled(self) -> Axis:
+        if self._axis is None:
+            held = self.beside("control")
+            raise LeaseRequired(
+                f"axis {self.info.axis} is not controlled by this gateway: {held.value if held else ''}",
+                axis=self.info.axis,
+            )
+        return self._axis
+
+    def _movable(self) -> Axis:
+        if self["SPMG"].value not in ("Go", "Move"):
+            raise WrongState(
+                f"axis {self.info.axis}: SPMG is {self['SPMG'].value}", axis=self.info.axis, remedy="put Go there"
+            )
+        return self._controlled()
+
+
+def database(prefix: str, records: Mapping[str, MotorRecord]) -> dict[str, Field]:
+    """Return the process variables of some axes by name."""
+    return {f"{prefix}{name}": field for record in records.values() for name, field in record.fields.items()}
+
+
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value

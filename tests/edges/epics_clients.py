@@ -1,0 +1,122 @@
+"""Unmodified EPICS clients that use a motor record: `python -m tests.edges.epics_clients CLIENT RECORD`.
+
+Each prints nothing and exits with 0, or raises. A process for each: libca reads its environment once.
+"""
+
+import asyncio
+import sys
+import time
+
+import pytest
+
+from tests.support.bluesky_engine import Documents
+
+
+def caget(record: str) -> None:
+    """The calls of the command line tools, over libca itself."""
+    import epics
+
+    seen = []
+    epics.camonitor(f"{record}.RBV", callback=lambda value, **_: seen.append(value))
+    assert epics.caget(f"{record}.RTYP") == "motor"
+    assert epics.caget(f"{record}.SEVR", as_string=True) == "NO_ALARM"
+    assert epics.caput(record, 2.0, wait=True, timeout=20) == 1
+    assert abs(epics.caget(f"{record}.RBV") - 2.0) < 0.02
+    assert epics.caget(f"{record}.DMOV") == 1
+    epics.caput(record, 1000.0, wait=True, timeout=5)
+    assert abs(epics.caget(f"{record}.RBV") - 2.0) < 0.02
+    assert "limit" in epics.caget(f"{record}:message", as_string=True)
+    assert len(seen) > 3
+    epics.camonitor_clear(f"{record}.RBV")
+
+
+def pyepics_motor(record: str) -> None:
+    """`epics.Motor`: moves, limits, stop, tweak."""
+    import epics
+
+    motor = epics.Motor(record)
+    assert (motor.units, motor.precision) == ("mm", 3)
+    assert motor.move(1.0, wait=True, timeout=20) == 0
+    assert abs(motor.get_position(readback=True) - 1.0) < 0.02
+    assert motor.within_limits(0.0)
+    motor.tweak(direction="forward", wait=True, timeout=20)
+    time.sleep(0.5)
+    assert abs(motor.get_position(readback=True) - 2.0) < 0.02
+    motor.move(50.0, wait=False)
+    time.sleep(0.5)
+    motor.stop()
+    time.sleep(1.0)
+    assert motor.done_moving == 1
+    assert motor.get_position(readback=True) < 49
+
+
+def ophyd_motor(record: str) -> None:
+    """`ophyd.EpicsMotor` in a scan."""
+    from bluesky import RunEngine
+    from bluesky.plans import scan
+    from ophyd import EpicsMotor
+    from ophyd.utils import LimitError
+
+    motor = EpicsMotor(record, name="motor")
+    motor.wait_for_connection(timeout=20)
+    documents = Documents()
+    engine = RunEngine({})
+    engine.subscribe(documents.take)
+    engine(scan([], motor, 0, 3, 4))
+    assert documents.exit_status == "success"
+    recorded = documents.data("motor")
+    assert len(recorded) == 4
+    assert all(abs(at - wanted) < 0.02 for wanted, at in enumerate(recorded)), recorded
+    with pytest.raises(LimitError):
+        motor.set(1000)
+
+
+def ophyd_async_motor(record: str) -> None:
+    """`ophyd_async.epics.motor.Motor`: a scan and a fly scan."""
+    import bluesky.plan_stubs as bps
+    from bluesky import RunEngine
+    from bluesky.plans import scan
+    from ophyd_async.core import FlyMotorInfo, init_devices
+    from ophyd_async.epics.motor import Motor
+
+    engine = RunEngine({})
+    documents = Documents()
+    engine.subscribe(documents.take)
+    with init_devices():
+        motor = Motor(f"ca://{record}", name="motor")
+    engine(scan([], motor, 0, 3, 4))
+    assert documents.exit_status == "success"
+    recorded = documents.data("motor")
+    assert all(abs(at - wanted) < 0.02 for wanted, at in enumerate(recorded)), recorded
+
+    def flight():
+        yield from bps.open_run()
+        yield from bps.prepare(motor, FlyMotorInfo(start_position=0, end_position=5, time_for_move=2.5), wait=True)
+        yield from bps.kickoff(motor, wait=True)
+        yield from bps.complete(motor, wait=True)
+        yield from bps.close_run()
+
+    engine(flight())
+    assert documents.exit_status == "success"
+    assert abs(asyncio.run_coroutine_threadsafe(motor.user_readback.get_value(), engine.loop).result(5) - 5) < 0.5
+
+
+def caproto_tools(record: str) -> None:
+    """`caproto-get` and `caproto-put`: another implementation of the protocol."""
+    import subprocess
+    from pathlib import Path
+
+    tools = Path(sys.executable).parent
+
+    def run(tool: str, *arguments: str) -> str:
+        return subprocess.run([tools / tool, *arguments], check=True, capture_output=True, text=True, timeout=30).stdout
+
+    assert "motor" in run("caproto-get", f"{record}.RTYP")
+    run("caproto-put", "--notify", "--timeout", "20", record, "1.5")
+    assert "1.5" in run("caproto-get", f"{record}.VAL")
+
+
+CLIENTS = {client.__name__: client for client in (caget, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools)}
+
+if __name__ == "__main__":
+    CLIENTS[sys.argv[1]](sys.argv[2])

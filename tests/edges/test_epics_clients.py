@@ -1,0 +1,74 @@
+"""Other people's EPICS clients, unmodified, with a daemon and a gateway in processes of their own."""
+
+import asyncio
+import os
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ldcnd.model.commands import Power
+from ldcnd.model.samples import Moving
+from tests.edges.epics_clients import CLIENTS
+from tests.support.process import ROOT, client, daemon, free_port, process
+
+pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(180)]
+
+
+@asynccontextmanager
+async def gateway(*options: str) -> AsyncIterator[tuple[str, dict[str, str]]]:
+    """Run a daemon and a gateway; yields the daemon's endpoint, and the environment of clients."""
+    port = free_port()
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        async with client(endpoint) as rig:
+            await rig.command("x", Power(on=True))
+        arguments = ("epics", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--prefix", "T:", *options)
+        async with process(*arguments) as running:
+            assert running.stdout
+            assert b"motor records T:{x}" in await running.stdout.readline()
+            yield (
+                endpoint,
+                {
+                    **os.environ,
+                    "EPICS_CA_ADDR_LIST": "127.0.0.1",
+                    "EPICS_CA_AUTO_ADDR_LIST": "NO",
+                    "EPICS_CA_SERVER_PORT": str(port),
+                    "EPICS_CA_REPEATER_PORT": str(free_port()),
+                },
+            )
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+async def test_an_unmodified_client_uses_the_record(name: str) -> None:
+    async with gateway("--moves") as (_, environment):
+        await asyncio.sleep(2)  # until the gateway has its lease
+        code = await run(name, environment)
+
+    assert code == 0
+
+
+async def test_libca_sees_a_record_that_it_cannot_write() -> None:
+    program = """
+import epics
+pv = epics.PV("T:x")
+pv.wait_for_connection(10)
+assert (pv.read_access, pv.write_access) == (True, False), pv
+assert epics.caput("T:x", 5.0, wait=True, timeout=3) != 1
+"""
+    async with gateway() as (endpoint, environment):
+        written = await asyncio.create_subprocess_exec(sys.executable, "-c", program, env=environment)
+        code = await written.wait()
+        async with client(endpoint) as rig:
+            state = await rig.state("x")
+
+    assert code == 0
+    assert state.moving is Moving.NO
+
+
+async def run(name: str, environment: dict[str, str]) -> int:
+    running = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "tests.edges.epics_clients", name, "T:x", env=environment, cwd=ROOT
+    )
+    async with asyncio.timeout(120):
+        return await running.wait()

@@ -1,0 +1,280 @@
+"""Plans of a real RunEngine on a whole daemon: what they record, and how they end when something goes wrong."""
+
+import threading
+from contextlib import suppress
+
+import bluesky.plan_stubs as bps
+import bluesky.plans as bp
+import pytest
+from bluesky import protocols
+from bluesky.preprocessors import monitor_during_wrapper
+from bluesky.utils import FailedStatus, RunEngineInterrupted
+
+from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
+from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, UnknownAxis, WrongState
+from ldcnd.model.events import ReadEvents
+from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.samples import Moving
+from tests.support.bluesky_engine import Laboratory, laboratory
+
+IN_POSITION = 0.02
+"""Millimetres between where a motor stands and where it was sent."""
+
+
+@pytest.fixture(scope="module")
+def shared():
+    with laboratory() as lab:
+        yield lab
+
+
+@pytest.fixture
+def lab(shared: Laboratory):
+    shared.documents.taken.clear()
+    return shared
+
+
+def stands(lab: Laboratory, axis: str) -> bool:
+    return lab.loop.run(lab.running.client.state(axis)).moving is Moving.NO
+
+
+def test_devices_satisfy_the_protocols_without_a_base_class(lab: Laboratory):
+    wanted = {
+        ReadableAxis: ("Readable", "Configurable", "Subscribable", "HasHints", "HasName", "HasParent"),
+        Axis: ("Movable", "Locatable", "Stoppable", "Checkable", "Preparable", "Flyable", "EventPageCollectable"),
+        Signal: ("Readable", "Subscribable", "HasHints"),
+        Trace: ("Readable", "Triggerable", "HasHints"),
+    }
+    with lab.powered("x") as (x,), lab.devices.watch("y") as y:
+        trace = x.trace("position")
+        made = {ReadableAxis: y, Axis: x, Signal: lab.devices.signal("x", "velocity"), Trace: trace}
+        lacking = [
+            (kind.__name__, name)
+            for kind, names in wanted.items()
+            for name in names
+            if not isinstance(made[kind], getattr(protocols, name))
+        ]
+
+    assert lacking == []
+    assert {base for kind in wanted for base in kind.__mro__} == {*wanted, object}
+
+
+def test_a_scan_records_where_the_motor_was(lab: Laboratory):
+    truth = []
+    with lab.powered("x") as (x,), lab.devices.watch("y") as y:
+        located = lab.loop.run(x.locate())
+        token = lab.engine.subscribe(lambda *_: truth.append(lab.truth("x")), "event")
+        lab.engine(bp.scan([y], x, 0, 4, 5))
+        lab.engine.unsubscribe(token)
+
+    assert located["setpoint"] == pytest.approx(lab.documents.data("x")[0], abs=IN_POSITION)
+    assert lab.documents.exit_status == "success"
+    assert lab.documents.data("x") == pytest.approx(truth, abs=IN_POSITION)
+    assert lab.documents.data("x_setpoint") == pytest.approx(range(5))
+    assert len(lab.documents.data("y")) == 5
+
+
+def test_a_reading_after_a_move_was_measured_after_its_end(lab: Laboratory):
+    def moves():
+        yield from bps.open_run()
+        for target in (3, 1, 4):
+            yield from bps.abs_set(x, target, wait=True)
+            ended.append(x._axis.state.sample.t * 1e-9)
+            yield from bps.create()
+            yield from bps.read(x)
+            yield from bps.save()
+        yield from bps.close_run()
+
+    ended = []
+    with lab.powered("x") as (x,):
+        lab.engine(moves())
+
+    measured = [event["timestamps"]["x"] for event in lab.documents.of("event")]
+    assert [at >= end for at, end in zip(measured, ended, strict=True)] == [True] * 3
+    assert all(at < 1.8e9 for at in measured)  # of the rig's clock, not this machine's
+
+
+def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
+    with lab.powered("x", "y") as (x, y):
+        began = (lab.truth("x"), lab.truth("y"))
+        lab.engine(bp.rel_grid_scan([lab.devices.signal("x", "adc")], x, -1, 1, 2, y, -1, 1, 2))
+
+    assert lab.documents.exit_status == "success"
+    assert len(lab.documents.data("x_adc")) == 4
+    assert (lab.truth("x"), lab.truth("y")) == pytest.approx(began, abs=IN_POSITION)
+
+
+def test_a_fly_scan_yields_positions_with_the_times_of_the_drive(lab: Laboratory):
+    def flight():
+        yield from bps.prepare(x, Fly(0, 5, velocity=5), wait=True)
+        yield from bp.fly([x])
+
+    with lab.powered("x") as (x,):
+        lab.engine(flight())
+
+    (descriptor,) = lab.documents.of("descriptor")
+    pages = lab.documents.of("event_page")
+    positions = [value for page in pages for value in page["data"]["x"]]
+    times = [at for page in pages for at in page["timestamps"]["x"]]
+    assert descriptor["name"] == "x_fly"
+    assert len(positions) >= 15  # 1 s at 20 Hz
+    assert (positions[0], positions[-1]) == pytest.approx((0, 5), abs=0.5)
+    assert positions[-1] == pytest.approx(5, abs=IN_POSITION)
+    assert times == sorted(set(times))
+    middle = [(at, value) for at, value in zip(times, positions, strict=True) if 1 < value < 4]
+    speed = (middle[-1][1] - middle[0][1]) / (middle[-1][0] - middle[0][0])
+    assert speed == pytest.approx(5, rel=0.01)
+
+
+def test_a_flight_is_prepared_first_and_within_the_limits(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        with pytest.raises(WrongState, match="prepare"):
+            x.kickoff().wait(20)
+        with pytest.raises(RequestRefused, match="100"):
+            x.prepare(Fly(0, 1000)).wait(20)
+        with pytest.raises(WrongState, match="under way"):
+            x.complete()
+
+
+def test_signals_are_monitored_while_an_axis_moves(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        velocity = lab.devices.signal("x", "velocity")
+        state = lab.devices.signal("x", "state")
+        lab.engine(monitor_during_wrapper(bp.list_scan([state], x, [0, 5, 0]), [velocity, x]))
+        faults = lab.loop.run(lab.devices.signal("x", "fault").read())
+
+    assert {descriptor["name"] for descriptor in lab.documents.of("descriptor")} == {
+        "primary",
+        "x_velocity_monitor",
+        "x_monitor",
+    }
+    assert max(lab.documents.data("x_velocity")) > 1
+    assert lab.documents.data("x_state") == ["standstill"] * 3
+    assert faults["x_fault"]["value"] == ""
+    with pytest.raises(UnknownAxis, match="velocity"):
+        lab.devices.signal("x", "monitor/speed_feedback")
+
+
+def test_a_trace_is_a_detector(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        trace = x.trace("position", samples=40)
+        with pytest.raises(WrongState, match="no trace"):
+            lab.loop.run(trace.read())
+        lab.engine(bp.scan([trace], x, 0, 1, 2))
+
+    rows = lab.documents.data("x_trace_position")
+    assert [len(row) for row in rows] == [40, 40]
+    assert rows[1] == pytest.approx([1.0] * 40, abs=IN_POSITION)
+
+
+def test_what_the_daemon_would_refuse_is_raised_by_the_check(lab: Laboratory):
+    with lab.devices.control("x", client="scan") as x:
+        x.power(on=False).wait(20)
+        with pytest.raises(RequestRefused, match="disabled"):
+            lab.loop.run(x.check_value(1))
+        x.power(on=True).wait(20)
+        lab.loop.run(x.check_value(1))
+        with pytest.raises(RequestRefused) as refused:
+            lab.loop.run(x.check_value(1000))
+
+    assert refused.value.nearest == 100
+
+
+def test_configuration_says_what_the_registers_would_hold(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        x.velocity = 7.0
+        configured = lab.loop.run(x.read_configuration())
+        described = lab.loop.run(x.describe_configuration())
+
+    assert configured["x_velocity"]["value"] == pytest.approx(7, rel=1e-3)
+    assert configured["x_acceleration"]["value"] == pytest.approx(200, rel=1e-2)
+    assert set(configured) == set(described)
+
+
+def test_a_scan_into_a_limit_fails_and_leaves_the_axis_at_rest(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        with pytest.raises(FailedStatus):
+            lab.engine(bp.scan([], x, 95, 105, 3))
+        assert stands(lab, "x")
+
+    assert lab.documents.exit_status == "fail"
+    assert lab.documents.data("x") == pytest.approx([95, 100], abs=IN_POSITION)
+
+
+def test_a_stop_from_elsewhere_ends_the_run_as_failed(lab: Laboratory):
+    def stop_at_the_third(name, document):
+        if document["seq_num"] == 3:
+            stopping.append(lab.loop.start(stop_while_moving()))
+
+    async def stop_while_moving():
+        await lab.running.until("x", lambda state: state.moving is Moving.YES)
+        await lab.running.client.stop()
+
+    stopping = []
+    with lab.powered("x") as (x,):
+        token = lab.engine.subscribe(stop_at_the_third, "event")
+        with pytest.raises(FailedStatus):
+            lab.engine(bp.scan([], x, 0, 4, 5))
+        lab.engine.unsubscribe(token)
+        stopping[0].result(20)
+        latched = lab.loop.run(lab.running.client.state("x")).stop_latched
+        assert stands(lab, "x")
+        x.reset().wait(20)
+        with lab.devices.control("y", client="scan") as y:
+            y.reset().wait(20)
+
+    assert latched
+    assert lab.documents.exit_status == "fail"
+
+
+def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
+    def pause_while_moving():
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
+        lab.engine.request_pause()
+
+    with lab.powered("x") as (x,):
+        pausing = threading.Thread(target=pause_while_moving)
+        pausing.start()
+        with pytest.raises(RunEngineInterrupted):
+            lab.engine(bp.scan([], x, 20, -20, 2))
+        pausing.join()
+        lab.engine.abort("enough")
+        state = lab.loop.run(lab.running.client.state("x"))
+
+    assert (state.stop_latched, state.moving) == (False, Moving.NO)
+    assert lab.documents.exit_status == "abort"
+
+
+def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        meant, unmeant = [], []
+        for success, ends in ((True, meant), (False, unmeant)):
+            status = x.set(50 if lab.truth("x") < 0 else -50)
+            lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
+            lab.loop.run(x.stop(success=success))
+            ends.append(status.exception(20))
+
+    assert meant == [None]
+    assert isinstance(unmeant[0], CommandAborted)
+
+
+def test_a_stop_of_a_standing_axis_sends_nothing(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
+        lab.loop.run(x.stop())
+        after = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
+
+    assert after.end_number == before.end_number
+
+
+def test_each_device_has_a_lease_of_its_own(lab: Laboratory):
+    with lab.powered("y") as (y,):
+        with (
+            suppress(LeaseExpired),
+            lab.powered("x") as (x,),
+        ):  # the end of the context may find it before the plan does
+            lab.loop.run(lab.running.client.ask(Acquire(client="ann", axes=("x",), force=True)))
+            refused = x.set(1).exception(20)
+        assert isinstance(refused, LeaseExpired)
+        y.set(1).wait(20)
+        with pytest.raises(LeaseHeld), lab.devices.control("y", client="bob"):
+            pass

@@ -1,0 +1,290 @@
+"""Motor records on a whole daemon: what puts do, what is refused, and that nothing moves without permission."""
+
+import asyncio
+import random
+from contextlib import asynccontextmanager, suppress
+
+import pytest
+from caproto import AccessRights, AlarmSeverity, CaprotoError, ChannelType, Forbidden
+
+from ldcnd.client.rig import Rig
+from ldcnd.epics.gateway import gateway
+from ldcnd.errors import CommandAborted, LdcndError, LeaseRequired, PositionLimit, ValueOutOfRange, WrongState
+from ldcnd.model.events import ReadEvents
+from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.samples import LinkState, Moving
+from tests.support.rig import running_rig, two_axes
+
+FIELDS = [
+    "VAL",
+    "DVAL",
+    "RBV",
+    "DRBV",
+    "RRBV",
+    "DMOV",
+    "MOVN",
+    "TDIR",
+    "MSTA",
+    "VELO",
+    "VMAX",
+    "VBAS",
+    "HVEL",
+    "ACCL",
+    "HLM",
+    "LLM",
+    "DHLM",
+    "DLLM",
+    "HLS",
+    "LLS",
+    "LVIO",
+    "EGU",
+    "PREC",
+    "MRES",
+    "ERES",
+    "SREV",
+    "UREV",
+    "RDBD",
+    "OUT",
+    "DESC",
+    "RTYP",
+    "STAT",
+    "SEVR",
+    "STOP",
+    "SPMG",
+    "HOMF",
+    "HOMR",
+    "TWV",
+    "TWF",
+    "TWR",
+    "SET",
+    "OFF",
+    "FOFF",
+    "DIR",
+    "CNEN",
+]
+
+
+@asynccontextmanager
+async def records(*, moves: bool = True, power: bool = True):
+    async with running_rig(two_axes()) as running:
+        for name in running.daemon.rig.axes:
+            await running.until(name, lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        async with gateway(rig, prefix="T:", moves=rig.axes if moves else ()) as made:
+            if moves:
+                await shows(made, "T:x:control", "epics gateway")
+                if power:
+                    await put(made, "T:x.CNEN", "Enable")
+                    await shows(made, "T:x.CNEN", "Enable")
+            await shows(made, "T:x.SEVR", "NO_ALARM")
+            yield running, made
+
+
+async def put(made, name: str, value) -> None:
+    """Put with completion, as a client does."""
+    kind = {str: ChannelType.STRING, int: ChannelType.LONG, float: ChannelType.DOUBLE}[type(value)]
+    data = [value.encode()] if isinstance(value, str) else [value]
+    async with asyncio.timeout(120):
+        await made.variables[name].auth_write("host", "user", data, kind, None)
+
+
+async def shows(made, name: str, wanted) -> None:
+    async with asyncio.timeout(30):
+        while made.variables[name].value != wanted:
+            await asyncio.sleep(0.01)
+
+
+async def test_a_put_returns_when_the_axis_stands_at_its_target():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 3.0))
+        await shows(made, "T:x.DMOV", 0)
+        await shows(made, "T:x.VAL", 3.0)
+        assert not moving.done()
+        await shows(made, "T:x.TDIR", 1)
+        await moving
+        state = await running.client.state("x")
+
+        assert made.variables["T:x.DMOV"].value == 1
+        assert state.moving is Moving.NO
+        assert made.variables["T:x.RBV"].value == pytest.approx(3, abs=0.02)
+        assert made.variables["T:x.RBV"].timestamp == pytest.approx(state.t * 1e-9, abs=1)
+
+
+async def test_the_record_has_the_fields_that_clients_use():
+    async with records(moves=False) as (_, made):
+        assert {name.rpartition(".")[2] for name in made.variables if name.startswith("T:x.")} == set(FIELDS)
+        shown = {field: made.variables[f"T:x.{field}"].value for field in ("EGU", "PREC", "MRES", "HLM", "LLM", "RTYP")}
+        beside = {name.partition(":x:")[2] for name in made.variables if ":x:" in name}
+
+    assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
+    assert beside == {"adc", "control", "faults", "first_fault", "message", "state", "velocity"}
+
+
+async def test_velocity_and_acceleration_are_those_of_the_next_move():
+    async with records() as (_, made):
+        assert made.variables["T:x.VELO"].value == pytest.approx(20, rel=0.01)
+        assert made.variables["T:x.ACCL"].value == pytest.approx(0.1, rel=0.01)
+        await put(made, "T:x.VELO", 2.0)
+        moving = asyncio.create_task(put(made, "T:x", 1.0))
+        await asyncio.sleep(0.3)
+        speed = made.variables["T:x:velocity"].value
+        await moving
+        with pytest.raises(ValueOutOfRange):
+            await put(made, "T:x.VELO", 51.0)
+
+    assert speed == pytest.approx(2, rel=0.1)
+
+
+async def test_a_target_beyond_the_limit_is_refused_and_moves_nothing():
+    async with records() as (running, made):
+        with pytest.raises(PositionLimit):
+            await put(made, "T:x", 1000.0)
+
+        assert made.variables["T:x.LVIO"].value == 1
+        assert made.variables["T:x.DMOV"].value == 1
+        assert "100" in made.variables["T:x:message"].value
+        assert (await running.client.state("x")).moving is Moving.NO
+        await put(made, "T:x", 0.5)
+        assert made.variables["T:x.LVIO"].value == 0
+
+
+async def test_a_stop_halts_without_the_latch_and_the_put_is_complete():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await put(made, "T:x.STOP", 1)
+        await moving
+        state = await running.client.state("x")
+
+    assert (state.stop_latched, state.moving) == (False, Moving.NO)
+
+
+async def test_a_stop_from_elsewhere_fails_the_put_and_raises_the_severity():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await running.client.stop()
+        with pytest.raises(CommandAborted):
+            await moving
+        await shows(made, "T:x.SEVR", "MAJOR")
+        await running.until("x", lambda state: state.moving is Moving.NO)
+
+
+async def test_a_second_put_sends_a_moving_axis_elsewhere():
+    async with records() as (running, made):
+        first = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await put(made, "T:x", 1.0)
+        await first
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(1, abs=0.02)
+
+
+async def test_a_motion_goes_on_when_its_client_is_gone():
+    async with records() as (running, made):
+        client = asyncio.create_task(put(made, "T:x", 2.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        client.cancel()
+        await shows(made, "T:x.DMOV", 1)
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(2, abs=0.02)
+
+
+async def test_spmg_halts_and_refuses_and_go_starts_nothing():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await put(made, "T:x.SPMG", "Pause")
+        await moving
+        with pytest.raises(WrongState, match="SPMG"):
+            await put(made, "T:x", 1.0)
+        await put(made, "T:x.SPMG", 3)
+        await asyncio.sleep(2)
+
+        assert (await running.client.state("x")).moving is Moving.NO
+
+
+async def test_tweaks_homing_and_set_mode():
+    async with records() as (running, made):
+        await put(made, "T:x.TWV", 0.5)
+        await put(made, "T:x.TWF", 1)
+        await put(made, "T:x.TWR", 1)
+        await put(made, "T:x.TWR", 1)
+        assert made.variables["T:x.RBV"].value == pytest.approx(-0.5, abs=0.02)
+        with pytest.raises(ValueOutOfRange, match="HVEL"):
+            await put(made, "T:x.HOMF", 1)
+        await put(made, "T:x.HVEL", 1.0)
+        await put(made, "T:x.HOMF", 1)
+        await put(made, "T:x.SET", "Set")
+        await put(made, "T:x", 7.0)
+        await put(made, "T:x.SET", "Use")
+        await asyncio.sleep(0.5)
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(7, abs=0.02)
+        assert (await running.client.state("x")).moving is Moving.NO
+
+
+async def test_control_that_another_program_takes_ends_puts_until_it_is_free():
+    async with records() as (running, made):
+        taken = await running.client.ask(Acquire(client="ann", axes=("x",), force=True, lease_s=60))
+        async with asyncio.timeout(20):
+            while made.variables["T:x:control"].value == "epics gateway":
+                await asyncio.sleep(0.1)
+        with pytest.raises(LeaseRequired):
+            await put(made, "T:x", 1.0)
+        await put(made, "T:x.STOP", 1)
+
+        assert (await running.client.state("x")).stop_latched
+        assert taken.client == "ann"
+
+
+async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
+    async with records(moves=False) as (running, made):
+        running.daemon.end()
+        await shows(made, "T:x.SEVR", "INVALID")
+
+        assert made.variables["T:x.DMOV"].value == 0
+        assert made.variables["T:x.RBV"].severity == AlarmSeverity.INVALID_ALARM
+
+
+VALUES = (0, 1, 2, 3, -1, 1.5, -20.0, 1e9, "Go", "Set", "Enable", "Move", "1")
+
+
+@pytest.mark.parametrize("seed", range(2))
+async def test_no_puts_move_an_axis_of_a_read_only_gateway(seed: int):
+    rng = random.Random(seed)
+    async with records(moves=False) as (running, made):
+        before = await running.client.ask(ReadEvents(count=1))
+        names = sorted(made.variables)
+        for name in [*names, *(rng.choice(names) for _ in range(60))]:
+            assert made.variables[name].check_access("host", "user") == AccessRights.READ
+            with pytest.raises(Forbidden):
+                await put(made, name, rng.choice(VALUES))
+            with pytest.raises(PermissionError):
+                await made.variables[name].write(rng.choice(VALUES))
+        after = await running.client.ask(ReadEvents(count=1))
+
+    assert after.end_number == before.end_number  # no command has reached the daemon
+
+
+@pytest.mark.parametrize("seed", range(2))
+async def test_no_puts_move_an_axis_whose_lease_is_elsewhere(seed: int):
+    rng = random.Random(seed)
+    async with running_rig(two_axes()) as running:
+        for name in running.daemon.rig.axes:
+            await running.until(name, lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        async with rig.control("x", "y", client="ann") as (x, _):
+            await x.power(on=True)
+            async with gateway(rig, prefix="T:", moves=("x",)) as made:
+                await asyncio.sleep(0.5)
+                at = x.position.sample.counts
+                names = [name for name in sorted(made.variables) if not name.endswith(("STOP", "SPMG"))]
+                for name in [*names, *(rng.choice(names) for _ in range(60))]:
+                    with suppress(LdcndError, ValueError, TypeError, CaprotoError, Forbidden):
+                        await put(made, name, rng.choice(VALUES))
+                    assert (await running.client.state("x")).moving is not Moving.YES
+                await asyncio.sleep(0.5)
+
+                assert abs(x.position.sample.counts - at) <= 2
+                assert [holder.client for holder in (await rig.holders()).holders] == ["ann", "ann"]

@@ -1,0 +1,118 @@
+"""A RunEngine, a whole daemon and devices on one loop whose clock jumps: a scan takes as long as it computes."""
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from bluesky import RunEngine
+from event_model import DocumentNames, schema_validators
+
+from ldcnd.bluesky import Axis, Devices
+from ldcnd.client.loop_thread import LoopThread
+from ldcnd.client.rig import Rig
+from ldcnd.model.samples import LinkState
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from tests.support.rig import RunningRig, running_rig, two_axes
+
+TICK_S = 1.0
+MODELS = ("ls182ap", "ls182ap")
+COUNTS_PER_UNIT = {"x": 1000, "y": 1000}
+"""Of config/simulated.toml."""
+
+
+@dataclass  # an engine refers weakly to the method that takes them
+class Documents:
+    """What a RunEngine emits, each checked against event-model's own schema."""
+
+    taken: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+
+    def take(self, name: str, document: dict[str, Any]) -> None:
+        """Check and keep a document."""
+        schema_validators[DocumentNames[name]].validate(document)
+        self.taken.append((name, document))
+
+    def of(self, name: str) -> list[dict[str, Any]]:
+        """Return the documents of one kind, in their order."""
+        return [document for kind, document in self.taken if kind == name]
+
+    def data(self, key: str) -> list[Any]:
+        """Return the values of one key, in the order of the events that have it."""
+        return [event["data"][key] for event in self.of("event") if key in event["data"]]
+
+    @property
+    def exit_status(self) -> str:
+        """How the last run ended."""
+        status: str = self.of("stop")[-1]["exit_status"]
+        return status
+
+
+@dataclass(frozen=True, slots=True)
+class Laboratory:
+    """A RunEngine and a rig."""
+
+    engine: RunEngine
+    devices: Devices
+    running: RunningRig
+    loop: LoopThread
+    documents: Documents
+    chain: Chain
+
+    @contextmanager
+    def powered(self, *axes: str) -> Iterator[tuple[Axis, ...]]:
+        """Control some axes, with their position loops closed."""
+        with self.devices.control_all(*axes, client="scan") as held:
+            for axis in held:
+                axis.power(on=True).wait(20)
+            yield held
+
+    def truth(self, axis: str) -> float:
+        """Return where the simulated motor of an axis of the simulated rig is, in axis units."""
+        return self.module(axis).shaft.position_counts / COUNTS_PER_UNIT[axis]
+
+    def module(self, axis: str) -> SimulatedDrive:
+        """Return the simulated drive of an axis."""
+        module = self.chain.modules[list(COUNTS_PER_UNIT).index(axis)]
+        assert isinstance(module, SimulatedDrive)
+        return module
+
+    def unplug(self, axis: str) -> None:
+        """Switch a drive off."""
+
+        async def switch() -> None:
+            self.module(axis).power(on=False, at_s=asyncio.get_running_loop().time())
+
+        self.loop.run(switch())
+
+
+@contextmanager
+def laboratory() -> Iterator[Laboratory]:
+    """Run a daemon and a RunEngine until the context ends."""
+    loop = JumpingLoop()
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, MODELS))))
+
+    def tick() -> None:
+        loop.call_later(TICK_S, tick)
+
+    loop.call_soon(tick)
+    engine = RunEngine({}, loop=loop, context_managers=[])
+    documents = Documents()
+    engine.subscribe(documents.take)
+    there = LoopThread(loop)
+    try:
+        with there.inside(running_rig(two_axes(), {"line0": chain})) as running:
+
+            async def rig() -> Rig:
+                for name in running.daemon.rig.axes:
+                    await running.until(name, lambda state: state.link is LinkState.UP)
+                return Rig(running.client, await running.client.daemon())
+
+            yield Laboratory(engine, Devices(there.run(rig()), there), running, there, documents, chain)
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        engine._th.join()
+        loop.close()
