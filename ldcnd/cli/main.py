@@ -33,6 +33,7 @@ COMMANDS = {
     "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),
     "plot": ("ldcnd.cli.plot", "Draw an axis of a recording."),
     "epics": ("ldcnd.cli.epics", "Serve axes as EPICS motor records."),
+    "ros2": ("ldcnd.cli.ros2", "Publish joint states and diagnostics to a ROS 2 graph."),
     "foxglove": ("ldcnd.cli.foxglove", "Show a running rig live in Foxglove, read-only."),
     "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
     "trace": ("ldcnd.cli.trace", "Record an axis against time, look at the result, draw it."),

@@ -124,9 +124,18 @@ class MemorySession(Session):
         self._name = f"session {id(self)}"
         self._closed = False
 
-    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+    def publish(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        encoding: str,
+        qos: Qos,
+        measured_at_ns: int | None = None,
+        attachment: bytes | None = None,
+    ) -> None:
         """Offer the sample to every subscription that matches; quality of service makes no difference here."""
-        del qos
+        del qos, attachment
         if self._closed:
             raise SessionError("the session is closed")
         subscriptions = self._broker.subscriptions

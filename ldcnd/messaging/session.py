@@ -240,7 +240,16 @@ class Session(ABC):
     """
 
     @abstractmethod
-    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+    def publish(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        encoding: str,
+        qos: Qos,
+        measured_at_ns: int | None = None,
+        attachment: bytes | None = None,
+    ) -> None:
         """Publish a value without waiting; what the network cannot take is dropped.
 
         Args:
@@ -249,6 +258,7 @@ class Session(ABC):
             encoding: of the payload.
             qos: how it travels; one for all values of a key keeps them in order.
             measured_at_ns: when the value was true, UTC in ns since 1970; the time of sending when missing.
+            attachment: what accompanies it, for other systems that need that.
         """
 
     @abstractmethod

@@ -142,16 +142,27 @@ class ZenohSession(Session):
         self._stamps = Stamps(session.new_timestamp().get_id())
         self._closed = False
 
-    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+    def publish(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        encoding: str,
+        qos: Qos,
+        measured_at_ns: int | None = None,
+        attachment: bytes | None = None,
+    ) -> None:
         """Publish; cheaper once the key's publisher is declared, which happens in the background."""
         self._must_be_open()
         timestamp = self._stamps.of(measured_at_ns)
         outlet = self._outlets.get(key) or self._new_outlet(key, qos)
         try:
             if outlet.publisher and outlet.qos is qos:
-                outlet.publisher.put(payload, encoding=encoding, timestamp=timestamp)
+                outlet.publisher.put(payload, encoding=encoding, timestamp=timestamp, attachment=attachment)
             else:
-                self._session.put(key, payload, encoding=encoding, timestamp=timestamp, **TRAVEL[qos])
+                self._session.put(
+                    key, payload, encoding=encoding, timestamp=timestamp, attachment=attachment, **TRAVEL[qos]
+                )
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot publish: {error}") from error
 

@@ -11,6 +11,7 @@ from tests.support.pages import ROOT, Block, blocks_of, command_lines, pages, re
 
 FIRST_RIG = "docs/tutorials/first-rig.md"
 MONITOR = "docs/how-to/monitor-a-rig.md"
+EPICS = "docs/how-to/use-epics.md"
 NEXT = (
     "docs/tutorials/move-from-python.md",
     "docs/tutorials/take-a-trace.md",
@@ -33,6 +34,15 @@ NOT_RUN = {
         "test_make_run_says_what_to_type_and_the_first_program_moves"
     ),
     ("README.md", "# first.py"): "test_make_run_says_what_to_type_and_the_first_program_moves",
+    (EPICS, "ldcnd epics --prefix lab:"): "test_libca_sees_a_record_that_it_cannot_write",
+    (EPICS, "ldcnd epics x y --prefix lab: --moves"): "test_an_unmodified_client_uses_the_record",
+    ("docs/how-to/use-ros-2.md", "ldcnd ros2 x y --router tcp/127.0.0.1:7448 --domain 0"): (
+        "test_a_plain_zenoh_client_sees_node_publishers_and_joint_states"
+    ),
+    ("docs/how-to/use-bluesky.md", "from bluesky import RunEngine"): "test_the_page_on_bluesky_runs",
+    ("docs/how-to/run-in-a-container.md", "docker build -f deploy/container/Dockerfile -t ldcnd ."): (
+        "needs an engine and fetches packages; tests/unit/test_deploy_container.py reads the files"
+    ),
     ("README.md", ".venv/bin/ldcnd axis list"): "test_the_tour_of_the_readme_runs",
     ("README.md", ".venv/bin/python examples/move_and_watch.py"): (
         "test_the_example_follows_a_moving_axis_to_its_target"

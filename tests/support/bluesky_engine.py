@@ -101,7 +101,7 @@ def laboratory() -> Iterator[Laboratory]:
     loop.call_soon(tick)
     engine = RunEngine({}, loop=loop, context_managers=[])
     documents = Documents()
-    engine.subscribe(documents.take)
+    engine.subscribe(documents.take)  # type: ignore[no-untyped-call]
     there = LoopThread(loop)
     try:
         with there.inside(running_rig(two_axes(), {"line0": chain})) as running:

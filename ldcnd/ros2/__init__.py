@@ -1,0 +1,1 @@
+"""Axes as ROS 2 joints: joint states and diagnostics for nodes that use rmw_zenoh, without ROS."""

@@ -1,0 +1,178 @@
+"""Scans of 200 points that something ends in the middle, and the page on Bluesky, typed as it stands."""
+
+import asyncio
+import contextlib
+import os
+import re
+import sys
+import threading
+import time
+
+import bluesky.plans as bp
+import pytest
+from bluesky import RunEngine
+from bluesky.utils import FailedStatus
+
+import ldcnd.bluesky
+from ldcnd.model.samples import LinkState, Moving, PositionSample, TelemetryItem
+from tests.support.bluesky_engine import Documents, Laboratory, laboratory
+from tests.support.process import ROOT, START_TIME_S, answering, client, daemon, free_port, process, simulated_terminal
+
+pytestmark = [pytest.mark.edges, pytest.mark.timeout(600)]
+
+IN_POSITION = 0.02
+POINTS = 200
+MIDDLE = 100
+
+
+def scan_until(lab: Laboratory, x, trouble) -> list[float]:
+    """Scan 200 points, with trouble during the move to the one in the middle; returns where the motor was each time."""
+    truth: list[float] = []
+    beginning = threading.Event()
+
+    def at_each(_, document):
+        truth.append(lab.truth("x"))
+        if document["seq_num"] == MIDDLE:
+            beginning.set()
+
+    async def while_moving():
+        await lab.running.until("x", lambda state: state.moving is Moving.YES)
+        await trouble()
+
+    def begin(_, document):
+        if document["seq_num"] == MIDDLE:
+            lab.loop.start(while_moving())
+
+    tokens = [lab.engine.subscribe(at_each, "event"), lab.engine.subscribe(begin, "event")]
+    try:
+        with contextlib.suppress(FailedStatus):
+            lab.engine(bp.scan([], x, 0, 19.9, POINTS))
+    finally:
+        for token in tokens:
+            lab.engine.unsubscribe(token)
+    return truth
+
+
+async def nothing() -> None:
+    """Let the scan be."""
+
+
+def test_two_hundred_points_are_where_the_motor_was():
+    with laboratory() as lab, lab.powered("x") as (x,):
+        truth = scan_until(lab, x, nothing)
+
+        assert lab.documents.exit_status == "success"
+        assert len(lab.documents.data("x")) == POINTS
+        assert lab.documents.data("x") == pytest.approx(truth, abs=IN_POSITION)
+        assert lab.documents.data("x") == pytest.approx([0.1 * at for at in range(POINTS)], abs=IN_POSITION)
+
+
+def test_a_stop_in_the_middle_fails_the_run_with_the_axis_at_rest():
+    with laboratory() as lab, lab.powered("x") as (x,):
+        truth = scan_until(lab, x, lab.running.client.stop)
+        state = lab.loop.run(lab.running.client.state("x"))
+
+        assert lab.documents.exit_status == "fail"
+        assert len(lab.documents.data("x")) == MIDDLE
+        assert lab.documents.data("x") == pytest.approx(truth, abs=IN_POSITION)
+        assert (state.stop_latched, state.moving) == (True, Moving.NO)
+        assert lab.module("x").shaft.velocity_counts == pytest.approx(0, abs=1e-6)
+
+
+def test_a_move_that_is_refused_fails_the_run_with_the_axis_at_rest():
+    with laboratory() as lab, lab.powered("x") as (x,):
+        with pytest.raises(FailedStatus):
+            lab.engine(bp.scan([], x, 90, 109.9, POINTS))
+        state = lab.loop.run(lab.running.client.state("x"))
+
+        assert lab.documents.exit_status == "fail"
+        assert len(lab.documents.data("x")) == 101  # up to the limit
+        assert state.moving is Moving.NO
+
+
+def test_a_drive_that_loses_its_power_fails_the_run():
+    async def unplug():
+        lab.module("x").power(on=False, at_s=asyncio.get_running_loop().time())
+
+    with contextlib.suppress(ldcnd.LdcndError), laboratory() as lab, lab.powered("x") as (x,):
+        scan_until(lab, x, unplug)
+
+        assert lab.documents.exit_status == "fail"
+        assert len(lab.documents.data("x")) == MIDDLE
+
+
+@pytest.mark.real_time
+async def test_a_killed_daemon_fails_the_run_and_the_drive_ends_its_move(tmp_path):
+    link, config = tmp_path / "line0", tmp_path / "adopt.toml"
+    simulated = (ROOT / "config" / "simulated.toml").read_text()
+    simulated = simulated[: simulated.index("[[sim]]")].replace('"sim:line0"', f'"{link}"')
+    config.write_text(simulated.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'))
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def run(kill) -> tuple[Documents, float]:
+        documents = Documents()
+        engine = RunEngine({}, context_managers=[])
+        engine.subscribe(documents.take)
+        began_s = 0.0
+
+        def at_each(_, document):
+            nonlocal began_s
+            if document["seq_num"] == 10:
+                began_s = time.monotonic()
+                kill()
+
+        engine.subscribe(at_each, "event")
+        with contextlib.suppress(ldcnd.LdcndError), ldcnd.bluesky.connect(endpoint) as rig:
+            with rig.control("x", client="scan") as x:
+                x.power(on=True).wait(20)
+                with pytest.raises(FailedStatus):
+                    engine(bp.scan([], x, 0, 199, POINTS))
+        return documents, time.monotonic() - began_s
+
+    async with simulated_terminal(link, "ls182ap", "ls182ap", "picservo-v4", "picservo-v4"):
+        async with process("run", "--config", str(config), "--listen", endpoint) as running:
+            await answering(running, endpoint)
+            documents, took_s = await asyncio.to_thread(run, running.kill)
+            await running.wait()
+        async with (
+            process("run", "--config", str(config), "--listen", endpoint) as again,
+            client_of(again, endpoint) as rig,
+        ):
+            async with asyncio.timeout(START_TIME_S):
+                while (
+                    (state := await rig.state("x")) is None
+                    or state.link is not LinkState.UP
+                    or state.moving is not Moving.NO
+                ):
+                    await asyncio.sleep(0.2)
+            async with rig.samples("x", TelemetryItem.POSITION) as positions, asyncio.timeout(5):
+                _, position = await anext(positions)
+
+    assert documents.exit_status == "fail"
+    assert 10 <= len(documents.data("x")) <= 12
+    assert took_s < 40
+    assert isinstance(position, PositionSample)
+    assert 8_000 < position.counts < 13_000  # where the last move led, not beyond
+
+
+@contextlib.asynccontextmanager
+async def client_of(running, endpoint):
+    await answering(running, endpoint)
+    async with client(endpoint) as rig:
+        yield rig
+
+
+@pytest.mark.real_time
+async def test_the_page_on_bluesky_runs():
+    (program,) = re.findall(r"(?ms)^```python\n(.*?)^```", (ROOT / "docs" / "how-to" / "use-bluesky.md").read_text())
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        typed = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", program, stdout=-1, env={**os.environ, "LDCND_CONNECT": endpoint}
+        )
+        printed, _ = await typed.communicate()
+
+    text = printed.decode()
+    assert typed.returncode == 0, text
+    assert text.count("\nstop") == 4, text
+    assert "x_trace_position" in text
+    assert "event_page" in text

@@ -1,0 +1,100 @@
+"""ROS 2 messages byte by byte, as two other CDR libraries write them (`make test-edges` asks these), and what they say."""
+
+import pytest
+from zenoh.ext import Int64, z_serialize
+
+from ldcnd.client.rig import Rig
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.model.samples import LinkState
+from ldcnd.ros2.bridge import Bridge
+from ldcnd.ros2.cdr import JOINT_STATE
+from ldcnd.ros2.graph import Node, advertise, attachment_of
+from tests.support.rig import running_rig, two_axes
+from tests.support.ros2_messages import DIAGNOSTICS, JOINTS
+
+BYTES = (
+    "0001000000f1536515cd5b070100000000000000010000000200000078000000010000009a9999999999893f0100000000000000000000000000e0"
+    "bf00000000",
+    "000100000000000000000000010000000000000000000000000000000000000000000000",
+    "000100000500000001000000010000000000000004000000020000006100000003000000626300000400000064656600050000006768696a000000"
+    "000400000000000000000000000000f03f0000000000000040000000000000084000000000000010400000000000000000",
+    "0001000000f153650000000001000000000000000100000007000000cea96d6567610000010000000000000095d626e80b2e11be01000000000000"
+    "000000000065cdcd4100000000",
+    "0001000000f1536515cd5b07010000000000000001000000000000000700000073696d3a207800000b0000007374616e647374696c6c0000080000"
+    "006c696e65302f310000000000",
+    "000100000000000007000000010000000000000000000000",
+    "0001000000f1536500000000010000000000000002000000020000000700000073696d3a207900000b0000006572726f725f73746f700000080000"
+    "006c696e65302f3200020000000f000000706f736974696f6e5f6572726f7200000f0000006c65667420746865206c696d69740000020000006b00"
+    "0000010000000003000001000000000000000100000000000000010000000000000000000000",
+)
+
+
+@pytest.mark.parametrize(("message", "expected"), zip((*JOINTS, *DIAGNOSTICS), BYTES, strict=True))
+def test_messages_are_those_of_other_libraries_byte_by_byte(message, expected):
+    assert message.payload.hex() == expected
+
+
+def test_attachments_are_what_zenoh_s_own_serializer_writes():
+    gid = bytes(range(16))
+    theirs = b"".join(
+        z_serialize(each).to_bytes()
+        for each in ("sequence_number", Int64(7), "source_timestamp", Int64(123_456_789), "source_gid", gid)
+    )
+
+    assert attachment_of(7, 123_456_789, gid) == theirs
+
+
+def test_keys_and_tokens_are_those_of_the_design_document():
+    node = Node(2, "ldcnd_sim", "8b20917502ee955ac4476e0266340d5c")
+
+    assert node.token == "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/0/NN/%/%/ldcnd_sim"
+    assert node.publisher_token(1, "/joint_states", JOINT_STATE) == (
+        "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/1/MP/%/%/ldcnd_sim/%joint_states/"
+        "sensor_msgs::msg::dds_::JointState_/"
+        "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e/::,10:,:,:,,"
+    )
+    assert node.topic_key("/joint_states", JOINT_STATE).startswith(
+        "2/joint_states/sensor_msgs::msg::dds_::JointState_/"
+    )
+
+
+async def test_a_publisher_is_seen_while_it_is_declared():
+    seen, published = [], []
+    broker = MemoryBroker()
+    async with broker.session() as session:
+        watching = await session.watch_tokens("@ros2_lv/0/**", lambda key, alive: seen.append((key, alive)))
+        node = Node(0, "n", "0" * 31 + "1")
+        listening = await session.subscribe(
+            node.topic_key("/joint_states", JOINT_STATE), lambda sample: published.append(sample.payload)
+        )
+        publisher, token = await advertise(session, node, 1, "/joint_states", JOINT_STATE)
+        publisher.publish(JOINTS[0].payload, JOINTS[0].t)
+        await token.close()
+        await listening.close()
+        await watching.close()
+
+    assert [alive for _, alive in seen] == [True, False]
+    assert published == [JOINTS[0].payload]
+
+
+async def test_joint_states_are_in_metres_with_the_time_of_the_drive():
+    async with running_rig(two_axes()) as running:
+        await running.until("x", lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        bridge = Bridge("sim", {info.axis: info for info in await rig.describe()})
+        made = []
+        async with rig.samples("x") as samples:
+            async for axis, sample in samples:
+                if message := bridge.take(axis, sample):
+                    made.append((sample, message))
+                if len(made) == 3:
+                    break
+        report = bridge.diagnostics(made[-1][1].t)
+        later = bridge.diagnostics(made[-1][1].t + 10**10)
+
+    assert bridge.joints == {"x", "y"}
+    for sample, message in made:
+        assert (message.t, message.names) == (sample.t, ("x",))
+        assert message.positions[0] == pytest.approx(sample.value * 1e-3)
+    assert {status.name: status.level for status in report.statuses}["sim: x"] == 0
+    assert {status.level for status in later.statuses} == {3}
