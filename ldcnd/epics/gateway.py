@@ -136,14 +136,19 @@ async def gateway(
         raise UnknownAxis(
             f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(known)}", axis=unknown[0], value=unknown[0]
         )
-    async with asyncio.TaskGroup() as group:
-        made = Gateway(rig, group)
-        for name in axes or known:
-            made.add(known[name], await _defaults(rig, name), prefix, moves=name in moves)
-        try:
-            yield made
-        finally:
-            made.end()
+    try:
+        async with asyncio.TaskGroup() as group:
+            made = Gateway(rig, group)
+            for name in axes or known:
+                made.add(known[name], await _defaults(rig, name), prefix, moves=name in moves)
+            try:
+                yield made
+            finally:
+                made.end()
+    except BaseExceptionGroup as errors:
+        if len(errors.exceptions) > 1:
+            raise
+        raise errors.exceptions[0] from None
 
 
 async def serve(variables: dict[str, Field], address: ListenAddress) -> None:

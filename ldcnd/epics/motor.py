@@ -6,6 +6,7 @@ jogs. Limit switches are not published by the daemon, so HLS and LLS are always 
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from contextlib import suppress
 
 from caproto import AlarmSeverity, AlarmStatus
 
@@ -31,6 +32,8 @@ from ldcnd.model.samples import (
 
 NO_LIMIT = 1e30
 """Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
+REST_S = 10.0
+"""Longest wait for the standstill after a motion that was ended early, in seconds."""
 SILENT = Alarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
 QUALITIES = {
     Quality.GOOD: NO_ALARM,
@@ -72,6 +75,7 @@ class MotorRecord:
         self._stopping = False
         self._synchronised = False
         self._moving = Moving.UNKNOWN
+        self._changed = asyncio.Event()
         self._alarm = SILENT
         velocity, acceleration = defaults
         self._highest_velocity = info.limits.velocity or NO_LIMIT
@@ -203,25 +207,26 @@ class MotorRecord:
                     self._synchronised = True
                     await self._val.show(sample.value)
             case VelocitySample():
-                await self._show_extra("velocity", sample.value, alarm, at_s)
+                await self._show_beside("velocity", sample.value, alarm, at_s)
                 if sample.value:
                     await self["TDIR"].show(int(sample.value > 0))
             case AdcSample():
-                await self._show_extra("adc", sample.volts, alarm, at_s)
+                await self._show_beside("adc", sample.volts, alarm, at_s)
             case FaultSample():
-                await self._show_extra("faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
-                await self._show_extra("first_fault", sample.first.code if sample.first else "")
+                await self._show_beside("faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
+                await self._show_beside("first_fault", sample.first.code if sample.first else "")
             case StateSample():
                 await self._take_state(sample)
             case MonitorSample():
-                await self._show_extra(item, sample.value, alarm, at_s)
+                await self._show_beside(item, sample.value, alarm, at_s)
                 if item == "input_signals":
-                    await self._show_extra(
+                    await self._show_beside(
                         "inputs", ", ".join(sample.active if sample.active is not None else sample.high)
                     )
 
     async def _take_state(self, sample: StateSample) -> None:
         self._moving = sample.moving
+        self._changed.set()
         if sample.link is LinkState.DOWN or sample.moving is Moving.UNKNOWN:
             self._alarm = SILENT
         elif sample.state is AxisState.ERROR_STOP:
@@ -230,7 +235,7 @@ class MotorRecord:
             self._alarm = Alarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
         else:
             self._alarm = NO_ALARM
-        await self._show_extra("state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
+        await self._show_beside("state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
         await self["CNEN"].show("Enable" if sample.enabled else "Disable")
         await self["MSTA"].show(
             (MSTA_DONE if sample.moving is Moving.NO else MSTA_MOVING)
@@ -258,11 +263,11 @@ class MotorRecord:
     async def controlled(self, axis: Axis | None, holder: str) -> None:
         """Take or lose control of the axis."""
         self._axis = axis
-        await self._show_extra("control", holder)
+        await self._show_beside("control", holder)
 
-    async def _show_extra(self, name: str, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+    async def _show_beside(self, name: str, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
         field = self.beside(name)
-        if field:
+        if field is not None:  # an empty one is false
             await field.show(value, alarm, at_s)
 
     # -- puts --------------------------------------------------------------------------------------------------------
@@ -274,9 +279,9 @@ class MotorRecord:
             try:
                 put = await action(asked)
             except (LdcndError, ValueError) as error:
-                await self._show_extra("message", str(error))
+                await self._show_beside("message", str(error))
                 raise
-            await self._show_extra("message", "")
+            await self._show_beside("message", "")
             return put
 
         return explained
@@ -373,15 +378,25 @@ class MotorRecord:
         try:
             await motion.done()
         except CommandAborted as error:
-            if not self._stopping and self._pending == 1:  # neither halted nor sent elsewhere over this record
-                await self._show_extra("message", str(error))
-                raise
+            if self._pending == 1:  # not sent elsewhere: it comes to rest
+                await self._rest()
+                if not self._stopping:
+                    await self._show_beside("message", str(error))
+                    raise
         except LdcndError as error:
-            await self._show_extra("message", str(error))
+            await self._show_beside("message", str(error))
             raise
         finally:
             self._pending -= 1
             await self.show_motion()
+
+    async def _rest(self) -> None:
+        """Wait until the axis stands, but not for ever: DMOV says when it does."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(REST_S):
+                while self._moving is not Moving.NO:
+                    self._changed.clear()
+                    await self._changed.wait()
 
     async def _halt(self) -> None:
         """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""
@@ -396,7 +411,7 @@ class MotorRecord:
         if self._axis is None:
             held = self.beside("control")
             raise LeaseRequired(
-                f"axis {self.info.axis} is not controlled by this gateway: {held.value if held else ''}",
+                f"axis {self.info.axis} is not controlled by this gateway: {held.value if held is not None else ''}",
                 axis=self.info.axis,
             )
         return self._axis

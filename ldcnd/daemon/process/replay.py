@@ -58,9 +58,18 @@ class OverheardSession(MemorySession):
         self._take = take
 
     @override
-    def publish(self, key: str, payload: bytes, *, encoding: str, qos: Qos, measured_at_ns: int | None = None) -> None:
+    def publish(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        encoding: str,
+        qos: Qos,
+        measured_at_ns: int | None = None,
+        attachment: bytes | None = None,
+    ) -> None:
         self._take(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
-        super().publish(key, payload, encoding=encoding, qos=qos, measured_at_ns=measured_at_ns)
+        super().publish(key, payload, encoding=encoding, qos=qos, measured_at_ns=measured_at_ns, attachment=attachment)
 
 
 @asynccontextmanager
