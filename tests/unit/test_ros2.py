@@ -39,7 +39,7 @@ BYTES = (
 )
 
 
-@pytest.mark.parametrize(("message", "expected"), zip((*JOINTS, *DIAGNOSTICS), BYTES, strict=True))
+@pytest.mark.parametrize(("message", "expected"), list(zip((*JOINTS, *DIAGNOSTICS), BYTES, strict=True)))
 def test_messages_are_those_of_other_libraries_byte_by_byte(message, expected):
     assert message.payload.hex() == expected
 
