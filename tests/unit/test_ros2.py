@@ -1,5 +1,7 @@
 """ROS 2 messages byte by byte, as two other CDR libraries write them (see `make test-edges`), and what they say."""
 
+import asyncio
+
 import pytest
 from zenoh.ext import Int64, z_serialize
 
@@ -79,7 +81,9 @@ async def test_a_publisher_is_seen_while_it_is_declared():
         )
         publisher, token = await advertise(session, node, 1, "/joint_states", JOINT_STATE)
         publisher.publish(JOINTS[0].payload, JOINTS[0].t)
+        await asyncio.sleep(0.1)
         await token.close()
+        await asyncio.sleep(0.1)
         await listening.close()
         await watching.close()
 
@@ -97,7 +101,7 @@ async def test_joint_states_are_in_metres_with_the_time_of_the_drive():
             async for axis, sample in samples:
                 if message := bridge.take(axis, sample):
                     made.append((sample, message))
-                if len(made) == 3:
+                if len(made) == 10:  # half a second
                     break
         report = bridge.diagnostics(made[-1][1].t)
         later = bridge.diagnostics(made[-1][1].t + 10**10)
