@@ -25,7 +25,7 @@ def caget(record: str) -> None:
     assert epics.caget(f"{record}.DMOV") == 1
     epics.caput(record, 1000.0, wait=True, timeout=5)
     assert abs(epics.caget(f"{record}.RBV") - 2.0) < 0.02
-    assert "limit" in epics.caget(f"{record}:message", as_string=True)
+    assert "100" in epics.caget(f"{record}:message", as_string=True)
     assert len(seen) > 3
     epics.camonitor_clear(f"{record}.RBV")
 
@@ -111,9 +111,9 @@ def caproto_tools(record: str) -> None:
     def run(tool: str, *arguments: str) -> str:
         return subprocess.run([tools / tool, *arguments], check=True, capture_output=True, text=True, timeout=30).stdout
 
-    assert "motor" in run("caproto-get", f"{record}.RTYP")
-    run("caproto-put", "--notify", "--timeout", "20", record, "1.5")
-    assert "1.5" in run("caproto-get", f"{record}.VAL")
+    assert "motor" in run("caproto-get", "--no-repeater", f"{record}.RTYP")
+    run("caproto-put", "--no-repeater", "--notify", "--timeout", "20", record, "1.5")
+    assert "1.5" in run("caproto-get", "--no-repeater", f"{record}.VAL")
 
 
 CLIENTS = {client.__name__: client for client in (caget, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools)}

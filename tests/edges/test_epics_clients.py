@@ -54,7 +54,12 @@ import epics
 pv = epics.PV("T:x")
 pv.wait_for_connection(10)
 assert (pv.read_access, pv.write_access) == (True, False), pv
-assert epics.caput("T:x", 5.0, wait=True, timeout=3) != 1
+try:
+    epics.caput("T:x", 5.0, wait=True, timeout=3)
+except epics.ca.CASeverityException as refused:
+    assert "denied" in str(refused)
+else:
+    raise AssertionError("a put to a read-only record was taken")
 """
     async with gateway() as (endpoint, environment):
         written = await asyncio.create_subprocess_exec(sys.executable, "-c", program, env=environment)
