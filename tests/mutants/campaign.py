@@ -152,7 +152,7 @@ class Campaign:
         if is_early or not self._is_replaceable(mutant, code):
             return _judged_freshly(mutant, tests)
         tests = self._affordable(tests)
-        while (run := self._run(tests, mutant, code)).failed:
+        while tests and (run := self._run(tests, mutant, code)).failed:
             alone = run if run.hung or run.failed == tests[0] else self._run([run.failed], mutant, code)
             if alone.failed and self._is_sound(run.failed):
                 return Verdict.TIMED_OUT if alone.hung else Verdict.KILLED, run.failed

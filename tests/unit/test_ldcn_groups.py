@@ -1,5 +1,7 @@
 """Group starts and stops on drives of which some do not do as they are told; exchanges go straight into the chain."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from ldcnd.drivers.driver import AxisSpec, Gains, Motion, StopMode
@@ -25,6 +27,7 @@ class Addressing:
 
     def __init__(self, host: SimulatedHost) -> None:
         self.host = host
+        self.rate = SimpleNamespace(spaced=b"".join, cycle_s=0.000512)
         self.regrouped: list[int] = []
         self.succeeds = True
 

@@ -152,7 +152,6 @@ class HomeSequence(Procedure):
             guards.check_position(view, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
         off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
-        self.turn.still_wanted()  # a stop that came meanwhile has disarmed nothing yet
         finds = search.find_velocity is not None and search.runs_onto_switch(motion.scale)
         await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
         return motion.reply(self.turn).model_copy(
@@ -252,7 +251,6 @@ class HomeSequence(Procedure):
         closed = search.stop is not StopMode.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:
             await turn.permit.power_on()
-            turn.still_wanted()
         tracker.switched(on=closed, now_s=motion.clock.now_s())
         motion.telemetry.origin_counts = captured - motion.scale.to_counts(search.position)
         tracker.referenced = True
