@@ -67,6 +67,16 @@ NOT_RUN = {
     ("docs/how-to/choose-an-adapter.md", "ldcnd doctor ldcn --config rig.toml --bus line0"): (
         "test_command_prints_findings_as_json_lines"
     ),
+    ("docs/how-to/probe-and-inputs.md", "ldcnd bus snapshot line0"): (
+        "test_a_snapshot_tells_the_position_of_a_moving_axis_within_its_bound"
+    ),
+    (
+        "docs/how-to/probe-and-inputs.md",
+        "ldcnd axis probe x --source forward_limit --distance 25 --velocity 1 --wait",
+    ): "test_a_switch_is_latched_within_its_bound_and_the_reference_stays",
+    ("docs/how-to/probe-and-inputs.md", "ldcnd bus set-io cabinet 4=high 9=low --pwm1 0.5"): (
+        "test_inputs_and_analog_inputs_are_published"
+    ),
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",
     ("docs/how-to/secure-a-rig.md", "ldcnd axis move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (

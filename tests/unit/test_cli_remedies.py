@@ -14,7 +14,15 @@ from tests.support.pages import require_command_line
 
 SOURCES = Path(ldcnd.__file__).parent
 PRESSED = SOURCES / "console" / "static" / "parts" / "remedies.js"
-PLACEHOLDERS = {"AXIS": "x", "POSITION": "1", "KP": "1", "EL": "1", "COUNTER": "feedback", "COMMAND": "true"}
+PLACEHOLDERS = {
+    "AXIS": "x",
+    "POSITION": "1",
+    "DISTANCE": "1",
+    "KP": "1",
+    "EL": "1",
+    "COUNTER": "feedback",
+    "COMMAND": "true",
+}
 
 
 def texts():

@@ -421,7 +421,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
             raise WrongState(
                 f"axis {self.spec.name}: the target is beyond the drive's 32-bit counter",
                 axis=self.spec.name,
-                remedy="send halt first: at standstill the counter is set back",
+                remedy=Remedy("{} first: at standstill the counter is set back", step("halt")),
             )
         away = abs(target_counts - self.state.offset_counts - before)
         if away > LARGEST_COUNT:
@@ -605,7 +605,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
                 axis=self.spec.name,
                 value=position_counts,
                 limit=LARGEST_COUNT,
-                remedy="send move_relative by a small distance: it sets the counter back",
+                remedy=Remedy("{}, a small distance: it sets the counter back", step("move_relative")),
             )
         exchange = commands.stop_motor(self._node, control, counter)
         self.state.loaded(absolute=False, opens_loop=False)

@@ -4,6 +4,7 @@ const PRESSED = {
   power: "press Enable",
   home: "home the axis",
   set_position: "set its current position",
+  move_relative: "move it by a distance",
   reset: "press Reset",
   halt: "press Halt",
   set_gains: "write gains, at least kp and el",
