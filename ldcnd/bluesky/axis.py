@@ -389,7 +389,8 @@ class Axis(ReadableAxis):
         if not self._under_way:
             return
         self._stopped = success
-        await (await self._axis.halt()).done()
+        with suppress(CommandAborted):  # by the halt of a motion that was on its way meanwhile
+            await (await self._axis.halt()).done()
         await self._rest()
 
     async def _rest(self) -> None:

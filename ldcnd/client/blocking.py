@@ -143,6 +143,9 @@ class Rig(Facade[rig.Rig]):
     holders = _waiting(rig.Rig.holders)
     outcome = _waiting(rig.Rig.outcome)
     latest = _waiting(rig.Rig.latest)
+    snapshot = _waiting(rig.Rig.snapshot)
+    set_io = _waiting(rig.Rig.set_io)
+    set_io_timer = _waiting(rig.Rig.set_io_timer)
 
     @property
     def name(self) -> str:

@@ -257,6 +257,17 @@ def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):
     assert isinstance(unmeant[0], CommandAborted)
 
 
+def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        status = x.set(40)
+        lab.loop.run(x.stop(success=True))
+        ended = status.exception(20)
+
+        assert ended is None
+        assert stands(lab, "x")
+        assert lab.truth("x") < 30
+
+
 def test_a_stop_of_a_standing_axis_sends_nothing(lab: Laboratory):
     with lab.powered("x") as (x,):
         before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
