@@ -12,6 +12,7 @@ from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.axis.state import STOP_UNCONFIRMED
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.driver import StopMode
+from ldcnd.drivers.ldcn.packet import Command, PacketReader
 from ldcnd.drivers.line import AdoptFallback, StartPolicy
 from ldcnd.errors import BusDown, StopLatched, WrongState
 from ldcnd.messaging.memory_session import MemoryBroker
@@ -98,19 +99,20 @@ async def test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_r
         await unplugged(rig, chain)
         await rig.client.stop("x")
         await asyncio.sleep(1.0)
-        packets = []
-        drive = chain.modules[0]
-        execute = drive.execute
+        sent: list[bytes] = []
+        write = chain.write
 
-        def noted(packet):
-            packets.append(type(packet).__name__)
-            execute(packet)
+        def noted(now_s: float, data: bytes) -> None:
+            sent.append(data)
+            write(now_s, data)
 
-        drive.execute = noted
+        chain.write = noted
         chain.replug()
         await rig.until("x", lambda state: not state.stop_pending)
 
-        assert packets[0] == "StopMotor", packets[:5]
+    reader = PacketReader()
+    first = next(received.packet for value in b"".join(sent) if (received := reader.feed(value)))
+    assert (first.address, first.command) == (1, Command.STOP_MOTOR)
 
 
 async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
