@@ -238,7 +238,7 @@ async def test_a_stop_reaches_drives_of_a_line_that_cannot_be_brought_up():
     async with starting(chain, start=StartPolicy.ADOPT, axis=wrong, adopt_fallback=AdoptFallback.REFUSE) as rig:
         await asyncio.sleep(2.0)
         await rig.client.stop("x")
-        await asyncio.sleep(2.5)
+        await asyncio.sleep(1.0)
         assert await stands(chain)
 
 

@@ -153,7 +153,7 @@ LDCN_REVERTS = (
     # -- a latched position
     Revert(
         "ldcnd/daemon/axis/procedures/probe.py",
-        "        self._error_counts = speed * motion.driver.capture_s + 1\n",
+        "        self._error_counts = speed * homing(motion.driver).capture_s + 1\n",
         "        self._error_counts = 0\n",
         (PROBE + "test_a_switch_is_latched_within_its_bound_and_the_reference_stays",),
     ),

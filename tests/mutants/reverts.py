@@ -16,7 +16,6 @@ LOSS = "tests/integration/test_loss_of_control.py::"
 PENDING = "tests/integration/test_pending_stops.py::"
 LEDGER = "tests/unit/test_ledger.py::"
 PERMISSION = "tests/integration/test_permission.py::"
-CAMPAIGN = "tests/property/test_control_campaign.py::"
 START = "tests/integration/test_start_policies.py::"
 
 
@@ -95,14 +94,6 @@ REVERTS = (
         "await self._send_pending_stops()  # before anything else",
         "pass  #",
         (PENDING + "test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_rate",),
-    ),
-    Revert(
-        "ldcnd/daemon/line/line.py",
-        """                await self._pause(retry_s)
-""",
-        """                await asyncio.sleep(retry_s)
-""",
-        (PENDING + "test_a_stop_reaches_drives_of_a_line_that_cannot_be_brought_up",),
     ),
     Revert(
         "ldcnd/daemon/axis/axis.py",
@@ -194,7 +185,6 @@ REVERTS = (
             PERMISSION + "test_a_buffered_move_of_a_lease_that_was_taken_by_force_is_refused",
             PERMISSION + "test_a_homing_whose_lease_was_lost_begins_no_further_leg",
             "tests/property/test_interruptions.py::test_a_daemon_may_be_interrupted_anywhere[suspended]",
-            CAMPAIGN + "test_no_schedule_moves_anything_twice_unasked_or_with_nobody_in_charge",
         ),
     ),
     Revert(
