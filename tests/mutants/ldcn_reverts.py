@@ -78,7 +78,6 @@ LDCN_REVERTS = (
         "    if False:\n",
         (
             HOMING + "test_a_search_that_the_index_pulse_can_slip_through_is_refused_with_the_nearest_velocity",
-            HOMING + "test_at_the_nearest_velocity_no_index_pulse_is_missed",
             PROBE + "test_what_cannot_be_latched_is_refused",
         ),
     ),
