@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 
 ROOT = "ldcnd"
-FOR_DEVELOPERS = frozenset({"docs", "test"})
+FOR_DEVELOPERS = frozenset({"docs", "edges", "test"})
 REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)\s*(?:\[(?P<extras>[^]]*)\])?")
 EXTRA_MARKER = re.compile(r"extra\s*==\s*['\"]([\w.-]+)['\"]")
 CLASSIFIED = "License :: OSI Approved :: "
