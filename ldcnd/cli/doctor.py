@@ -18,7 +18,9 @@ from ldcnd.families.opened import show_findings
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
 
-FILES = ConfigFiles(lambda file: load_config(file).bus, set_for_axis)
+FILES = ConfigFiles(
+    lambda file: load_config(file).bus, lambda file, settings: chain_of(settings, load_config(file).sim), set_for_axis
+)
 
 
 class Examinations(click.Group):

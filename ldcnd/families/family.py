@@ -185,10 +185,12 @@ class ConfigFiles:
 
     Attributes:
         lines: reads one and returns its lines.
+        chain: builds the simulated line that a line of a file is; None for a real one.
         set_for_axis: sets values of an axis: the file, the axis, tables by name with their keys and literals.
     """
 
     lines: Callable[[Path], Sequence[BusConfig]]
+    chain: Callable[[Path, BusConfig], Chain | None]
     set_for_axis: Callable[[Path, str, Mapping[str, Mapping[str, str]]], None]
 
 

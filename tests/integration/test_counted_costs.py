@@ -33,7 +33,7 @@ class Bound:
     bytecodes: float = 0.0
 
 
-POLL = Bound(calls=130, turns=3.5, bytecodes=3650)
+POLL = Bound(calls=92, turns=3.5, bytecodes=3650)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
 COMMAND = Bound(calls=1540, turns=78)
 """A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;

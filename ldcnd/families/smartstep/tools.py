@@ -27,6 +27,7 @@ from ldcnd.families.smartstep.config import SmartStepBusConfig, SmartStepTraceCo
 from ldcnd.families.smartstep.family import open_smartstep_line
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
+from ldcnd.sim.chain import Chain
 from ldcnd.transport.port_url import port_opener
 from ldcnd.transport.transport import Opener
 
@@ -87,7 +88,14 @@ def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
     def trigger_bits(config: Path, name: str, axis: str, *, write: bool) -> None:
         """Find the trigger bits of a SmartStep by trying words; asks to turn the shaft and to press RESET."""
         settings = _line_of(files.lines(config), config, name, axis)
-        found = asyncio.run(_with_drive(settings, axis, lambda _bus, unit: find_trigger_map(unit.words, _act)))
+        found = asyncio.run(
+            _with_drive(
+                settings,
+                axis,
+                lambda _bus, unit: find_trigger_map(unit.words, _act),
+                lambda: files.chain(config, settings),
+            )
+        )
         table = {key: f"0x{getattr(found, key):04X}" for key in TriggerMap.__slots__}
         click.echo("\n".join(f"{key} = {literal}" for key, literal in table.items()))
         if write:
@@ -110,7 +118,8 @@ def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
                 state = "open" if each.setting is None else "verified"
                 click.echo(f"{each.key:22} {state:8} {each.text}")
 
-        asyncio.run(_with_drive(_line_of(files.lines(config), config, name, axis), axis, work))
+        settings = _line_of(files.lines(config), config, name, axis)
+        asyncio.run(_with_drive(settings, axis, work, lambda: files.chain(config, settings)))
         if write:
             files.set_for_axis(config, axis, verified_tables(found))
             click.echo(f"written to {config}")
@@ -144,7 +153,10 @@ def _line_of(lines: Sequence[BusConfig], config: Path, name: str, axis: str) -> 
 
 
 async def _with_drive(
-    settings: SmartStepBusConfig, axis: str, work: Callable[[Bus, SmartStepAxis], Awaitable[ResultT]]
+    settings: SmartStepBusConfig,
+    axis: str,
+    work: Callable[[Bus, SmartStepAxis], Awaitable[ResultT]],
+    chain: Callable[[], Chain | None],
 ) -> ResultT:
     """Open the line of a SmartStep, do something with the drive, and close it.
 
@@ -152,7 +164,7 @@ async def _with_drive(
         BusDown: the port does not open.
     """
     configure_logging(level="error")
-    line = open_smartstep_line(settings)
+    line = open_smartstep_line(settings, chain=chain())
     line.bus.resync = line.network.resync
     unit = line.network.axes[axis]
     if not isinstance(unit, SmartStepAxis):
