@@ -532,7 +532,12 @@ async def test_a_start_with_an_unknown_outcome_is_left_to_the_readings():
 
 async def test_a_start_that_was_not_taken_ends_the_command_at_once():
     async with axis_bench() as bench:
-        bench.drive.during["start"] = raising(LOST)
+
+        async def lost() -> None:
+            await asyncio.sleep(0.01)
+            raise LOST
+
+        bench.drive.during["start"] = lost
         with contextlib.suppress(ReplyTimeout):
             await bench.send(THERE, "first")
 
