@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from ldcnd.drivers.smartstep.profiles import Framing
-from ldcnd.families.smartstep.config import SimulatedUnitConfig
+from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.smartstep.cable import simulated_units, smartstep_chain
+from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.guest.machine import Adapter, Bench, booted_guest, far_end, why_no_guest
 from tests.guest.rigs import FAST, STEPS, USB
 from tests.support.package import package, why_no_package
