@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from unittest import mock
 
 from ldcnd.client.traces import take_trace
 from ldcnd.config.axis import AxisConfig, RatesConfig
@@ -9,6 +10,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, Function
 from ldcnd.drivers.smartstep.trace_data import chunk_plan
+from ldcnd.families.smartstep import family
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.smartstep.unit import CHARACTER_S
 from ldcnd.sim.smartstep.variant import SimulatedVariant
@@ -52,7 +54,10 @@ def share_of_limit(string_bytes: int, *, polled: bool = False) -> float:
         await take_trace(rig.client, "feed", TRACE, within_s=300)
         return limit_s(string_bytes) / _uploading_s(rig)
 
-    return on_jumping_clock(_config(string_bytes, polled=polled), work)
+    # an idle line reads no alarm history either
+    history_hz = family.ALARM_HISTORY_HZ if polled else 0.0
+    with mock.patch.object(family, "ALARM_HISTORY_HZ", history_hz):
+        return on_jumping_clock(_config(string_bytes, polled=polled), work)
 
 
 def limit_s(string_bytes: int) -> float:

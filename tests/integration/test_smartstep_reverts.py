@@ -209,7 +209,7 @@ REVERTS = (
         22,
         "unit/test_cli_params.py::test_two_files_are_compared_however_their_parameters_are_spelt",
         "ldcnd/cli/parameter_file.py",
-        "return {_label(name): value for",
+        "return {FAMILY.parameter(name, value)[0]: value for",
         "return {name: value for",
     ),
     revert(

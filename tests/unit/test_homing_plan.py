@@ -5,7 +5,7 @@ from pydantic import ValidationError
 
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.procedures.home import plan_search
-from ldcnd.drivers.driver import StopMode
+from ldcnd.drivers.driver import Homes, StopMode
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.model.commands import Home, HomeMethod
@@ -20,11 +20,17 @@ PRESET = {
 }
 
 
-class _Drive:
+class _Drive(Homes):
     """All that planning asks of a driver."""
 
     home_methods = frozenset({HomeMethod.INDEX, HomeMethod.REVERSE_LIMIT})
     capture_s = 0.000512
+
+    async def captured_home(self):
+        raise NotImplementedError
+
+    def stands_on(self, limit, reading):
+        raise NotImplementedError
 
 
 def axis(**more):

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from ldcnd.drivers.driver import AxisReading, Fault, ReadingListeners
+from ldcnd.drivers.driver import AxisReading, Fault, Homes, Moves, ReadingListeners, TakesGains, Tracks
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import reference
@@ -13,7 +13,7 @@ from ldcnd.drivers.smartstep.packet import add_parity, decode_command
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.drivers.smartstep.poller import Basic, Listeners, UnitPoller
 from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, Wiring
-from ldcnd.errors import NetworkMismatch, NotSupported, WrongState
+from ldcnd.errors import NetworkMismatch, WrongState
 from ldcnd.exchange import Timing
 from ldcnd.model.samples import MonitorName, TelemetryItem
 from ldcnd.sim.smartstep.variant import SimulatedVariant
@@ -234,20 +234,18 @@ async def test_polling_for_long_leaves_nothing_behind_in_the_queue():
     async with smartstep_line([simulated(1)]) as line:
         heard.listen(line, "u1")
         await asyncio.sleep(300.0)
-        polls = line.bus._queue._polls
+        polls = line.bus._queue.polls
         kept = len(polls._later) + len(polls._turns) + len(polls._due)
 
     assert len(heard.readings) > 800
     assert kept < 50
 
 
-async def test_motion_is_refused_whatever_it_is():
+async def test_a_smartstep_is_no_drive_that_moves_homes_or_has_gains():
     async with smartstep_line([simulated(1)]) as line:
         axis = line.axis("u1")
 
-        for refused in (axis.power(on=True), axis.start(), axis.reset(), axis.captured_home()):
-            with pytest.raises(NotSupported, match="over its line"):
-                await refused
+        assert not isinstance(axis, Moves | Homes | Tracks | TakesGains)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 20.0], ids=["at once", "late"])
