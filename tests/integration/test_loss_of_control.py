@@ -8,11 +8,16 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.daemon.command.loss import LeaseWatch
+from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, StopLatched
 from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.rig_commands import Acquire, LeaseReply, Rehearsal, Rehearse
 from ldcnd.model.samples import AxisState, Moving
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.chain_rig import drive
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 BOTH = ("x", "y")
@@ -175,3 +180,33 @@ async def test_a_client_that_freezes_in_mid_motion_has_its_axis_do_what_the_poli
 
     assert (last.state, last.enabled, last.moving) == (state, enabled, Moving.NO)
     assert position.value == pytest.approx(target, abs=0.05) if target else 4.0 < position.value < 7.0
+
+
+@pytest.mark.parametrize("part", ["health", "leases", "liveliness"])
+async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(monkeypatch, part):
+    broken = asyncio.Event()
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
+
+    async def fails(*_: object) -> None:
+        await broken.wait()
+        raise ZeroDivisionError
+
+    for owner, method in {
+        "health": [(HealthWatch, "run")],
+        "leases": [(LeaseWatch, "run")],
+        "liveliness": [(Daemon, "_watch_axes")],
+    }[part]:
+        monkeypatch.setattr(owner, method, fails)
+
+    with pytest.raises(ExceptionGroup):  # noqa: PT012 - the daemon's, with the error that ended it
+        async with running_rig(load_config(SIMULATED), {"line0": chain}) as rig:
+            await rig.until("x", lambda state: state.link == "up")
+            await rig.client.command("x", Power(on=True))
+            await rig.client.command("x", MoveVelocity(velocity=5.0))
+            await asyncio.sleep(0.5)
+            broken.set()
+            await asyncio.sleep(3.0)  # the daemon is gone by then
+    await asyncio.sleep(1.0)  # a drive decelerates by itself
+
+    assert drive(chain, 1).loop.trajectory.at_rest
+    assert drive(chain, 1).loop.servo_on

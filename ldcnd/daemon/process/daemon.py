@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+from collections.abc import Coroutine
 from functools import partial
+from typing import Any
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
@@ -67,6 +69,7 @@ class Daemon:
         self._run = Run(instance, clock.now_ns(), clock)
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
+        self._failure: Exception | None = None
         self.captures = _capture_watch(self, self._run)
         self._declarations: list[Declaration] = []
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load)
@@ -136,27 +139,39 @@ class Daemon:
             try:
                 await self._declare_stops(declared, requests)
                 serving += [
-                    group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses
+                    group.create_task(self._guarded(bus.run()), name=f"line {bus.bus.settings.name}")
+                    for bus in self.rig.buses
                 ]
                 await self._declare(declared, requests)
-                serving.append(group.create_task(self._watch_axes(), name="liveliness"))
-                serving.append(group.create_task(leases.run(), name="leases"))
-                serving.append(group.create_task(self._health.run(), name="health"))
+                serving.append(group.create_task(self._guarded(self._watch_axes()), name="liveliness"))
+                serving.append(group.create_task(self._guarded(leases.run()), name="leases"))
+                serving.append(group.create_task(self._guarded(self._health.run()), name="health"))
                 if self._heartbeat:
-                    serving.append(group.create_task(self._heartbeat.run(), name="heartbeat"))
+                    serving.append(group.create_task(self._guarded(self._heartbeat.run()), name="heartbeat"))
                 if self.captures:
-                    serving.append(group.create_task(self.captures.run(), name="captures"))
+                    serving.append(group.create_task(self._guarded(self.captures.run()), name="captures"))
                 self._serving.set()
                 log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
                 await self._ending.wait()
                 requests.close()
                 await self._come_to_rest()
+                if self._failure:
+                    raise self._failure
             finally:
                 for task in serving:
                     task.cancel()
                 for name in (*self.rig.axes, *self.rig.modules):
                     self._publisher.withdraw(name)
         log.info("ended", rig=self.rig.name)
+
+    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do part of the daemon's work; if it fails, end in order, so that axes come to rest, and fail only then."""
+        try:
+            await work
+        except Exception as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
+            log.error("internal error, the daemon ends", reason=repr(error))
+            self._failure = error
+            self._ending.set()
 
     async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
         stops = self._stops
