@@ -14,7 +14,7 @@ from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
 from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, UnknownAxis, WrongState
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.rig_commands import Acquire
-from ldcnd.model.samples import Moving
+from ldcnd.model.samples import AxisState, Moving
 from tests.support.bluesky_engine import Laboratory, laboratory
 
 IN_POSITION = 0.02
@@ -219,6 +219,7 @@ def test_a_stop_from_elsewhere_ends_the_run_as_failed(lab: Laboratory):
         latched = lab.loop.run(lab.running.client.state("x")).stop_latched
         assert stands(lab, "x")
         x.reset().wait(20)
+        lab.loop.run(lab.running.until("y", lambda state: state.state is not AxisState.STOPPING))
         with lab.devices.control("y", client="scan") as y:
             y.reset().wait(20)
 

@@ -43,9 +43,8 @@ async def test_last_values_and_descriptions_are_readable_by_anyone():
             }
 
             keys = {key.removeprefix("ldcn/sim/tele/") for key in telemetry}
-            assert keys == {
-                f"{axis}/{item}" for axis in "xyzc" for item in ("position", "velocity", "adc", "fault", "state")
-            }
+            items = ("position", "velocity", "adc", "inputs", "fault", "state")
+            assert keys == {f"{axis}/{item}" for axis in "xyzc" for item in items}
             for key, sample in telemetry.items():
                 assert str(sample.encoding) == "application/json"
                 value = json.loads(sample.payload.to_string())
@@ -138,7 +137,7 @@ async def test_a_json_rig_is_readable_by_tools_that_print_what_they_get(tmp_path
         assert key.startswith("ldcn/sim/tele/")
         assert json.loads(value)["t"] > 0
     assert encodings == {"application/json"}
-    assert len(asked) == 5
+    assert len(asked) == 6
     assert all(json.loads(value)["quality"] for value in asked)
     assert sum("/axis/" in key for key in shown) == 4
 
