@@ -103,9 +103,10 @@ static void status(struct line *l, int items)
 {
     l->reply_bytes = 0;
     put(l, 0x69, 1); /* move done, power on, no diagnostic */
-    if (items & 0x01) put(l, (int)l->exchange_count, 4);
+    /* a shaft that stands and is not quite still: what a daemon would not believe it would ask again */
+    if (items & 0x01) put(l, (int)(l->exchange_count / 8 & 0x3), 4);
     if (items & 0x02) put(l, (int)(l->exchange_count & 0xFF), device == 90 ? 2 : 1);
-    if (items & 0x04) put(l, (int)(l->exchange_count & 0x7), 2);
+    if (items & 0x04) put(l, 0, 2);
     if (items & 0x08) put(l, 0, 1);
     if (items & 0x10) put(l, 0, 4);
     if (items & 0x20) { put(l, device, 1); put(l, version, 1); }
