@@ -127,7 +127,7 @@ async def test_declarations_and_queries_take_no_threads_of_their_own(pair: Pair)
         for _ in range(50):
             group.create_task(pair.client.query(KEYS.command("x", "halt")), name="ask")
 
-    assert own_threads() == before
+    assert own_threads() <= before
 
 
 @pytest.mark.parametrize("timeout_s", [0.0, -1.0])

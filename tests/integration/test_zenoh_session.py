@@ -122,9 +122,9 @@ def flood(session: Session) -> None:
         session.publish(POSITION, bytes(4096), encoding=JSON, qos=Qos.TELEMETRY)
 
 
-def own_threads() -> set[str]:
+def own_threads() -> set[threading.Thread]:
     # those that Zenoh's runtime called back on stay known to Python as dummies
-    return {thread.name for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
+    return {thread for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
 
 
 async def test_a_frozen_client_holds_up_neither_publishing_nor_stops_nor_closing(pair: Pair, endpoint: str) -> None:
@@ -287,7 +287,8 @@ async def test_a_session_leaves_no_thread_behind(endpoint: str) -> None:
         return own_threads() <= before
 
     await until(gone)
-    assert during > before
+    # threads of an earlier session may end meanwhile
+    assert during - before
 
 
 async def test_the_interpreter_exits_when_the_program_fails_inside_a_session(endpoint: str) -> None:
