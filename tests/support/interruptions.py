@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, TypeVar
 
+from pydantic import BaseModel
 from typing_extensions import override
 
 from ldcnd.sim.jumping_loop import JumpingLoop
@@ -138,9 +139,17 @@ def in_new_loop(scenario: Callable[[], Awaitable[ResultT]], now_s: float) -> Res
         return runner.run(run())
 
 
+def _build_models(base: type[BaseModel]) -> None:
+    """Build the validators that pydantic defers, lest each copy build them for itself."""
+    for model in base.__subclasses__():
+        model.model_rebuild()
+        _build_models(model)
+
+
 def run_with_copies(scenario: Callable[[], Awaitable[None]], chosen: Chosen = lambda _: False) -> Interruptions:
     """Run a scenario on a loop that is copied; return what came of the copies."""
     origin = os.getpid()
+    _build_models(BaseModel)
     loop = CopiedLoop(chosen)
 
     async def run() -> None:
