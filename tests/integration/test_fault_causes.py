@@ -5,11 +5,22 @@ import asyncio
 import pytest
 
 from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.errors import NotReferenced, WrongState
+from ldcnd.errors import DriveFault, NotReferenced, WrongState
 from ldcnd.model.commands import MoveAbsolute, Power, Reset, SetPosition, Stop
 from ldcnd.model.samples import AxisState, LinkState, Moving
 from ldcnd.sim.ldcn.power import Condition
-from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
+from tests.support.dialect_rig import (
+    AXIS,
+    DIALECTS,
+    GAINS,
+    LS_173AP,
+    LS_182AP,
+    SC,
+    V4,
+    DialectRig,
+    adopting_rig,
+    dialect_rig,
+)
 
 FAR = MoveAbsolute(position=18.0, velocity=10.0)
 LATCHED = {
@@ -117,6 +128,46 @@ async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(co
 
         await later.send(Reset())
         assert await codes_later(later) == []
+
+
+async def stopped_after(rig: DialectRig, condition: Condition) -> None:
+    """Trip a drive and stop it: with its power driver off it hides a cause that is over, and holds it all the same."""
+    await trip(rig, condition)
+    await rig.until(lambda state: state.moving is Moving.NO)
+    await rig.send(Stop())
+
+
+@pytest.mark.parametrize(
+    ("dialect", "condition"),
+    [(LS_182AP, condition) for condition in LATCHED] + [(each, Condition.STALLED) for each in DIALECTS],
+    ids=lambda each: each.name.lower(),
+)
+async def test_one_reset_is_enough_for_a_tripped_drive_that_was_stopped_and_taken_over(dialect, condition):
+    async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
+        await stopped_after(rig, condition)
+
+    async with adopting_rig(dialect, rig) as later:
+        await later.until(lambda state: state.link is LinkState.UP)
+        await later.send(Stop())
+        await later.send(Reset())
+
+        await later.send(Power(on=True))
+
+        assert (await later.rig.client.state(AXIS)).enabled
+
+
+@pytest.mark.parametrize("dialect", [LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_power_clears_no_fault_that_a_drive_hides_when_it_is_taken_over(dialect):
+    async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
+        await stopped_after(rig, Condition.STALLED)
+
+    async with adopting_rig(dialect, rig) as later:
+        await later.until(lambda state: state.state is AxisState.DISABLED)
+
+        with pytest.raises(DriveFault, match="did not close its loop"):
+            await later.send(Power(on=True))
+
+        assert "position_error" in await codes_later(later)
 
 
 async def test_nothing_is_said_of_a_drive_that_is_taken_over_switched_off():

@@ -47,6 +47,12 @@ LDCN_REVERTS = (
         "self.code not in WARNINGS",
         (CAUSES + "test_motor_power_that_is_off_while_the_axis_is_disabled_stops_nothing",),
     ),
+    Revert(
+        "ldcnd/daemon/axis/commands.py",
+        "        if stopped or not tracker.energised:\n",
+        "        if stopped:\n",
+        (CAUSES + "test_one_reset_is_enough_for_a_tripped_drive_that_was_stopped_and_taken_over",),
+    ),
     # -- bounds, rest and resets
     Revert(
         "ldcnd/daemon/axis/procedures/analog.py",

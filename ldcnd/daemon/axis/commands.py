@@ -245,7 +245,11 @@ class AxisCommands:
         return self._motion.reply(turn)
 
     async def _reset(self, turn: Turn) -> CommandReply:
-        """Recover from what has stopped the motor; mere warnings are cleared with the loop as it is."""
+        """Recover from what has stopped the motor; mere warnings are cleared with a closed loop as it is.
+
+        A drive whose loop is open may hold a cause that it does not show: a Logosol drive hides a position error while
+        its power driver is off, and a host that took it over has not seen what came before.
+        """
         tracker = self._tracker
         view = tracker.view()
         guards.check_reachable(view)
@@ -258,7 +262,8 @@ class AxisCommands:
                 value=tracker.moving.value,
                 remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
             )
-        if tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults):
+        stopped = tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults)
+        if stopped or not tracker.energised:
             await self._driver.reset()
             self._drop_procedure()
             tracker.switched(on=False, now_s=self._motion.clock.now_s())
