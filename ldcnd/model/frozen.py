@@ -5,10 +5,10 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from pydantic import GetJsonSchemaHandler
     from pydantic.json_schema import JsonSchemaValue
     from pydantic_core import CoreSchema
-
-FieldsT = ParamSpec("FieldsT")
-ModelT = TypeVar("ModelT", bound="Frozen")
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -42,26 +39,6 @@ class Frozen(BaseModel):
             if name in said:
                 described["description"] = said[name]
         return schema
-
-
-def unchecked(model: Callable[FieldsT, ModelT]) -> Callable[FieldsT, ModelT]:
-    """Return what makes a model as its constructor does, without looking at the values.
-
-    For what is made so often that it shows, of values that are what the fields say. Every field has to be given, by
-    name, also one that has a default.
-    """
-    kind, put = cast("type[ModelT]", model), object.__setattr__
-    given = set(kind.model_fields)
-
-    def make(*_: FieldsT.args, **fields: FieldsT.kwargs) -> ModelT:
-        made = kind.__new__(kind)
-        put(made, "__dict__", fields)
-        put(made, "__pydantic_fields_set__", given)
-        put(made, "__pydantic_extra__", None)
-        put(made, "__pydantic_private__", None)
-        return made
-
-    return make
 
 
 def build_models(model: type[Frozen] = Frozen) -> None:

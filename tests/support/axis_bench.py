@@ -218,8 +218,12 @@ class AxisBench:
         self.ended.append((command.command_id, status, reason))
 
     def published(self, item: TelemetryItem) -> Sample | None:
-        """Return the last sample of an item."""
-        return self._publisher.last.get(KEYS.telemetry(self.axis.config.name, item))
+        """Return the last sample of an item; its fields are those of its model, in their order."""
+        sample = self._publisher.last.get(KEYS.telemetry(self.axis.config.name, item))
+        if sample is None:
+            return None
+        assert list(vars(sample)) == list(type(sample).model_fields)
+        return type(sample).model_validate(vars(sample), strict=True)
 
     def show(self, **changes: Any) -> None:
         """Let the axis see what the drive reads from now on."""

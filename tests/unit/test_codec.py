@@ -13,13 +13,14 @@ from ldcnd.errors import ErrorCode, LdcndError, MalformedRequest, PayloadTooLarg
 from ldcnd.messaging.codec import (
     MAX_PAYLOAD_BYTES,
     MAX_RECEIVED_BYTES,
-    Encoder,
     Encoding,
     decode,
     decode_error,
     decode_received,
     encode,
+    encoding_name,
     error_reply,
+    packer,
     rebuild_error,
     reply_encoding,
     to_json,
@@ -35,6 +36,7 @@ from ldcnd.model.samples import (
     FaultSample,
     LinkState,
     Moving,
+    PositionSample,
     Quality,
     StateSample,
 )
@@ -62,15 +64,18 @@ def test_a_sample_survives_either_encoding(encoding: Encoding) -> None:
 
 
 @pytest.mark.parametrize("encoding", list(Encoding))
-def test_an_encoder_says_the_same_as_encode_also_after_something_that_it_refused(encoding: Encoding) -> None:
-    encoder = Encoder(encoding)
+def test_a_packer_says_the_same_as_encode_also_after_something_that_it_refused(encoding: Encoding) -> None:
+    pack = packer(encoding)
     unreadable = STATE.model_copy(update={"command": object()})
 
     with pytest.raises(pydantic_core.PydanticSerializationError):
-        encoder.encode(unreadable)
+        pack(vars(unreadable))
 
-    for sample in (STATE, STATE.model_copy(update={"seq": 4, "last_error": "it did not"})):
-        assert encoder.encode(sample) == encode(sample, encoding)
+    nowhere = PositionSample(
+        t=1, t_error_ns=0, seq=0, quality=Quality.BAD, value=0.0, unit="mm", counts=0, following_error=None
+    ).model_copy(update={"value": math.inf, "following_error": math.nan})
+    for sample in (STATE, STATE.model_copy(update={"seq": 4, "last_error": "it did not"}), nowhere):
+        assert (pack(vars(sample)), encoding_name(type(sample), encoding)) == encode(sample, encoding)
 
 
 def test_encodings_are_named_as_stock_tools_expect() -> None:

@@ -7,7 +7,7 @@ from ldcnd.errors import MalformedRequest
 from ldcnd.exchange import Condition, Timing, only_while
 from ldcnd.log import get_logger
 from ldcnd.model.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
-from ldcnd.model.samples import IoSample, Quality, TelemetryItem
+from ldcnd.model.samples import Quality, TelemetryItem
 
 FULL_SCALE_V = 5.0
 FULL_SCALE_COUNTS = 255
@@ -64,18 +64,15 @@ class ModuleService:
         self._misses = 0
         t, t_error_ns = self._clock.stamp(timing)
         self._topic.publish(
-            IoSample(
-                t=t,
-                t_error_ns=t_error_ns,
-                seq=self._topic.seq,
-                quality=Quality.GOOD,
-                levels=reading.levels,
-                outputs=reading.outputs,
-                adc=reading.adc,
-                volts=tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
-                counter=reading.counter,
-                pwm=reading.pwm,
-            )
+            t,
+            t_error_ns,
+            Quality.GOOD,
+            levels=reading.levels,
+            outputs=reading.outputs,
+            adc=reading.adc,
+            volts=tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
+            counter=reading.counter,
+            pwm=reading.pwm,
         )
 
     def _lost(self) -> None:

@@ -1,11 +1,16 @@
 """Samples on their way out: numbers them, keeps the last of each, hands them to the session without waiting."""
 
-from ldcnd.messaging.codec import Encoder, Encoding
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from typing_extensions import override
+
+from ldcnd.messaging.codec import Encoding, encode, encoding_name, packer
 from ldcnd.messaging.keys import EVENT, Keys
 from ldcnd.messaging.session import Qos, Session
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.samples import MonitorName, Quality, Sample, TelemetryItem
+from ldcnd.model.samples import SAMPLE_MODELS, MonitorName, MonitorSample, Quality, Sample, TelemetryItem
 from ldcnd.model.traces import TraceChunk, TraceHeader
 
 QOS = {
@@ -20,35 +25,86 @@ QOS = {
 }
 
 
+Values = dict[str, Any]  # of any type: they are what the fields of some model hold
+"""The fields of a sample by name, in the order of its model; they are checked where they come off the wire."""
+
+
 class Topic:
     """One key's samples on their way out; made by `Publisher`.
 
     Attributes:
         seq: number of the next sample.
+        values: what was published last; None before.
     """
 
-    __slots__ = ("_key", "_publisher", "_qos", "seq")
+    __slots__ = ("_encoding", "_key", "_model", "_publisher", "_qos", "_sample", "seq", "values")
 
-    def __init__(self, publisher: "Publisher", key: str, qos: Qos) -> None:
+    def __init__(self, publisher: "Publisher", key: str, model: type[Sample], qos: Qos) -> None:
         self.seq = 0
+        self.values: Values | None = None
+        self._sample: Sample | None = None
         self._publisher = publisher
         self._key = key
+        self._model = model
+        self._encoding = encoding_name(model, publisher.encoding)
         self._qos = qos
 
-    def publish(self, sample: Sample) -> None:
-        """Publish a sample that has the number `seq`, and keep it as the last one of its key."""
+    def publish(self, t: int, t_error_ns: int, quality: Quality, **fields: object) -> None:
+        """Publish a sample of `t`, UTC in ns since 1970: the fields of its own in the order of its model.
+
+        No model is built: five samples of each poll pass here.
+        """
+        values = {"t": t, "t_error_ns": t_error_ns, "seq": self.seq, "quality": quality, **fields}
         self.seq += 1
-        key, publisher = self._key, self._publisher
+        self.values, self._sample = values, None
+        publisher = self._publisher
         publisher.published += 1
-        publisher.last[key] = sample
-        payload, encoding = publisher.encoder.encode(sample)
-        publisher.session.publish(key, payload, encoding=encoding, qos=self._qos, measured_at_ns=sample.t)
+        publisher.send(self._key, publisher.pack(values), encoding=self._encoding, qos=self._qos, measured_at_ns=t)
+
+    def publish_sample(self, sample: Sample) -> None:
+        """Publish a sample, with the next number."""
+        own = {name: value for name, value in vars(sample).items() if name not in Sample.model_fields}
+        self.publish(sample.t, sample.t_error_ns, sample.quality, **own)
 
     def publish_again(self, quality: Quality) -> None:
-        """Publish the last sample with what it is worth now; it keeps the instant at which it was true."""
-        last = self._publisher.last.get(self._key)
+        """Publish the last sample with the quality of now; it keeps the instant at which it was true."""
+        last = self.sample
         if last and last.quality is not quality:
-            self.publish(last.model_copy(update={"seq": self.seq, "quality": quality}))
+            self.publish_sample(last.model_copy(update={"quality": quality}))
+
+    def forget(self) -> bool:
+        """Keep no last sample any more; return whether there was one."""
+        had, self.values, self._sample = self.values is not None, None, None
+        return had
+
+    @property
+    def sample(self) -> Sample | None:
+        """The last sample; made when it is asked for."""
+        if self._sample is None and self.values is not None:
+            self._sample = self._model.model_construct(set(self.values), **self.values)
+        return self._sample
+
+
+class LastSamples(Mapping[str, Sample]):
+    """The newest sample of each key."""
+
+    def __init__(self, topics: Mapping[str, Topic]) -> None:
+        self._topics = topics
+
+    @override
+    def __getitem__(self, key: str) -> Sample:
+        sample = self._topics[key].sample
+        if sample is None:
+            raise KeyError(key)
+        return sample
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return (key for key, topic in self._topics.items() if topic.values is not None)
+
+    @override
+    def __len__(self) -> int:
+        return sum(topic.values is not None for topic in self._topics.values())
 
 
 class Publisher:
@@ -58,36 +114,40 @@ class Publisher:
         last: the newest sample of each key.
         published: samples and events handed to the network so far.
         session: the network.
-        encoder: how payloads are encoded.
+        encoding: of payloads.
+        send: hands a payload to the network.
+        pack: encodes the fields of a sample.
     """
 
     def __init__(self, session: Session, keys: Keys, encoding: Encoding) -> None:
-        self.last: dict[str, Sample] = {}
         self.published = 0
         self.session = session
-        self.encoder = Encoder(encoding)
+        self.encoding = encoding
+        self.send = session.publish
+        self.pack = packer(encoding)
         self._keys = keys
         self._topics: dict[str, Topic] = {}
+        self.last = LastSamples(self._topics)
 
     def item(self, axis: str, item: TelemetryItem) -> Topic:
         """Return the topic of one item of an axis."""
-        return self._topic(self._keys.telemetry(axis, item), QOS[item])
+        return self._topic(self._keys.telemetry(axis, item), SAMPLE_MODELS[item], QOS[item])
 
     def monitor(self, axis: str, name: MonitorName) -> Topic:
         """Return the topic of one monitor of a drive."""
-        return self._topic(self._keys.monitor(axis, name), Qos.TELEMETRY)
+        return self._topic(self._keys.monitor(axis, name), MonitorSample, Qos.TELEMETRY)
 
     def publish_event(self, event: CommandEvent) -> None:
         """Publish an event; events are history, not values, so no last one is kept here."""
         self.published += 1
-        payload, encoding = self.encoder.encode(event)
+        payload, encoding = encode(event, self.encoding)
         self.session.publish(
             self._keys.telemetry(event.axis, EVENT), payload, encoding=encoding, qos=Qos.EVENT, measured_at_ns=event.t
         )
 
     def publish_report(self, key: str, report: Frozen, t: int) -> None:
         """Publish how something is doing, as of `t`, UTC in ns since 1970."""
-        payload, encoding = self.encoder.encode(report)
+        payload, encoding = encode(report, self.encoding)
         self.session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY, measured_at_ns=t)
 
     def withdraw_report(self, key: str) -> None:
@@ -96,20 +156,18 @@ class Publisher:
 
     def publish_trace(self, axis: str, header: TraceHeader) -> None:
         """Publish how far a trace is."""
-        topic = self._topic(self._keys.trace(axis), Qos.BULK)
-        topic.publish(header.model_copy(update={"seq": topic.seq}))
+        self._topic(self._keys.trace(axis), TraceHeader, Qos.BULK).publish_sample(header)
 
     def publish_trace_chunk(self, axis: str, index: int, chunk: TraceChunk) -> None:
         """Publish samples of the last trace."""
-        topic = self._topic(self._keys.trace_chunk(axis, index), Qos.BULK)
-        topic.publish(chunk.model_copy(update={"seq": topic.seq}))
+        self._topic(self._keys.trace_chunk(axis, index), TraceChunk, Qos.BULK).publish_sample(chunk)
 
     def withdraw_trace_chunks(self, axis: str) -> None:
         """Take the samples of the last trace off the network."""
         below = f"{self._keys.trace(axis)}/"
-        for key in [key for key in self.last if key.startswith(below)]:
-            del self.last[key]
-            self.session.delete(key)
+        for key, topic in self._topics.items():
+            if key.startswith(below) and topic.forget():
+                self.session.delete(key)
 
     def withdraw(self, axis: str) -> None:
         """Take an axis off the network: its last values must not look alive."""
@@ -118,11 +176,11 @@ class Publisher:
         keys.append(self._keys.trace(axis))
         self.withdraw_trace_chunks(axis)
         for key in keys:
-            if self.last.pop(key, None):
+            if (topic := self._topics.get(key)) and topic.forget():
                 self.session.delete(key)
 
-    def _topic(self, key: str, qos: Qos) -> Topic:
+    def _topic(self, key: str, model: type[Sample], qos: Qos) -> Topic:
         topic = self._topics.get(key)
         if topic is None:
-            topic = self._topics[key] = Topic(self, key, qos)
+            topic = self._topics[key] = Topic(self, key, model, qos)
         return topic
