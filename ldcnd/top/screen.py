@@ -110,6 +110,8 @@ class TopScreen(App[None]):
         answer.add_class("said")
 
     def _redraw(self) -> None:
+        if not self.is_running:
+            return  # the timer outlives the widgets while the screen closes
         glance = self._view.glance(asyncio.get_running_loop().time())
         urgent = glance.trouble or glance.count(Severity.WRONG)
         self.query_one("#headline", Static).update(Text(headline(glance), STYLES[Severity.WRONG] if urgent else ""))

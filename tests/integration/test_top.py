@@ -47,6 +47,7 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
             await until(pilot, lambda: "a stop is latched" in axes.get_row_at(0)[-1].plain)
             await pilot.press("r")
             await until(pilot, lambda: ": reset" in str(answer.content))
+        screen._redraw()  # as a timer does that expires while the screen closes
         states_after = [await rig.state(axis) for axis in "xyzc"]
         printed, _ = await printing.communicate()
 
