@@ -64,6 +64,25 @@ async def test_a_line_at_work_is_busy_and_its_axes_get_the_rates_they_asked_for(
             assert axis.sample_age_s < 2 / axis.rate_wanted_hz
 
 
+async def test_no_report_names_a_rate_that_nothing_was_sampled_for_yet():
+    async with running_rig() as rig:
+        reports = []
+        await rig.session.subscribe(KEYS.bus_health("line0"), reports.append)
+        await asyncio.sleep(3.0)
+
+    sampled = [
+        axis
+        for report in reports
+        if report.kind is SampleKind.PUT
+        for axis in decode_received(BusHealth, report.payload, report.encoding).axes
+        if axis.sample_age_s is not None
+    ]
+    assert len(sampled) >= 8
+    for axis in sampled:
+        assert axis.rate_hz == pytest.approx(axis.rate_wanted_hz, rel=0.1)
+        assert {item.item for item in axis.items if not item.granted_hz} == set()
+
+
 async def test_samples_grow_old_while_the_adapter_is_unplugged():
     chain = build_chain(load_config(SIMULATED).sim[0].spec(starts_at_s=0.0))
     async with running_rig(chains={"line0": chain}) as rig:
@@ -168,7 +187,7 @@ async def test_rates_of_drives_that_pace_themselves_are_reported_like_those_of_o
 
 
 def test_rate_is_told_from_the_instants_of_samples_also_by_two_reports_at_one_instant():
-    rate = _Rate(0.0, 1, 0)
+    rate = _Rate(0.0, 1, 0, 2.0)
     reports = ((9, 2_000_000_000, 2.05), (10, 2_250_000_000, 2.05), (10, 2_250_000_000, 3.2))
 
     assert [rate.of(*report, 0.9) for report in reports] == [4.0, 4.0, 4.0]

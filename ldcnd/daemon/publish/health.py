@@ -8,7 +8,7 @@ from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
-from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.daemon.publish.publisher import Publisher, Topic
 from ldcnd.drivers.driver import parameters_of
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Load
@@ -34,15 +34,22 @@ LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
 
 
 class _Rate:
-    """How often something comes, from the instants of the samples themselves, over as long as it takes to tell."""
+    """How often something comes, from the instants of the samples themselves, over as long as it takes to tell.
+
+    Args:
+        now_s: when it was looked at first.
+        count: samples until then.
+        at_ns: when the latest of them was true.
+        hz: the rate until there is one to measure.
+    """
 
     __slots__ = ("_at_ns", "_count", "_hz", "_looked_s")
 
-    def __init__(self, now_s: float, count: int, at_ns: int) -> None:
+    def __init__(self, now_s: float, count: int, at_ns: int, hz: float) -> None:
         self._looked_s = now_s
         self._count = count
         self._at_ns = at_ns
-        self._hz = 0.0
+        self._hz = hz
 
     def of(self, count: int, at_ns: int, now_s: float, least_s: float) -> float:
         """Return the rate since at least `least_s` ago; before that the one found last.
@@ -98,7 +105,8 @@ class HealthWatch:
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
-        self._granted: dict[tuple[str, TelemetryItem], _Rate] = {}
+        self._topics: dict[tuple[str, TelemetryItem], Topic] = {}
+        self._rates: dict[Topic, _Rate] = {}
 
     async def run(self) -> None:
         """Report each second until cancelled; then take the reports off the network."""
@@ -183,32 +191,37 @@ class HealthWatch:
 
     def _axis(self, axis: AxisService, asked_hz: Mapping[TelemetryItem, float], t: int) -> AxisHealth:
         name = axis.config.name
-        granted_hz = {item: self._granted_hz(name, item, asked_hz.get(item, 0.0)) for item in TelemetryItem}
-        last = self._publisher.last.get(self._keys.telemetry(name, TelemetryItem.POSITION))
+        position = self._topic(name, TelemetryItem.POSITION)
         return AxisHealth(
             axis=name,
             link=axis.tracker.link,
-            sample_age_s=max(0.0, (t - last.t) / 1e9) if last else None,
+            sample_age_s=None if position.at_ns is None else max(0.0, (t - position.at_ns) / 1e9),
             rate_wanted_hz=axis.config.rates.position,
-            rate_hz=granted_hz[TelemetryItem.POSITION],
+            rate_hz=self._granted_hz(position, asked_hz.get(TelemetryItem.POSITION, 0.0)),
             faults=len(axis.tracker.active_faults),
             eeprom_writes=parameters.eeprom_writes if (parameters := parameters_of(axis.driver)) else None,
             items=tuple(
-                ItemHealth(item=item.value, asked_hz=hz, granted_hz=granted_hz[item]) for item, hz in asked_hz.items()
+                ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(self._topic(name, item), hz))
+                for item, hz in asked_hz.items()
             ),
         )
 
-    def _granted_hz(self, axis: str, item: TelemetryItem, asked_hz: float) -> float:
-        """Return how often an item was published lately."""
-        last = self._publisher.last.get(self._keys.telemetry(axis, item))
-        now_s, count, at_ns = self._clock.now_s(), self._count(axis, item), last.t if last else 0
-        rate = self._granted.setdefault((axis, item), _Rate(now_s, count, at_ns))
-        return rate.of(count, at_ns, now_s, TURNS / asked_hz if asked_hz else PERIOD_S)
+    def _topic(self, axis: str, item: TelemetryItem) -> Topic:
+        topic = self._topics.get((axis, item))
+        if topic is None:
+            topic = self._topics[axis, item] = self._publisher.item(axis, item)
+        return topic
 
-    def _count(self, axis: str, item: TelemetryItem) -> int:
-        """Return how many samples of an item were published so far."""
-        last = self._publisher.last.get(self._keys.telemetry(axis, item))
-        return last.seq + 1 if last else 0
+    def _granted_hz(self, topic: Topic, asked_hz: float) -> float:
+        """Return how often an item was published lately; as often as asked for until that can be measured."""
+        at_ns, now_s = topic.at_ns, self._clock.now_s()
+        rate = self._rates.get(topic)
+        if at_ns is None:
+            self._rates.pop(topic, None)
+            return 0.0
+        if rate is None:
+            rate = self._rates[topic] = _Rate(now_s, topic.seq, at_ns, asked_hz)
+        return rate.of(topic.seq, at_ns, now_s, TURNS / asked_hz if asked_hz else PERIOD_S)
 
     def _note_counters(self) -> None:
         self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}

@@ -78,6 +78,11 @@ class Topic:
         return had
 
     @property
+    def at_ns(self) -> int | None:
+        """When the last sample was true, UTC in ns since 1970; None without one."""
+        return self.values["t"] if self.values else None
+
+    @property
     def sample(self) -> Sample | None:
         """The last sample; made when it is asked for."""
         if self._sample is None and self.values is not None:
