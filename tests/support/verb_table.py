@@ -1,9 +1,15 @@
 """The table of verbs and where each can be reached; `python -m tests.support.verb_table` writes the page anew."""
 
+import functools
+import inspect
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import CodeType, FunctionType
 
+import click
+
+from ldcnd.cli.main import cli
 from ldcnd.cli.verb_methods import method_name
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
@@ -16,8 +22,9 @@ PAGE = ROOT / "docs" / "reference" / "verbs.md"
 PLACES = ("client", "command line", "console", "documentation")
 HEADER = """# Verbs
 
-Where can a verb be reached? This table is made from the command classes and from the sources of the client, the command
-line, the console and the documentation. A cell with words says why a verb is not there as such.
+Where can a verb be reached? This table is made from the command classes: the method of the client, the commands of the
+command line that send the class, the source of the console's page, the first page that tells how it is used. A cell with
+words says why a verb is not there as such.
 
 """
 LEASE = "part of `Rig.control`"
@@ -37,21 +44,26 @@ EXPLAINED = {
     ("snapshot", "console"): "answered by the console's server; no page sends it yet: `ldcnd bus snapshot`",
     ("set_io", "console"): "what an output switches, a page cannot show: `ldcnd bus set-io`",
     ("set_io_timer", "console"): "`ldcnd bus set-io-timer`",
+    ("preview", "documentation"): "`ldcnd axis preview`, in the reference of the command line",
+    ("acquire", "documentation"): "[console](../how-to/console.md): Take control",
     ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
     ("renew", "command line"): "a command that holds control renews it by itself",
     ("outcome", "command line"): "`ldcnd events` shows it",
+    ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
+    ("why", "command line"): "`ldcnd why`",
+    ("rehearse", "command line"): "`ldcnd drill`",
 }
 """Why a verb is not in a place; everything else is there."""
 METHODS_OF_RIGS = {"holders", "outcome", "move_together", "snapshot", "set_io", "set_io_timer"}
-BY_FUNCTIONS = {
-    "events": ("follow_events", "latest_events"),
-    "wire_log": ("fetch_wire_log",),
-    "why": ("client.why",),
-    "read_all_parameters": ("read_dump",),
-    "plan_parameters": ("plan_transfer",),
-}
-"""What the command line calls in place of the class."""
+NOT_FOR_READERS = {"verbs.md", "python.md", "keys.md", "cli.md", "errors.md", "lab-log.md", "glossary.md"}
+"""Pages that are made of the classes, or only define a word."""
+LAST = "write-a-client.md"
+"""For those who have no client library."""
+MOST_COMMANDS = 2
+"""Of the command line in one cell."""
+PAGES = ("how-to", "tutorials", "reference", "explanation")
+"""Where a reader looks first."""
 
 
 def verb_table() -> str:
@@ -86,9 +98,7 @@ def _found(command: type[Command[Frozen]], place: str) -> str:
             known = command.about is About.AXIS or name in METHODS_OF_RIGS
             return f"`{kind.__name__}.{name}`" if known and hasattr(kind, name) else ""
         case "command line":
-            names = "|".join((command.__name__, *BY_FUNCTIONS.get(command.verb, ())))
-            files = (file for file in ROOT.glob("ldcnd/cli/*.py") if file.stem not in {"verb_methods", "schema"})
-            return _in_sources(rf"\b(?:{names})\b", files)
+            return _commands_that_send(command)
         case "console":
             sources = [*ROOT.glob("ldcnd/console/static/**/*.js"), *ROOT.glob("ldcnd/console/*.py")]
             return _in_sources(
@@ -96,18 +106,77 @@ def _found(command: type[Command[Frozen]], place: str) -> str:
                 (each for each in sources if "vendor" not in str(each) and each.name != "remedies.js"),
             )
         case _:
-            pages = [*ROOT.glob("docs/*/*.md"), *ROOT.glob("ldcnd/fault_pages/*.md")]
-            spelt = re.escape(command.verb).replace("_", "[_ -]")
-            return _in_sources(rf"\b{spelt}\b", (page for page in pages if not _is_generated(page)))
+            name = re.escape(command.verb).replace("_", "[_ -]")
+            strictly, loosely = rf"""(?:ldcnd[a-z -]* |["`.]){name}\b""", rf"\b{name}\b"
+            found = next((page for how in (strictly, loosely) for page in _pages() if _says(page, how)), None)
+            return f"[{found.stem}](../{found.parent.name}/{found.name})" if found else ""
+
+
+@functools.cache
+def _pages() -> list[Path]:
+    pages = [page for folder in PAGES for page in sorted((ROOT / "docs" / folder).glob("*.md"))]
+    return [*(page for page in pages if page.name not in (*NOT_FOR_READERS, LAST)), *(ROOT / "docs").glob(f"*/{LAST}")]
+
+
+def _says(page: Path, pattern: str) -> bool:
+    return re.search(pattern, page.read_text(encoding="utf-8")) is not None
 
 
 def _in_sources(pattern: str, files: Iterable[Path]) -> str:
-    found = sorted(file for file in files if re.search(pattern, file.read_text(encoding="utf-8")))
+    found = sorted((file for file in files if _says(file, pattern)), key=lambda file: (file.name == "axis.js", file))
     return f"`{found[0].name}`" if found else ""
 
 
-def _is_generated(page: Path) -> bool:
-    return page.parent.name == "adr" or page.name in {"verbs.md", "python.md", "keys.md", "cli.md", "errors.md"}
+def _commands_that_send(command: type[Command[Frozen]]) -> str:
+    """Return the commands of the command line from whose code the class is reached, the one of its name first."""
+    name = command.verb.replace("_", "-")
+    sending = sorted(
+        (not path.endswith(f" {name}"), path)
+        for path, reached in _command_line()
+        if command in reached and path.split()[1] not in {"schema", "drill"}
+    )
+    return ", ".join(f"`{path}`" for _, path in sending[:MOST_COMMANDS])
+
+
+@functools.cache
+def _command_line() -> list[tuple[str, set[object]]]:
+    """Return every command of the command line with the functions and classes that its code names."""
+    return [
+        (path, _reached(command.callback, set()))
+        for path, command in _leaves(cli, "ldcnd", click.Context(cli))
+        if isinstance(command.callback, FunctionType)
+    ]
+
+
+def _leaves(command: click.Command, path: str, context: click.Context) -> Iterator[tuple[str, click.Command]]:
+    if not isinstance(command, click.Group):
+        yield path, command
+        return
+    for name in command.list_commands(context):
+        if found := command.get_command(context, name):
+            yield from _leaves(found, f"{path} {name}", context)
+
+
+def _reached(function: FunctionType, reached: set[object]) -> set[object]:
+    bare = inspect.unwrap(function)
+    if bare in reached or not bare.__module__.startswith("ldcnd"):
+        return reached
+    reached.add(bare)
+    closed = inspect.getclosurevars(bare).nonlocals.values()
+    named = (bare.__globals__.get(name) for code in _codes(bare.__code__) for name in code.co_names)
+    for value in (*closed, *named):
+        if isinstance(value, type):
+            reached.add(value)
+        elif isinstance(value, FunctionType):
+            _reached(value, reached)
+    return reached
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
 
 
 if __name__ == "__main__":
