@@ -13,6 +13,24 @@ expect = playwright.expect
 pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
 
 AXES = ("x", "y", "z", "c")
+MOST_TABS = 90
+IS_AT = "(element) => element === document.activeElement"
+
+
+async def tab_to(desk, wanted):
+    """Press Tab until the focus is there, as somebody does who has no mouse."""
+    await expect(wanted).to_be_visible()
+    for _ in range(MOST_TABS):
+        if await wanted.evaluate(IS_AT):
+            return
+        await desk.page.keyboard.press("Tab")
+    raise AssertionError(f"{wanted} is not reached by Tab")
+
+
+async def press(desk, wanted, key="Enter"):
+    await tab_to(desk, wanted)
+    await expect(wanted).not_to_have_attribute("aria-disabled", "true")
+    await desk.page.keyboard.press(key)
 
 
 async def holders(house):
@@ -124,3 +142,44 @@ async def test_pins_become_outputs_and_a_slow_velocity_can_be_read(house):
         await expect(desk.panel("Now")).to_contain_text(re.compile(r"velocity\s*0\.3[0-9]*"))
         await desk.button("Halt").click()
         await house.sim.until("z", lambda state: state.moving == "no")
+
+
+async def test_an_operator_without_a_mouse_does_everything_that_a_day_asks_for(house):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", SetPosition(position=0.0))
+    async with house.desk(width=1280) as desk:
+        await desk.open("rig")
+        await press(desk, desk.panel("Rig sim").get_by_role("link", name="x", exact=True))
+        await press(desk, desk.button("Take control"))
+        await press(desk, desk.button("Enable"))
+        await house.sim.until("x", lambda state: state.enabled)
+
+        await tab_to(desk, desk.panel("Move").get_by_label("Position mm"))
+        await desk.page.keyboard.type("2")
+        await expect(desk.panel("Move")).to_contain_text("Ends at 2.000 mm")
+        await desk.page.keyboard.press("Enter")
+        await house.sim.reaches("x", 2, within=0.05)
+
+        await tab_to(desk, desk.panel("Jog").get_by_role("button", name="Hold to run +"))
+        await desk.page.keyboard.down("ArrowRight")
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await desk.page.keyboard.up("ArrowRight")
+        await house.sim.until("x", lambda state: state.moving == "no")
+        before = await house.sim.position("x")
+        await press(desk, desk.panel("Jog").get_by_role("button", name="+1 mm", exact=True), "Space")
+        await house.sim.reaches("x", before + 1, within=0.05)
+
+        await press(desk, desk.page.get_by_role("button", name="Stop all axes"))
+        await house.sim.until("x", lambda state: state.stop_latched)
+        await press(desk, desk.button("Reset"))
+        await house.sim.until("x", lambda state: not state.stop_latched)
+
+        await press(desk, desk.page.get_by_role("link", name="Trace", exact=True).first)
+        await tab_to(desk, desk.panel("Record x").get_by_label("Samples"))
+        await desk.page.keyboard.press("Control+A")
+        await desk.page.keyboard.type("20")
+        await press(desk, desk.button("Record"))
+        await expect(desk.panel("Captures")).to_contain_text("20 samples")
+        await press(desk, desk.page.get_by_role("link", name="Rig", exact=True))
+        await press(desk, desk.page.get_by_role("group", name="Commands for x").get_by_role("button", name="Disable x"))
+        await house.sim.until("x", lambda state: not state.enabled)

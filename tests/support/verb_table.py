@@ -23,8 +23,8 @@ PLACES = ("client", "command line", "console", "documentation")
 HEADER = """# Verbs
 
 Where can a verb be reached? This table is made from the command classes: the method of the client, the commands of the
-command line that send the class, the source of the console's page, the first page that tells how it is used. A cell with
-words says why a verb is not there as such.
+command line that send the class, the source of the console's page, the first page that tells how it is used. A cell
+with words says why a verb is not there as such.
 
 """
 LEASE = "part of `Rig.control`"

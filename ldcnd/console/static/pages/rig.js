@@ -186,6 +186,7 @@ function RigCommands({ rig }) {
       ${button("Enable", "enable", "power", { on: true })}
       ${button("Disable", "disable", "power", { on: false })}
       ${button("Reset", "reset", "reset", {})}
+      ${button("Home", "home", "home", {})}
       ${button("Halt", "halt", "halt", {})}
     </p>
     <p role="status">${told}</p>
