@@ -100,6 +100,40 @@ class Trial:
     settings: BusConfig | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ScannedDrive:
+    """What a scan found at an address.
+
+    Attributes:
+        address: of it.
+        model: as in the configuration; None for a device that ldcnd does not know.
+        is_axis: ldcnd can move it.
+        baud: the rate at which it answers.
+        text: what it is and does, for a person.
+    """
+
+    address: int
+    model: str | None
+    is_axis: bool
+    baud: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """A look at a line of which nothing is known.
+
+    Attributes:
+        bus: of the line, not open yet.
+        findings: looks, while the line is open.
+        drives: what was found, in the order of addresses; complete when `findings` has ended.
+    """
+
+    bus: Bus
+    findings: AsyncIterator[Finding]
+    drives: Sequence[ScannedDrive]
+
+
 class PacketCutter(Protocol):
     """Cuts the bytes of a host into packets."""
 
@@ -237,6 +271,28 @@ class Tries(ABC):
             held: tells whether the dead-man is held.
             opener: opens the line instead of its port.
         """
+
+
+class Scans(ABC):
+    """A family whose drives `ldcnd scan` finds on a line of which nothing is known."""
+
+    @abstractmethod
+    def scan(self, port: str, *, give_addresses: bool, opener: Opener | None = None) -> Scan:
+        """Return a scan of a port; it reads only.
+
+        Args:
+            port: that drives may be on.
+            give_addresses: reset and address them where nothing can be moving; families without addresses ignore it.
+            opener: opens the line instead of its port.
+        """
+
+    @abstractmethod
+    def configured_line(self, name: str, port: str, drives: Sequence[ScannedDrive]) -> str:
+        """Return the `[[bus]]` table of a line, without its drives, as the configuration has it."""
+
+    @abstractmethod
+    def configured_drive(self, name: str, drive: ScannedDrive) -> str:
+        """Return the table of a drive of a known model, as the configuration has it."""
 
 
 class HasParameters(ABC):

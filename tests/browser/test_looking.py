@@ -196,3 +196,28 @@ async def test_what_the_pages_compute_is_what_one_computes_by_hand(house, tmp_pa
     dump = tmp_path / "feed.toml"
     dump.write_text(text, encoding="utf-8")
     assert dict(read) == load_parameters(dump).values == {"Pn100": 80}
+
+
+async def test_what_needs_attention_is_said_once_and_links_keep_the_axis(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.sim.rig.stop("x")
+    await house.sim.rig.stop("y")
+    async with house.desk(width=1280) as desk:
+        await desk.open("rig")
+        latched = desk.panel("Needs attention").get_by_role("listitem").filter(has_text="A stop is latched")
+        await expect(latched).to_have_count(1)
+        await expect(latched.get_by_role("link")).to_have_text(["sim · x", "sim · y"])
+        await latched.get_by_role("link", name="sim · y").click()
+
+        await expect(desk.page.get_by_role("list", name="Inputs")).to_contain_text(
+            re.compile(r"forward limit\s*(high|low)")
+        )
+        await desk.page.get_by_role("link", name="Scope", exact=True).last.click()
+        for quantity in ("position", "velocity", "following error"):
+            await expect(
+                desk.page.get_by_role("group", name="sim · y").get_by_label(quantity, exact=True)
+            ).to_be_checked()
+        await desk.page.go_back()
+        await desk.page.get_by_role("link", name="Trace", exact=True).last.click()
+        await expect(desk.page.get_by_role("heading", name="Record y")).to_be_visible()
+    await house.sim.quiet("x", "y")

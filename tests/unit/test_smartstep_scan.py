@@ -4,7 +4,8 @@ import pytest
 
 from ldcnd.drivers.smartstep.network import smartstep_opener
 from ldcnd.drivers.smartstep.profiles import Framing, Wiring
-from ldcnd.families.smartstep.tools import SOFT_PARITY, scan_line
+from ldcnd.families.opened import show_findings
+from ldcnd.families.smartstep.family import SMARTSTEP, SOFT_PARITY
 from ldcnd.model.health import Verdict
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line
@@ -15,7 +16,10 @@ from tests.support.smartstep_line import simulated
 async def scanned(units, **line):
     chain = smartstep_chain(units, framing=Framing.SOFT_PARITY, **line)
     found = []
-    await scan_line(smartstep_opener(lambda: open_simulated_line(chain), SOFT_PARITY), "sim", found.append)
+    opener = smartstep_opener(lambda: open_simulated_line(chain), SOFT_PARITY)
+    look = SMARTSTEP.scan("sim", give_addresses=False, opener=opener)
+    await show_findings(look.bus, "sim", look.findings, found.append)
+    assert [f"unit {drive.address:X}" for drive in look.drives] == [each.axis for each in found if each.axis != "-"]
     return found
 
 

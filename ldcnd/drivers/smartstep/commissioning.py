@@ -5,7 +5,7 @@ Source: manual 2 to 6; the order goes from what no drive can take amiss to what 
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.smartstep import commands
@@ -177,27 +177,36 @@ class Examination:
 # -- the line as a whole ---------------------------------------------------------------------------------------------
 
 
-async def scan(bus: Bus, profile: SmartStepProfile) -> AsyncIterator[Finding]:
+async def scan(
+    bus: Bus, profile: SmartStepProfile, found: Callable[[int, str], None] = lambda *_: None
+) -> AsyncIterator[Finding]:
     """Ask every unit number from 0 to F whether a drive has it; yields each drive, or why there is none.
 
     Works best on a line that makes parity in software: then characters with wrong parity are seen as such.
+
+    Args:
+        bus: open.
+        profile: how words are sent.
+        found: takes the number of each unit, and what it says of itself.
     """
-    found = 0
+    answered = 0
     began_s = asyncio.get_running_loop().time()
     for unit in range(HIGHEST_UNIT + 1):
         words = Words(bus, f"unit {unit:X}", unit, profile)
         if not await words.answers(unit):
             continue
-        found += 1
+        answered += 1
         try:
             type_word, version = await words.read(Register.DRIVER_TYPE), await words.read(Register.SOFTWARE_VERSION)
             present = alarm(await words.read(Register.PRESENT_ALARM))
         except (BusError, DriveFault) as error:
+            found(unit, error.message)
             yield Finding(axis=words.axis, what="scan", verdict=Verdict.LOOK, text=error.message)
             continue
         text = f"driver type {type_word:04X}H, version {version:04X}H, alarm {present.code:02X} ({present.text})"
+        found(unit, text)
         yield Finding(axis=words.axis, what="scan", verdict=Verdict.FINE, text=text)
-    if not found:
+    if not answered:
         text = diagnosis([record for record in bus.wire_log.records() if record.at_s >= began_s])
         yield Finding(axis="-", what="scan", verdict=Verdict.WRONG, text=text, verifies="wiring")
 

@@ -18,6 +18,7 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.costs import price_list
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drivers.price_list import PriceList
 from ldcnd.errors import BusError, LdcndError
 from ldcnd.exchange import Exchange
 from ldcnd.model.health import Finding, Verdict
@@ -113,11 +114,11 @@ async def examine(
         if not found:
             yield await _unaddressed(bus, line.name)
             return
-        held = await _measured(bus, found)
+        held = await measured(bus, found)
     except BusError as error:
         yield Finding(axis=line.name, what="line", verdict=Verdict.WRONG, text=error.message, remedy=error.remedy)
         return
-    for finding in (*_timing(line, bus, held), _errors(line.name, bus, before)):
+    for finding in (*_timing(line, bus, held), lost_on_line(line.name, bus, before)):
         yield finding
 
 
@@ -183,7 +184,7 @@ async def _unaddressed(bus: Bus, line: str) -> Finding:
 # -- how long replies take -------------------------------------------------------------------------------------------
 
 
-async def _measured(bus: Bus, found: Mapping[int, Found]) -> Held:
+async def measured(bus: Bus, found: Mapping[int, Found]) -> Held:
     """Ask every drive at the host's rate again and again; nothing is sent twice when a reply is lost.
 
     Raises:
@@ -234,19 +235,20 @@ def _timing(line: LineAsConfigured, bus: Bus, held: Held) -> list[Finding]:
 def _cost(line: LineAsConfigured, baud: int, held: Held) -> Finding:
     """Say how many polls a second the adapter costs."""
     prices = price_list(line.model, baud)
-    reading: Exchange[object] = prices.reading(frozenset(TelemetryItem))
-    polls_hz = [
-        1.0 / cost_of(reading, LineTiming(baud, prices.node_baud, adapter_latency_s=latency_ms / 1000)).mean_s
-        for latency_ms in (held.adapter_ms, 0.0)
-    ]
-    text = (
-        f"{polls_hz[0]:.0f} polls a second fit on the line; {polls_hz[1]:.0f} with an adapter that keeps nothing back"
-    )
-    slow = polls_hz[0] < polls_hz[1] / 2
+    with_it_hz, without_hz = (polls_hz(prices, baud, latency_ms) for latency_ms in (held.adapter_ms, 0.0))
+    text = f"{with_it_hz:.0f} polls a second fit on the line; {without_hz:.0f} with an adapter that keeps nothing back"
+    slow = with_it_hz < without_hz / 2
     return Finding(axis=line.name, what="cost", verdict=Verdict.LOOK if slow else Verdict.FINE, text=text)
 
 
-def _errors(line: str, bus: Bus, before: object) -> Finding:
+def polls_hz(prices: PriceList, baud: int, latency_ms: float) -> float:
+    """Return how many polls of everything fit on a line in a second."""
+    reading: Exchange[object] = prices.reading(frozenset(TelemetryItem))
+    return 1.0 / cost_of(reading, LineTiming(baud, prices.node_baud, adapter_latency_s=latency_ms / 1000)).mean_s
+
+
+def lost_on_line(line: str, bus: Bus, before: object) -> Finding:
+    """Say what was lost on a line since a count of the driver's."""
     statistics, after = bus.statistics, bus.line_errors()
     counted = after.since(before) if after and isinstance(before, type(after)) else None
     lost = statistics.corrupt_replies + statistics.rejected_packets + statistics.stray_bytes

@@ -28,6 +28,9 @@ from ldcnd.families.family import (
     Family,
     Line,
     OpenLine,
+    Scan,
+    ScannedDrive,
+    Scans,
     ServedLine,
     ServesLines,
     Trial,
@@ -35,7 +38,7 @@ from ldcnd.families.family import (
     Tries,
     bus_settings,
 )
-from ldcnd.families.ldcn import acceptance, examination
+from ldcnd.families.ldcn import acceptance, examination, scan
 from ldcnd.families.ldcn.config import LdcnBusConfig
 from ldcnd.families.ldcn.simulation import SimulatedLdcnLineConfig, SimulationConfig
 from ldcnd.model.health import Finding
@@ -53,7 +56,7 @@ from ldcnd.transport.transport import Opener
 DEFAULT_SEED = 1
 
 
-class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBusConfig], Tries, ServesLines):
+class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBusConfig], Scans, Tries, ServesLines):
     """LDCN (Logosol) and NMC (J R Kerr)."""
 
     name = "ldcn"
@@ -97,6 +100,20 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
             settings.name, settings.port, settings.adapter_latency_ms, settings.margin_ms, settings.axis[0].model
         )
         return examination.examine(line.bus, line.network, configured)
+
+    @override
+    def scan(self, port: str, *, give_addresses: bool, opener: Opener | None = None) -> Scan:
+        bus = acceptance.trial_bus(opener or port_opener(port, RESET_BAUD))
+        look = scan.LineScan(bus, port, give_addresses=give_addresses)
+        return Scan(bus, look.findings(), look.drives)
+
+    @override
+    def configured_line(self, name: str, port: str, drives: Sequence[ScannedDrive]) -> str:
+        return scan.configured_line(name, port, drives)
+
+    @override
+    def configured_drive(self, name: str, drive: ScannedDrive) -> str:
+        return scan.configured_drive(name, drive)
 
     @override
     def assumptions(self) -> Sequence[Mapping[str, str]]:

@@ -10,9 +10,13 @@ import click
 from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
+from ldcnd.bus.resync import Resync
+from ldcnd.bus.settings import BusSettings
 from ldcnd.config.toml import read_toml
 from ldcnd.drivers.driver import AxisSpec
+from ldcnd.drivers.smartstep.commands import FLUSH
 from ldcnd.drivers.smartstep.commissioning import examine
+from ldcnd.drivers.smartstep.commissioning import scan as scan_units
 from ldcnd.drivers.smartstep.costs import BAUD, price_list, words_of
 from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger
@@ -36,6 +40,9 @@ from ldcnd.families.family import (
     HasParameters,
     Line,
     OpenLine,
+    Scan,
+    ScannedDrive,
+    Scans,
     ServedLine,
     ServesLines,
     Trial,
@@ -64,6 +71,8 @@ from ldcnd.transport.transport import Opener
 
 LEDGER_FILE = "eeprom-writes.json"
 DEFAULT_SEED = 1
+SOFT_PARITY = SmartStepProfile(framing=Framing.SOFT_PARITY)
+"""Parity is made here, so that any adapter will do and wrong parity is seen character by character."""
 ALARM_HISTORY_HZ = HISTORY_LENGTH / 60
 """One word a turn: an alarm that came and went between two readings of the state is found within a minute."""
 
@@ -73,6 +82,7 @@ class SmartStepFamily(
     Examines[SmartStepBusConfig],
     Tries,
     HasParameters,
+    Scans,
     ServesLines,
 ):
     """OMRON SmartStep."""
@@ -124,6 +134,39 @@ class SmartStepFamily(
         from ldcnd.families.smartstep import tools  # noqa: PLC0415 - only that command needs them
 
         return tools.commands(files)
+
+    @override
+    def scan(self, port: str, *, give_addresses: bool, opener: Opener | None = None) -> Scan:
+        opener = opener or smartstep_opener(port_opener(port, BAUD, "8n1"), SOFT_PARITY)
+        bus = Bus(BusSettings("scan", BAUD, margin_s=0.01, attempts=1), opener)
+        bus.resync = Resync(flush=FLUSH, quiet_s=SOFT_PARITY.gap_s, settle_s=SOFT_PARITY.quiet_s, probe=lambda _: None)
+        drives: list[ScannedDrive] = []
+
+        def found(unit: int, text: str) -> None:
+            drives.append(ScannedDrive(unit, self.name, is_axis=True, baud=BAUD, text=text))
+
+        return Scan(bus, scan_units(bus, SOFT_PARITY, found), drives)
+
+    @override
+    def configured_line(self, name: str, port: str, drives: Sequence[ScannedDrive]) -> str:
+        return f"""
+[[bus]]
+name = "{name}"
+port = "{port}"
+family = "smartstep"
+smartstep = {{ framing = "8n1-soft-parity" }}  # as the scan used it; "7e1" where the adapter makes parity itself
+"""
+
+    @override
+    def configured_drive(self, name: str, drive: ScannedDrive) -> str:
+        return f"""
+[[bus.axis]]  # {drive.text}
+name = "{name}"
+address = {drive.address}
+model = "{drive.model}"
+unit = "count"  # your unit, and counts_per_unit = counts of one of it
+rates = {{ position = 0.5, velocity = 1, state = 1 }}
+"""
 
     @override
     def assumptions(self) -> Sequence[Mapping[str, str]]:

@@ -1,4 +1,4 @@
-"""Tools for SmartSteps: looking for drives on a port, and finding out what their manual leaves open."""
+"""Tools for SmartSteps: finding out what their manual leaves open."""
 
 import asyncio
 import sys
@@ -10,59 +10,21 @@ from typing import Any, TypeVar
 import click
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.resync import Resync
-from ldcnd.bus.settings import BusSettings
 from ldcnd.config.bus import BusConfig
-from ldcnd.drivers.smartstep.commands import FLUSH
-from ldcnd.drivers.smartstep.commissioning import scan as scan_units
 from ldcnd.drivers.smartstep.drive import SmartStepAxis
-from ldcnd.drivers.smartstep.network import BAUD, smartstep_opener
-from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, TriggerMap, Verification
+from ldcnd.drivers.smartstep.profiles import TriggerMap, Verification
 from ldcnd.drivers.smartstep.trigger_search import find_trigger_map
 from ldcnd.drivers.smartstep.verification import Verified, verify_traces
 from ldcnd.errors import ConfigError
 from ldcnd.families.family import ConfigFiles
-from ldcnd.families.opened import show_findings, with_line
+from ldcnd.families.opened import with_line
 from ldcnd.families.smartstep.config import SmartStepBusConfig, SmartStepTraceConfig
 from ldcnd.families.smartstep.family import open_smartstep_line
 from ldcnd.log import configure_logging
-from ldcnd.model.health import Finding, Verdict
 from ldcnd.sim.chain import Chain
-from ldcnd.transport.port_url import port_opener
-from ldcnd.transport.transport import Opener
 
 ResultT = TypeVar("ResultT")
 CommandT = TypeVar("CommandT", bound=Callable[..., Any])
-SOFT_PARITY = SmartStepProfile(framing=Framing.SOFT_PARITY)
-"""Parity is made here, so that any adapter will do and wrong parity is seen character by character."""
-
-
-@click.command()
-@click.argument("port")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
-def scan(port: str, *, as_json: bool) -> None:
-    """Look for SmartSteps on PORT, units 0 to F, and say what is wrong with the wires; exits with 1 without any."""
-    found: list[Finding] = []
-
-    def show(finding: Finding) -> None:
-        found.append(finding)
-        text = f"{finding.axis:8} {finding.verdict:5} {finding.text}"
-        click.echo(finding.model_dump_json() if as_json else text)
-
-    configure_logging(level="error")
-    asyncio.run(scan_line(smartstep_opener(port_opener(port, BAUD, "8n1"), SOFT_PARITY), port, show))
-    sys.exit(1 if any(each.verdict is Verdict.WRONG for each in found) else 0)
-
-
-async def scan_line(opener: Opener, port: str, show: Callable[[Finding], None]) -> None:
-    """Open a line, look for SmartSteps on it, and close it.
-
-    Raises:
-        BusDown: the port does not open.
-    """
-    bus = Bus(BusSettings("scan", BAUD, margin_s=0.01, attempts=1), opener)
-    bus.resync = Resync(flush=FLUSH, quiet_s=SOFT_PARITY.gap_s, settle_s=SOFT_PARITY.quiet_s, probe=lambda _: None)
-    await show_findings(bus, port, scan_units(bus, SOFT_PARITY), show)
 
 
 def _one_drive(function: CommandT) -> CommandT:
@@ -125,7 +87,7 @@ def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
             click.echo(f"written to {config}")
         sys.exit(1 if any(each.setting is None for each in found) else 0)
 
-    return scan, trigger_bits, verify
+    return trigger_bits, verify
 
 
 def verified_tables(found: Sequence[Verified]) -> dict[str, dict[str, str]]:
