@@ -409,7 +409,7 @@ class SimulatedDrive(SimulatedModule):
     def _arm_homing(self, control: HomingControl) -> None:
         loop = self.loop
         sources = control & HomingControl(self.profile.homing_sources)
-        loop.search = HomeSearch(control, loop.inputs) if sources else None
+        loop.search = HomeSearch.armed(control, loop.inputs) if sources else None
 
     def _clear_sticky_bits(self) -> None:
         loop = self.loop

@@ -45,21 +45,31 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class HomeSearch:
-    """One armed search: what it waits for, and how the inputs were when it began."""
+    """One armed search.
+
+    Attributes:
+        control: what it was armed with.
+        limit1: the level of the input when the search began; None while it is not watched. Likewise limit2, index.
+    """
 
     control: HomingControl
-    armed_with: Inputs
+    limit1: bool | None = None
+    limit2: bool | None = None
+    index: bool | None = None
 
-    def limit_changed(self, inputs: Inputs) -> bool:
+    @classmethod
+    def armed(cls, control: HomingControl, inputs: Inputs) -> "HomeSearch":
+        """Return a search that begins with these levels."""
+        watched = (HomingControl.LIMIT1, inputs.limit1), (HomingControl.LIMIT2, inputs.limit2), (
+            HomingControl.INDEX, inputs.index
+        )  # fmt: skip
+        return cls(control, *(level if control & source else None for source, level in watched))
+
+    def limit_changed(self, limit1: bool, limit2: bool) -> bool:  # noqa: FBT001 - in every servo cycle
         """Tell whether a watched limit switch changed."""
-        return bool(
-            (self.control & HomingControl.LIMIT1 and inputs.limit1 != self.armed_with.limit1)
-            or (self.control & HomingControl.LIMIT2 and inputs.limit2 != self.armed_with.limit2)
+        return (self.limit1 is not None and self.limit1 is not limit1) or (
+            self.limit2 is not None and self.limit2 is not limit2
         )
-
-    def index_changed(self, inputs: Inputs) -> bool:
-        """Tell whether the watched index changed."""
-        return bool(self.control & HomingControl.INDEX) and inputs.index != self.armed_with.index
 
 
 class ServoLoop:
@@ -391,11 +401,13 @@ class ServoLoop:
             self.trajectory.stop_abruptly()
 
     def _look_for_home(self, search: HomeSearch) -> None:
-        inputs = self.inputs
-        if search.limit_changed(inputs):
+        shaft = self.shaft
+        limits = (shaft.on_reverse_limit, shaft.on_forward_limit)
+        limit1, limit2 = reversed(limits) if self._profile.limit1_is_forward else limits
+        if search.limit_changed(limit1, limit2):
             self.homed_on_limit = True
             self._capture(search)
-        elif search.index_changed(inputs):
+        elif search.index is not None and shaft.on_index is not search.index:
             self._capture(search)
 
     def _capture(self, search: HomeSearch) -> None:
