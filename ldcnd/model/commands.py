@@ -33,6 +33,7 @@ class Verb(StrEnum):
     MOVE_ABSOLUTE = "move_absolute"
     MOVE_RELATIVE = "move_relative"
     MOVE_VELOCITY = "move_velocity"
+    JOG = "jog"
     HALT = "halt"
     STOP = "stop"
     QUICK_STOP = "quick_stop"
@@ -350,6 +351,29 @@ class MoveVelocity(Move):
     """Velocity in units a second, positive forward, not 0."""
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
+
+
+SHORTEST_HOLD_S, LONGEST_HOLD_S = 0.2, 1.0
+"""Bounds of `Jog.hold_s`, in seconds."""
+
+
+class Jog(Move):
+    """Run at a velocity for as long as a hand says that it is held; ends by itself when nothing is heard of that.
+
+    The first one begins the jog. Later ones that carry its `command_id` in `renews` keep it alive, and may change its
+    velocity; they begin nothing: a jog that is over stays over. `halt` ends it.
+    """
+
+    verb = Verb.JOG
+
+    velocity: float
+    """Velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+    hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
+    """The jog ends so long after it was begun or renewed last, in seconds by the clock of the daemon."""
+    renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
+    """The command id of the jog that goes on; without it a new one begins. A renewal leaves no event."""
 
 
 class Halt(AxisCommand[CommandReply]):
@@ -671,6 +695,7 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     MoveAbsolute,
     MoveRelative,
     MoveVelocity,
+    Jog,
     Halt,
     Stop,
     QuickStop,

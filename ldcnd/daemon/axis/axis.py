@@ -21,6 +21,7 @@ from ldcnd.daemon.axis.parameters import Parameters
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedure import Turn
+from ldcnd.daemon.axis.procedures.jog import Hold
 from ldcnd.daemon.axis.state import REST_COUNTS, AxisTracker, Ended, ObservedTracker
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
@@ -39,6 +40,7 @@ from ldcnd.model.commands import (
     BufferMode,
     Capability,
     CommandReply,
+    Jog,
     Move,
     Preview,
     PreviewReply,
@@ -410,6 +412,21 @@ class AxisService:
                 await self._changed.wait()
                 permit.ask()
             return await execute()
+
+    def begin_hold(self, command_id: str, request: Jog) -> Hold:
+        """Remember who holds a jog, from its command on."""
+        return self._commands.holds.begin(command_id, request, self._clock.now_s())
+
+    def renew_jog(self, request: Jog, command_id: str) -> CommandReply:
+        """Keep a jog alive, at the velocity that is asked for now; begins nothing.
+
+        Raises:
+            LeaseExpired: the jog is over.
+            RequestRefused: a limit forbids the velocity.
+        """
+        reply = self._commands.renew_jog(request, command_id)
+        self._turns.wake()
+        return reply
 
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""

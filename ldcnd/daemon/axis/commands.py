@@ -9,10 +9,11 @@ from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
 from ldcnd.daemon.axis.procedures.home import HomeSequence
-from ldcnd.daemon.axis.procedures.jog import COUNTER_SHARE, Jog, jogs
+from ldcnd.daemon.axis.procedures.jog import HeldJog, Holds
 from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
+from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE, VelocityChange, runs
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, StopMode, TakesGains, Warns
 from ldcnd.errors import (
@@ -33,6 +34,7 @@ from ldcnd.model.commands import (
     CommandReply,
     Halt,
     Home,
+    Jog,
     Move,
     MoveAbsolute,
     MoveAnalog,
@@ -64,6 +66,7 @@ class AxisCommands:
     Attributes:
         procedure: what is under way and takes more than one step; None otherwise.
         step_due: its next step is due.
+        holds: the jogs that are held.
     """
 
     def __init__(self, motion: AxisMotion) -> None:
@@ -74,6 +77,7 @@ class AxisCommands:
         self._tracker = motion.tracker
         self._gains = motion.driver.spec.gains
         self.procedure: Procedure | None = None
+        self.holds = Holds(motion.config.name)
         self._retry_s: float | None = None  # when the step that was not taken is taken again
 
     async def carry_out(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
@@ -121,12 +125,38 @@ class AxisCommands:
                 return AnalogMove(self._motion, turn, request)
             case SetPwm():
                 return PwmRun(self._motion, turn, request)
-            case MoveVelocity() if jogs(self._tracker) and not self._driver.retargets:
-                return Jog(self._motion, turn, request)
+            case Jog():
+                return HeldJog(self._motion, turn, self.holds.of(turn.command_id))
+            case MoveVelocity() if runs(self._tracker) and not self._driver.retargets:
+                return VelocityChange(self._motion, turn, request)
             case Track():
                 return SetPoint(self._motion, turn, request, self.procedure)
             case _:
                 return None
+
+    def renew_jog(self, request: Jog, command_id: str) -> CommandReply:
+        """Take note that a jog is held; what it is to do from now on is its next step.
+
+        Raises:
+            LeaseExpired: the jog is over.
+            VelocityLimit, AccelerationLimit, ValueOutOfRange: the jog goes on as it was, and is not renewed.
+        """
+        hold, procedure = self.holds.of(command_id), self.procedure
+        if hold.begun and not (isinstance(procedure, HeldJog) and procedure.is_of(hold)):
+            hold.over = True
+        now_s = self._motion.clock.now_s()
+        hold.check(now_s)
+        plan = self._motion.planner.at_velocity(self._tracker.view(), request.velocity, request.acceleration)
+        hold.renew(request, now_s)
+        if isinstance(procedure, HeldJog) and procedure.wants_step:
+            self.step_due = True
+        return CommandReply(
+            command_id=command_id,
+            axis=self._config.name,
+            verb=request.verb,
+            velocity=plan.velocity,
+            acceleration=plan.acceleration,
+        )
 
     def brought_to_rest(self, command_id: str, verb: Verb) -> None:
         """The drive acknowledged a stop: watch the axis come to rest."""
@@ -288,6 +318,7 @@ class AxisCommands:
         tracker = self._tracker
         return (
             self._driver.retargets
+            and not isinstance(request, Jog)
             and request.buffer_mode is BufferMode.ABORTING
             and tracker.command is not None
             and tracker.command.verb in MOVES
@@ -295,7 +326,7 @@ class AxisCommands:
         )
 
     def _check_may_start(self, request: Move) -> None:
-        if self.retargets(request) or (isinstance(request, MoveVelocity) and jogs(self._tracker)):
+        if self.retargets(request) or (isinstance(request, MoveVelocity) and runs(self._tracker)):
             guards.check_may_follow(self._tracker.view())
         else:
             guards.check_may_move(self._tracker.view())
@@ -314,6 +345,8 @@ class AxisCommands:
                 self._plan_relative(request)
             case MoveVelocity():
                 self._plan_velocity(request)
+            case Jog():
+                self._motion.planner.at_velocity(self._tracker.view(), request.velocity, request.acceleration)
 
     async def _move_absolute(self, turn: Turn, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(request)

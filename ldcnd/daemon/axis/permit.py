@@ -8,7 +8,7 @@ is true when it would start, not what was true when it came.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NoReturn, Protocol
 
 from typing_extensions import override
@@ -51,6 +51,15 @@ class Right:
 
     holds: Condition = always
     in_time: Condition = always
+
+    def also(self, condition: Condition) -> "Right":
+        """Return the right of a sender of whom this must hold as well before every motion."""
+
+        def both() -> None:
+            self.holds()
+            condition()
+
+        return replace(self, holds=both)
 
 
 UNCONDITIONAL = Right()

@@ -35,6 +35,7 @@ from ldcnd.model.commands import (
     CommandReply,
     Effect,
     Ends,
+    Jog,
     Move,
     MoveAbsolute,
     Preview,
@@ -145,6 +146,9 @@ class Dispatcher:
         axis = self._rig.axis(axis_name)
         if command.effect is Effect.QUESTION:
             return await axis.execute(command)
+        if isinstance(command, Jog) and command.renews is not None:
+            self._admit(axis_name, command)
+            return axis.renew_jog(command, command.renews)
         command_id = command.command_id or self._next_command_id()
         if entry := self._ledger.repeated(command_id, axis_name, command):
             if command.effect is not Effect.REST:
@@ -152,6 +156,9 @@ class Dispatcher:
             command_id = self._next_command_id()
         client = self._admit(axis_name, command) or command.client
         right = UNCONDITIONAL if command.effect is Effect.REST else self._right(axis_name, command)
+        hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
+        if hold:
+            right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command.verb, right)
         self._ledger.open(Entry(command_id, axis_name, command, client, login))
         over = self._under_way[command_id] = asyncio.Event()
@@ -166,6 +173,8 @@ class Dispatcher:
         finally:
             del self._under_way[command_id]
             over.set()
+            if hold and not hold.begun:
+                hold.over = True
 
     async def _execute(
         self, axis: AxisService, command: AxisCommand[CommandReply], command_id: str, permit: Permit

@@ -1,94 +1,262 @@
-"""A jog that gets another velocity on its way.
+"""A jog: it runs for as long as a hand is known to hold it, and in the drive never much farther than that.
 
-A jog begins as a trapezoid, which ends in the drive. A trapezoid must not be changed in mid-move, while velocity mode
-may be entered and changed at any time (PIC-SERVO manual, 4.4): from its first change on the jog runs in velocity mode,
-which has no end in the drive. The daemon ends it before the software limit or at the jog horizon; only limit switches
-that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time: there a jog keeps its end in the drive.
+The client says again and again that the jog is held; this daemon ends it as soon as it has heard nothing for
+`Jog.hold_s`. If the daemon dies, the drive ends it: every packet that runs the axis names a goal. PIC-SERVO SC takes a
+new goal in mid-move, so its goal is only ever twice `hold_s` ahead. Other drives must not get another trapezoid before
+they stand (PIC-SERVO manual, 4.4): their goal is `jog_reach_s` ahead, and a jog that is held for longer, or gets
+another velocity, comes to rest and goes on from there.
 """
 
+import math
+from enum import Enum
+
+from typing_extensions import override
+
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import Procedure, Turn
-from ldcnd.daemon.axis.state import AxisTracker, Completion
-from ldcnd.drivers.driver import AxisReading, StopMode
-from ldcnd.errors import PositionLimit, Remedy, step
-from ldcnd.model.commands import CommandReply, MoveVelocity, Verb
+from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE
+from ldcnd.daemon.axis.state import Completion
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, StopMode
+from ldcnd.errors import LeaseExpired, PositionLimit, Remedy, step
+from ldcnd.model.commands import CommandReply, Jog
 from ldcnd.model.samples import AxisState
 
-COUNTER_SHARE = 0.99
-"""Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
-LATENCY_S = 0.2
-"""Longest time from a reading to the stop that follows it; what is gone meanwhile must not reach the software limit."""
+REACH_HOLDS = 2.0
+"""How far ahead the goal of a drive that takes new ones is, in units of `hold_s`,"""
+EXTEND_HOLDS = 0.75
+"""and so long after one goal the next one is given."""
 
 
-def jogs(tracker: AxisTracker) -> bool:
-    """Tell whether the axis carries out a jog whose velocity may be changed."""
-    command = tracker.command
-    return command is not None and command.verb is Verb.MOVE_VELOCITY and tracker.state is AxisState.CONTINUOUS_MOTION
+class Hold:
+    """What is known of the hand that holds one jog.
+
+    Attributes:
+        axis: that it jogs.
+        command_id: names the jog.
+        velocity: that is wanted now, in units a second.
+        acceleration: likewise, in units a second squared; None for the default of the axis.
+        hold_s: the jog ends so long after it was heard of last.
+        until_s: when it ends unless it is renewed, in loop time.
+        begun: its procedure has taken it over.
+        over: it has ended, and is not begun again.
+    """
+
+    def __init__(self, axis: str, command_id: str, request: Jog, now_s: float) -> None:
+        self.axis = axis
+        self.command_id = command_id
+        self.begun = self.over = False
+        self._take(request, now_s)
+
+    def renew(self, request: Jog, now_s: float) -> None:
+        """Take note that the jog is held, and of the velocity that is wanted now.
+
+        Raises:
+            LeaseExpired: it is over.
+        """
+        self.check(now_s)
+        self._take(request, now_s)
+
+    def check(self, now_s: float) -> None:
+        """Refuse to move on when nothing was heard of the hand for too long; from then on the jog is over.
+
+        Raises:
+            LeaseExpired: the jog is over.
+        """
+        self.over = self.over or now_s >= self.until_s
+        if self.over:
+            raise no_such_jog(self.axis, self.command_id)
+
+    def _take(self, request: Jog, now_s: float) -> None:
+        self.velocity, self.acceleration, self.hold_s = request.velocity, request.acceleration, request.hold_s
+        self.until_s = now_s + request.hold_s
 
 
-class Jog(Procedure):
-    """A jog in velocity mode, from the change of its velocity to the stop that ends it."""
+def no_such_jog(axis: str, command_id: str) -> LeaseExpired:
+    """Return the refusal of what belongs to a jog that is over, or never was."""
+    return LeaseExpired(
+        f"axis {axis}: the jog {command_id} is over",
+        axis=axis,
+        value=command_id,
+        remedy=Remedy("let go, then {} anew", step("jog")),
+    )
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: MoveVelocity) -> None:
+
+class Holds:
+    """The jogs of one axis that are held, or wait for their turn."""
+
+    def __init__(self, axis: str) -> None:
+        self._axis = axis
+        self._holds: dict[str, Hold] = {}
+
+    def begin(self, command_id: str, request: Jog, now_s: float) -> Hold:
+        """Remember a jog from its command on, also while that waits."""
+        self._holds = {name: hold for name, hold in self._holds.items() if not hold.over and hold.until_s > now_s}
+        hold = self._holds[command_id] = Hold(self._axis, command_id, request, now_s)
+        return hold
+
+    def of(self, command_id: str) -> Hold:
+        """Return a jog.
+
+        Raises:
+            LeaseExpired: it is over, or there was none.
+        """
+        if hold := self._holds.get(command_id):
+            return hold
+        raise no_such_jog(self._axis, command_id)
+
+
+class _Phase(Enum):
+    """What the drive does for a jog."""
+
+    RUNS = "runs"
+    """It runs to a goal that is there to end it if this host dies."""
+    ENDS = "ends"
+    """It runs to the software limit."""
+    SLOWS = "slows"
+    """It comes to rest, to go on at another velocity."""
+    RESTS = "rests"
+    """What it did is over."""
+
+
+class HeldJog(Procedure):
+    """A jog, from its first packet to the stop that ends it."""
+
+    def __init__(self, motion: AxisMotion, turn: Turn, hold: Hold) -> None:
         self.turn = turn
         self._motion = motion
-        self._request = request
-        self._end: float | None = None
-        self._velocity = 0.0
-        self._margin = 0.0
+        self._hold = hold
+        self._wanted: tuple[float, float | None] = (0.0, None)  # velocity and acceleration at which it runs
+        self._phase = _Phase.RESTS
+        self._extend_at_s = math.inf
+
+    @property
+    @override
+    def deadline_s(self) -> float:  # type: ignore[override]
+        """See `Procedure`: when the hand was heard of last, or when the drive gets its next goal."""
+        return min(self._hold.until_s, self._extend_at_s)
 
     async def begin(self) -> CommandReply:
         """See `Procedure`.
 
         Raises:
-            PositionLimit: the software limit ahead is too near to stop before it.
+            PositionLimit: the axis stands at the software limit ahead.
+            LeaseExpired: nothing was heard of the hand while the command waited.
         """
-        motion, request = self._motion, self._request
-        view = motion.tracker.view()
-        guards.check_may_follow(view)
-        plan = motion.planner.at_velocity(view, request.velocity, request.acceleration)
-        before = abs(motion.scale.to_units(motion.latest().velocity_counts_per_s))
-        self._velocity, speed = plan.velocity, max(abs(plan.velocity), before)
-        self._margin = speed * speed / (2 * plan.acceleration) + speed * LATENCY_S
-        self._end = motion.planner.limit_ahead(plan.velocity) if view.referenced else None
-        if self._ends_here(motion.latest()):
-            raise PositionLimit(
-                f"axis {view.name}: the limit {self._end:g} {view.unit} is too near for"
-                f" {plan.velocity:g} {view.unit}/s",
-                axis=view.name,
-                value=plan.velocity,
-                limit=self._end,
-                remedy=Remedy("{}", step("halt")),
-            )
-        await self.turn.permit.load(plan.motion)
-        speed_counts = plan.motion.velocity_counts_per_s
-        room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
-        self.deadline_s = motion.clock.now_s() + min(motion.config.jog_horizon_s, COUNTER_SHARE * room_s)
-        await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        return motion.reply(self.turn).model_copy(update={"velocity": plan.velocity, "acceleration": plan.acceleration})
+        guards.check_may_move(self._motion.tracker.view())
+        try:
+            return await self._run()
+        finally:
+            command = self._motion.tracker.command
+            self._hold.begun = command is not None and command.command_id == self.turn.command_id
+
+    def is_of(self, hold: Hold) -> bool:
+        """Tell whether this is the jog that a hand holds, and goes on."""
+        return self._hold is hold and not hold.over and not self.outlived(self._motion.tracker)
+
+    @property
+    def wants_step(self) -> bool:
+        """Whether what the hand wants is not what the drive does."""
+        return self._phase in (_Phase.RUNS, _Phase.ENDS) and self._wanted != self._asked
 
     def calls_for_step(self, reading: AxisReading) -> bool:
-        """See `Procedure`: the end is near, the drive has stopped, or the command was lost while out of sight."""
-        return self._motion.tracker.command is None or bool(reading.cut_short) or self._ends_here(reading)
+        """See `Procedure`: the drive has reached its goal, or was stopped by a limit switch."""
+        if reading.profile_done and (self._phase is not _Phase.SLOWS or self._motion.tracker.at_rest):
+            self._extend_at_s = math.inf
+            if self._phase is not _Phase.ENDS:
+                self._phase = _Phase.RESTS
+            return True
+        return bool(reading.cut_short) or self.wants_step
 
     async def step(self) -> bool:
-        """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
+        """See `Procedure`: end, or go on as long as it is held."""
+        hold, motion = self._hold, self._motion
+        reading = motion.latest()
+        if hold.over or motion.clock.now_s() >= hold.until_s:
+            return await self._stop(f"nothing was heard of the hand that holds it for {hold.hold_s:g} s")
+        if reading.cut_short:
+            return await self._stop(reading.cut_short)
+        if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
+            self._over()
+            motion.tracker.finished()
+            return False
+        if self._phase is not _Phase.RESTS and not motion.driver.retargets:
+            if self.wants_step:
+                await self._slow_down()
+            return True
+        if self._phase is _Phase.RESTS or self.wants_step or motion.clock.now_s() >= self._extend_at_s:
+            await self._run()
+        return True
+
+    @property
+    def _asked(self) -> tuple[float, float | None]:
+        return self._hold.velocity, self._hold.acceleration
+
+    async def _run(self) -> CommandReply:
+        """Have the drive run to a goal that is as far ahead as it may be."""
+        motion, asked = self._motion, self._asked
+        here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
+        self.turn.permit.ask_to_move()
+        plan, velocity, reach_s, at_limit = self._plan(motion.telemetry.position(here), *asked)
+        await self.turn.permit.load(plan.motion)
+        self._wanted = asked
+        self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if nobody knows whether the drive has started
+        extends = motion.driver.retargets and not at_limit
+        self._extend_at_s = motion.clock.now_s() + EXTEND_HOLDS * self._hold.hold_s if extends else math.inf
+        await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        return motion.reply(self.turn).model_copy(
+            update={"velocity": velocity, "acceleration": plan.acceleration, "duration_s": reach_s}
+        )
+
+    def _plan(
+        self, here: float, velocity: float, acceleration: float | None
+    ) -> tuple[MotionPlan, float, float, bool]:
+        """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""
+        motion, view = self._motion, self._motion.tracker.view()
+        steady = motion.planner.at_velocity(view, velocity, acceleration)
+        forward = velocity > 0
+        longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
+        reach_s = min(self._reach_s, longest_s)
+        way = abs(velocity) * reach_s + velocity * velocity / (2 * steady.acceleration)
+        end = here + way if forward else here - way
+        at_limit = False
+        if view.referenced:
+            limits, limit = motion.config.limits, motion.planner.limit_ahead(velocity)
+            if limit is not None and (end >= limit if forward else end <= limit):
+                end, at_limit = limit, True
+                if here >= limit if forward else here <= limit:
+                    raise PositionLimit(
+                        f"axis {view.name} is at its limit {limit:g} {view.unit}",
+                        axis=view.name,
+                        value=here,
+                        limit=limit,
+                        remedy="jog the other way",
+                    )
+            behind = limits.position_min if forward else limits.position_max
+            if behind is not None and (end < behind if forward else end > behind):
+                end = behind  # from outside the limits at least to the nearest of them
+        return motion.plan_to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
+
+    @property
+    def _reach_s(self) -> float:
         motion = self._motion
-        reading, ours = motion.latest(), motion.tracker.command is not None
+        return REACH_HOLDS * self._hold.hold_s if motion.driver.retargets else motion.config.jog_reach_s
+
+    async def _slow_down(self) -> None:
+        """Bring the axis to rest; the jog goes on from there."""
+        motion = self._motion
+        await motion.driver.stop(StopMode.SMOOTH)
+        motion.begin(self.turn.command_id, self.turn.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        motion.tracker.started(motion.clock.now_s())
+        self._phase = _Phase.SLOWS
+
+    async def _stop(self, reason: str) -> bool:
+        motion = self._motion
+        self._over()
         await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
-        if ours:
-            motion.stopping(self.turn.command_id, self.turn.verb)
-            if reading.cut_short:
-                motion.tracker.failing(reading.cut_short)
+        motion.stopping(self.turn.command_id, self.turn.verb)
+        motion.tracker.failing(reason)
         return False
 
-    def outlived(self, tracker: AxisTracker) -> bool:
-        """See `Procedure`; without a command the drive may still run until it is seen at rest."""
-        return tracker.at_rest if tracker.command is None else super().outlived(tracker)
-
-    def _ends_here(self, reading: AxisReading) -> bool:
-        if self._end is None:
-            return False
-        way = self._end - self._motion.telemetry.position(reading.position_counts)
-        return (way if self._velocity > 0 else -way) <= self._margin
+    def _over(self) -> None:
+        self._hold.over = True

@@ -1,0 +1,91 @@
+"""`move_velocity` on an axis that jogs changes the velocity on the fly."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.errors import PositionLimit, WrongState
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity
+from ldcnd.model.samples import AxisState
+from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, DialectRig, dialect_rig
+
+LIMITS = {"position_min": -15, "position_max": 15}
+dialects = pytest.mark.parametrize("dialect", [V1, V4, SC, LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
+
+
+async def speed(rig: DialectRig) -> float:
+    """Return the velocity of the shaft over the next tenth of a second, mm/s."""
+    loop = asyncio.get_running_loop()
+    rig.drive.catch_up(loop.time())
+    before = rig.position_mm
+    await asyncio.sleep(0.1)
+    rig.drive.catch_up(loop.time())
+    return (rig.position_mm - before) / 0.1
+
+
+@dialects
+async def test_a_jog_gets_faster_slower_and_turns_round_without_a_stop_in_between(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        seen = []
+
+        for velocity in (4.0, 8.0, 2.0, -5.0, 0.5):
+            reply = await rig.send(MoveVelocity(velocity=velocity))
+            await asyncio.sleep(0.5)
+            seen.append(await speed(rig))
+            assert reply.velocity == pytest.approx(velocity, abs=0.001)
+            assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
+        await rig.send(Halt())
+        state = await rig.until(lambda state: state.command is None)
+
+        assert seen == pytest.approx([4.0, 8.0, 2.0, -5.0, 0.5], abs=0.2)
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, "move_velocity: aborted by halt")
+
+
+@dialects
+@pytest.mark.parametrize("velocity", [10.0, -10.0, 0.5])
+async def test_a_changed_jog_ends_before_the_software_limit(dialect, velocity):
+    async with dialect_rig(dialect, limits=LIMITS, jog_horizon_s=60) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.2)
+
+        state = await rig.done(MoveVelocity(velocity=velocity))
+
+        assert state.state is AxisState.STANDSTILL
+        assert 10.0 < abs(rig.position_mm) < 15.05
+
+
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_changed_jog_without_limits_ends_at_the_horizon(dialect):
+    async with dialect_rig(dialect, jog_horizon_s=2.0) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=2.0))
+        await asyncio.sleep(0.2)
+
+        began_s = asyncio.get_running_loop().time()
+        state = await rig.done(MoveVelocity(velocity=3.0))
+
+        assert state.state is AxisState.STANDSTILL
+        assert 1.9 < asyncio.get_running_loop().time() - began_s < 2.6
+
+
+async def test_a_change_too_near_to_the_limit_is_refused_and_the_jog_goes_on():
+    async with dialect_rig(LS_182AP, limits=LIMITS) as rig:
+        await rig.power_on()
+        await rig.done(MoveAbsolute(position=14.0))
+        await rig.send(MoveVelocity(velocity=0.1))
+
+        with pytest.raises(PositionLimit, match="too near"):
+            await rig.send(MoveVelocity(velocity=20.0))
+
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
+
+
+async def test_other_motions_are_not_changed_on_the_fly():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=15.0, velocity=5.0))
+
+        with pytest.raises(WrongState):
+            await rig.send(MoveVelocity(velocity=2.0))
