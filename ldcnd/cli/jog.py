@@ -6,6 +6,7 @@ import termios
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import click
 
@@ -15,10 +16,11 @@ from ldcnd.cli.output import show_lines
 from ldcnd.cli.quantities import rounded
 from ldcnd.cli.sending import NAME, halted, halting
 from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
-from ldcnd.model.commands import MoveVelocity
+from ldcnd.errors import ConfigError, LeaseExpired
+from ldcnd.model.commands import LONGEST_HOLD_S, Jog
 from ldcnd.model.meta import AxisInfo
 
 LEASE_S = 1.0
@@ -27,6 +29,9 @@ FIRST_REPEAT_S = 0.8
 """A keyboard begins to repeat a key that is held within this time."""
 NEXT_REPEAT_S = 0.25
 """And repeats it at least so often; after a longer silence the key counts as released."""
+HOLD_S = 0.4
+"""The daemon ends the jog when no repetition of the key has reached it for so long."""
+RENEW_EACH_S = 0.1
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -42,9 +47,9 @@ def jog(
     """Run AXIS at VELOCITY (units a second, signed) while the space bar is held, or with --for for a time.
 
     The axis is under control of this command meanwhile. It is halted when the key is released, when the time is over,
-    at Ctrl-C and when the terminal goes; if this program dies, the daemon does what `loss.client` says within a second.
+    at Ctrl-C and when the terminal goes; if this program dies, the daemon ends the jog within half a second.
     """
-    command = of_options(MoveVelocity, velocity=velocity, acceleration=acceleration)
+    command = of_options(Jog, velocity=velocity, acceleration=acceleration, hold_s=HOLD_S)
     if for_s is None and not sys.stdin.isatty():
         raise ConfigError("there is no keyboard here", remedy="say how long to run with --for SECONDS")
 
@@ -55,38 +60,63 @@ def jog(
             halting(client, info),
         ):
             if for_s is None:
-                await _while_held(client, info, held, command)
+                await _while_pressed(client, info, held, command)
             else:
-                reply = await held.command(axis, command)
-                show_lines(f"{axis}: runs at {rounded(reply.velocity or velocity)} {info.unit}/s for {for_s:g} s")
-                await asyncio.sleep(for_s)
+                await _for_a_time(info, held, command, for_s)
             return await halted(client, info)
 
     end_as_interrupted()
     show_lines(target.run(work))
 
 
-async def _while_held(client: RigClient, info: AxisInfo, held: Control, command: MoveVelocity) -> None:
+async def _for_a_time(info: AxisInfo, held: Control, command: Jog, for_s: float) -> None:
+    """Run the axis for so many seconds, or until its software limit."""
+    jog = Jogging(partial(held.command, info.axis), command)
+    reply = await jog.begin()
+    show_lines(f"{info.axis}: runs at {rounded(reply.velocity or command.velocity)} {info.unit}/s for {for_s:g} s")
+    try:
+        async with asyncio.timeout(for_s):
+            while True:
+                await jog.held()
+    except TimeoutError:
+        return
+    except LeaseExpired:
+        if held.lost:
+            raise
+
+
+async def _while_pressed(client: RigClient, info: AxisInfo, held: Control, command: Jog) -> None:
     """Run the axis whenever the space bar is held, until another key is pressed."""
+    first = command.model_copy(update={"hold_s": LONGEST_HOLD_S})
     with _keys() as pressed:
         show_lines("hold the space bar to run, any other key ends", err=True)
         while await pressed.get() == " ":
-            await held.command(info.axis, command)
-            await _released(pressed)
+            jog = Jogging(partial(held.command, info.axis), first)
+            await jog.begin()
+            try:
+                await _renewed_until_released(pressed, jog)
+            except LeaseExpired:
+                if held.lost:
+                    raise
             show_lines(await halted(client, info), err=True)
 
 
-async def _released(pressed: "asyncio.Queue[str]") -> None:
-    """Return when the key that was pressed is not repeated any more."""
-    within_s = FIRST_REPEAT_S
-    try:
-        while True:
+async def _renewed_until_released(pressed: "asyncio.Queue[str]", jog: Jogging) -> None:
+    """Keep a jog alive with the repetitions of the key; return when it is not repeated any more."""
+    loop = asyncio.get_running_loop()
+    within_s, due_s = FIRST_REPEAT_S, loop.time()
+    while True:
+        try:
             async with asyncio.timeout(within_s):
-                if await pressed.get() != " ":
-                    return
-            within_s = NEXT_REPEAT_S
-    except TimeoutError:
-        return
+                key = await pressed.get()
+        except TimeoutError:
+            return
+        if key != " ":
+            return
+        within_s = NEXT_REPEAT_S
+        if loop.time() >= due_s:
+            due_s = loop.time() + RENEW_EACH_S
+            await jog.renew(hold_s=HOLD_S)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import pydantic
 
+from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
 from ldcnd.client.motion import Motion, Position, State, Watched
 from ldcnd.client.notebook import table
@@ -18,7 +19,7 @@ from ldcnd.client.verbs import AxisVerbs
 from ldcnd.errors import LdcndError, LeaseExpired, SessionError
 from ldcnd.messaging.codec import decode_received, explained
 from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.commands import AxisCommand, Command, CommandReply, Halt, StopReply
+from ldcnd.model.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
 from ldcnd.model.events import CommandOutcome, ReadOutcome
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
@@ -143,6 +144,36 @@ class Axis(AxisVerbs, Watched):
     async def stop(self) -> StopReply:
         """Stop at once and latch: nothing moves again before `reset`. Needs no control and is never refused."""
         return await self._client.stop(self.name, client=self._who)
+
+    @contextlib.asynccontextmanager
+    async def jogging(
+        self, velocity: float, *, acceleration: float | None = None, hold_s: float = 0.4
+    ) -> AsyncIterator[Jogging]:
+        """Jog for as long as `Jogging.held` is called; the end of the context halts the axis, whatever ends it.
+
+        What the axis does already, such as coming to rest from another jog, is halted first.
+
+        Args:
+            velocity: in units a second, positive forward, not 0.
+            acceleration: in units a second squared; the axis default when missing.
+            hold_s: the daemon ends the jog when it is not renewed for so long, 0.2 to 1 s.
+
+        Raises:
+            LdcndError: as the daemon refused it.
+        """
+        jog = Jogging(
+            lambda request: self._send(lambda: request),
+            _made(
+                lambda: Jog(
+                    velocity=velocity, acceleration=acceleration, hold_s=hold_s, buffer_mode=BufferMode.ABORTING
+                )
+            ),
+        )
+        try:
+            await jog.begin()
+            yield jog
+        finally:
+            await self.halt_now()
 
     async def take_trace(
         self,

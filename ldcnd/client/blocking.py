@@ -78,6 +78,7 @@ class Axis(Facade[asynchronous.Axis]):
     move_absolute = _moving(asynchronous.Axis.move_absolute)
     move_relative = _moving(asynchronous.Axis.move_relative)
     move_velocity = _moving(asynchronous.Axis.move_velocity)
+    jog = _moving(asynchronous.Axis.jog)
     halt = _moving(asynchronous.Axis.halt)
     quick_stop = _waiting(asynchronous.Axis.quick_stop)
     home = _moving(asynchronous.Axis.home)

@@ -15,6 +15,7 @@ from ldcnd.model.commands import (
     Home,
     HomeMethod,
     HomeStop,
+    Jog,
     MoveAbsolute,
     MoveAnalog,
     MoveRelative,
@@ -155,6 +156,31 @@ class AxisVerbs(ABC):
         """
         return await self._start(
             lambda: MoveVelocity(buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration)
+        )
+
+    async def jog(
+        self,
+        velocity: float,
+        *,
+        buffer_mode: BufferMode = BufferMode.REFUSE,
+        acceleration: float | None = None,
+        hold_s: float = 0.4,
+        renews: str | None = None,
+    ) -> Motion:
+        """Run at a velocity for as long as a hand says that it is held; ends by itself when nothing is heard of that.
+
+        Args:
+            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
+                new move.
+            velocity: Velocity in units a second, positive forward, not 0.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
+            hold_s: The jog ends so long after it was begun or renewed last, in seconds by the clock of the daemon.
+            renews: The command id of the jog that goes on; without it a new one begins. A renewal leaves no event.
+        """
+        return await self._start(
+            lambda: Jog(
+                buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, hold_s=hold_s, renews=renews
+            )
         )
 
     async def halt(self) -> Motion:

@@ -193,8 +193,8 @@ moving off a switch stays possible. Not for `track`, nor on drives that do not s
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
     """A motion at constant velocity that no software limit ends is ended by the drive itself after so many seconds."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
-    """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: it runs on \
-for as long if the daemon dies. A jog that is held for longer pauses there. PIC-SERVO SC gets a nearer goal each time."""
+    """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
+daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""
     adc_volts: float = Field(default=5.0, gt=0)
     """Voltage at full scale of the A/D converter."""
     identity: DeviceIdentity | None = None

@@ -10,9 +10,11 @@ import secrets
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 from pydantic import Field
 
+from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.rigs import Rigs
@@ -28,7 +30,7 @@ from ldcnd.errors import (
 )
 from ldcnd.log import get_logger
 from ldcnd.messaging.codec import error_reply
-from ldcnd.model.commands import AxisCommand, CommandReply, Effect, ErrorReply, Halt, MoveVelocity
+from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.rig_commands import Acquire, MoveTogether, MoveTogetherReply
 from ldcnd.model.samples import Moving
@@ -43,7 +45,8 @@ REST_TIME_S = 15.0
 its configuration decides."""
 LOOK_EACH_S = 0.05
 HELD_S = 0.4
-"""A jog ends when the page says for so long nothing of the hand that holds it; pages say it each tenth of a second."""
+"""A jog ends when the page says for so long nothing of the hand that holds it, and in the daemon when this process says
+nothing; pages say it each tenth of a second."""
 MOST_PAGES = 64
 TOKEN_BYTES = 16
 
@@ -59,7 +62,7 @@ class Lost(Frozen):
     """Why it has no control any more."""
 
 
-class Jog(Frozen):
+class PageJog(Frozen):
     """Run an axis for as long as the page goes on saying that it is held."""
 
     rig: str
@@ -75,7 +78,7 @@ class Jog(Frozen):
 class FromPage(Frozen):
     """One message of a page on its web socket."""
 
-    jog: Jog | None = None
+    jog: PageJog | None = None
     """Begin to jog; an earlier jog of the page ends."""
     held: bool | None = None
     """The jog goes on, for `HELD_S` more; false ends it."""
@@ -228,26 +231,42 @@ class PageControl:
             self._jogging.cancel()
             self._jogging = None
 
-    async def _jog(self, jog: Jog) -> None:
-        """Run an axis until its page lets go of it or falls silent, then halt it."""
-        command = MoveVelocity(velocity=jog.velocity, acceleration=jog.acceleration, client=self.client)
+    async def _jog(self, wanted: PageJog) -> None:
+        """Run an axis until its page lets go of it or falls silent, then halt it; if this process dies the jog ends."""
+        request = Jog(
+            velocity=wanted.velocity,
+            acceleration=wanted.acceleration,
+            client=self.client,
+            hold_s=HELD_S,
+            buffer_mode=BufferMode.ABORTING,
+        )
+        jog = Jogging(partial(self.command, wanted.rig, wanted.axis), request)
         try:
-            await self.command(jog.rig, jog.axis, command)
+            await jog.begin()
+        except RequestRefused as error:
+            self._tell(ToPage(refused=error_reply(error)))
+            return
+        except (LdcndError, asyncio.CancelledError) as error:
+            await self._end_of_jog(wanted, error)
+            return
+        try:
             while True:
                 self._held_on.clear()
                 async with asyncio.timeout(HELD_S):
                     await self._held_on.wait()
-        except RequestRefused as error:
-            self._tell(ToPage(refused=error_reply(error)))
-            return
+                await jog.renew()
         except (TimeoutError, LdcndError, asyncio.CancelledError) as error:
-            await self._halt_jog(jog)
-            if isinstance(error, LdcndError):
-                self._tell(ToPage(refused=error_reply(error)))
-            if isinstance(error, asyncio.CancelledError):
-                raise
+            await self._end_of_jog(wanted, error)
 
-    async def _halt_jog(self, jog: Jog) -> None:
+    async def _end_of_jog(self, wanted: PageJog, error: BaseException) -> None:
+        """Halt the axis, and say why if the page has not let go of it."""
+        await self._halt_jog(wanted)
+        if isinstance(error, LdcndError):
+            self._tell(ToPage(refused=error_reply(error)))
+        if isinstance(error, asyncio.CancelledError):
+            raise error
+
+    async def _halt_jog(self, jog: PageJog) -> None:
         try:
             await self._rigs.client(jog.rig).command(jog.axis, Halt(client=self.client), HALT_TIME_S)
         except LdcndError as error:

@@ -1,6 +1,8 @@
 """What a newcomer runs, against a daemon in its own process over loopback TCP."""
 
 import asyncio
+import os
+import struct
 import sys
 from asyncio.subprocess import PIPE
 
@@ -46,6 +48,33 @@ async def test_both_clients_move_under_a_lease_follow_the_motion_and_hear_why_th
         assert left[0] >= left[-1]
         assert ended.startswith("ended: standstill (")
         assert refused.startswith("refused: position_limit")
+
+
+async def test_a_joystick_jogs_while_its_button_and_stick_are_held(tmp_path):
+    device = tmp_path / "js0"
+    os.mkfifo(device)
+    stick, button = (struct.Struct("=IhBB").pack for _ in range(2))
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        example = await asyncio.create_subprocess_exec(
+            sys.executable, str(ROOT / "examples" / "jog_by_joystick.py"), str(device), endpoint, "x", stdout=PIPE
+        )
+        with await asyncio.to_thread(device.open, "wb", buffering=0) as hand:
+            hand.write(stick(0, -16_000, 2, 0))  # without the button nothing moves
+            hand.write(button(0, 1, 1, 0))
+            async with asyncio.timeout(30):
+                assert await example.stdout.readline() == b"jogs\n"
+                await asyncio.sleep(1.0)
+                hand.write(button(0, 0, 1, 0))
+                halted = await example.stdout.readline()
+                hand.write(button(0, 1, 1, 0))
+                assert await example.stdout.readline() == b"jogs\n"
+        async with asyncio.timeout(30):
+            unplugged, _ = await example.communicate()
+
+    assert example.returncode == 0
+    first, second = (float(line.split()[-1]) for line in (halted, unplugged))
+    assert first < -1.0
+    assert second < first + 0.5
 
 
 def test_the_example_is_thirty_lines_and_needs_nothing_of_ours():

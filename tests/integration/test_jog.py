@@ -147,9 +147,10 @@ async def test_renewals_leave_no_events_and_a_velocity_above_the_limit_renews_no
         events = (await rig.rig.client.ask(ReadEvents())).events
         assert sum(event.verb == "jog" for event in events) <= 2  # accepted, executing
         began_s = asyncio.get_running_loop().time()
-        with pytest.raises(VelocityLimit):
-            while asyncio.get_running_loop().time() < began_s + 5.0:
+        for _ in range(3):
+            with pytest.raises(VelocityLimit):
                 await rig.send(Jog(velocity=30.0, renews=jog.command_id))
+            await asyncio.sleep(0.1)
         state = await rig.until(lambda state: state.command is None)
 
         assert state.last_error is not None

@@ -15,6 +15,7 @@ from ldcnd.model.commands import (
     AxisCommand,
     CommandReply,
     Home,
+    Jog,
     MoveAbsolute,
     MoveAnalog,
     MoveRelative,
@@ -90,6 +91,7 @@ BOUNDED = {
     "move_relative": case(MoveRelative(distance=-10.0, velocity=10.0), 1.1),
     "move_velocity": case(MoveVelocity(velocity=5.0), HORIZON_S),
     "move_velocity, switches": case(MoveVelocity(velocity=8.0), 1.2, limit_switches="stop", jog_horizon_s=60.0),
+    "jog": case(Jog(velocity=5.0, hold_s=1.0), HORIZON_S, jog_reach_s=HORIZON_S),
     "move_together": case(
         MoveTogether(moves=[AxisMove(axis=axis, position=10.0, velocity=10.0) for axis in ("x", "y")]), 1.1
     ),

@@ -53,7 +53,16 @@ REQUEST, REPLY = 0xA5, 0x5A
 
 
 REFUSED = frozenset(
-    {Verb.HOME, Verb.TRACK, Verb.SET_PWM, Verb.SET_GAINS, Verb.SET_OUTPUTS, Verb.MOVE_ANALOG, Verb.MOVE_VELOCITY, Verb.JOG}
+    {
+        Verb.HOME,
+        Verb.TRACK,
+        Verb.SET_PWM,
+        Verb.SET_GAINS,
+        Verb.SET_OUTPUTS,
+        Verb.MOVE_ANALOG,
+        Verb.MOVE_VELOCITY,
+        Verb.JOG,
+    }
 )
 
 

@@ -9,7 +9,7 @@ from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
 from ldcnd.daemon.axis.procedures.home import HomeSequence
-from ldcnd.daemon.axis.procedures.jog import HeldJog, Holds
+from ldcnd.daemon.axis.procedures.jog import HeldJog, Holds, no_such_jog
 from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
@@ -126,7 +126,9 @@ class AxisCommands:
             case SetPwm():
                 return PwmRun(self._motion, turn, request)
             case Jog():
-                return HeldJog(self._motion, turn, self.holds.of(turn.command_id))
+                hold = self.holds.get(turn.command_id)
+                now_s = self._motion.clock.now_s()
+                return HeldJog(self._motion, turn, hold or self.holds.begin(turn.command_id, request, now_s))
             case MoveVelocity() if runs(self._tracker) and not self._driver.retargets:
                 return VelocityChange(self._motion, turn, request)
             case Track():
@@ -141,7 +143,9 @@ class AxisCommands:
             LeaseExpired: the jog is over.
             VelocityLimit, AccelerationLimit, ValueOutOfRange: the jog goes on as it was, and is not renewed.
         """
-        hold, procedure = self.holds.of(command_id), self.procedure
+        hold, procedure = self.holds.get(command_id), self.procedure
+        if hold is None:
+            raise no_such_jog(self._config.name, command_id)
         if hold.begun and not (isinstance(procedure, HeldJog) and procedure.is_of(hold)):
             hold.over = True
         now_s = self._motion.clock.now_s()

@@ -38,7 +38,7 @@ export function AxisPage({ at }) {
       </div>
       <div class="column">
         <${AuthorityPanel} axis=${axis} />
-        ${axis.can("move_velocity") && html`<${JogPanel} key=${axis.name} axis=${axis} />`}
+        ${axis.can("jog") && html`<${JogPanel} key=${axis.name} axis=${axis} />`}
         ${MOTIONS.some((verb) => axis.can(verb)) && html`<${MovePanel} axis=${axis} />`}
         ${axis.can("home") && html`<${HomePanel} axis=${axis} />`}
         ${axis.can("set_outputs") && html`<${OutputsPanel} key=${axis.name} axis=${axis} />`}

@@ -16,7 +16,7 @@ export function JogPanel({ axis }) {
   const reason = useId();
   const { unit } = axis.info;
   const missing = speed > 0 ? null : "A speed above 0 is missing.";
-  const way = obstacle(axis, "move_velocity", true) ?? missing;
+  const way = obstacle(axis, "jog", true) ?? missing;
   const stepWay = obstacle(axis, "move_relative") ?? missing;
 
   return html`<${Panel} title="Jog" note="Runs while you hold a button or, with a button focused, an arrow key; letting go halts.">

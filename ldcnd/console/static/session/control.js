@@ -11,6 +11,7 @@ const MOTIONS = new Set([
   "move_absolute",
   "move_relative",
   "move_velocity",
+  "jog",
   "move_analog",
   "set_pwm",
   "track",

@@ -35,6 +35,7 @@ const CHECKS = {
   move_absolute: [...toMove, referenced],
   move_relative: toMove,
   move_velocity: toMove,
+  jog: toMove,
   move_analog: toMove,
   set_pwm: toMove,
   probe: toMove,

@@ -95,15 +95,9 @@ class Holds:
         hold = self._holds[command_id] = Hold(self._axis, command_id, request, now_s)
         return hold
 
-    def of(self, command_id: str) -> Hold:
-        """Return a jog.
-
-        Raises:
-            LeaseExpired: it is over, or there was none.
-        """
-        if hold := self._holds.get(command_id):
-            return hold
-        raise no_such_jog(self._axis, command_id)
+    def get(self, command_id: str) -> Hold | None:
+        """Return a jog, unless it is forgotten."""
+        return self._holds.get(command_id)
 
 
 class _Phase(Enum):
@@ -208,9 +202,7 @@ class HeldJog(Procedure):
             update={"velocity": velocity, "acceleration": plan.acceleration, "duration_s": reach_s}
         )
 
-    def _plan(
-        self, here: float, velocity: float, acceleration: float | None
-    ) -> tuple[MotionPlan, float, float, bool]:
+    def _plan(self, here: float, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
         """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""
         motion, view = self._motion, self._motion.tracker.view()
         steady = motion.planner.at_velocity(view, velocity, acceleration)
