@@ -246,3 +246,16 @@ async def test_a_jog_that_was_changed_on_its_way_ends_without_a_host_on_sc_alone
         await asyncio.sleep(HORIZON_S + BRAKING_S)
 
         assert (await travelled(rig, 2.0) > 1.0) is runs_on
+
+
+@pytest.mark.parametrize(("dialect", "bound_s"), [(SC, 1.0), (V4, HORIZON_S), (LS_182AP, HORIZON_S)], **names)
+async def test_a_jog_that_is_held_ends_at_its_goal_in_the_drive_when_the_daemon_is_killed(dialect, bound_s):
+    async with powered(dialect, {"jog_reach_s": HORIZON_S}) as rig:
+        jog = await rig.client.command("x", Jog(velocity=4.0, hold_s=0.4))
+        for _ in range(15):
+            await asyncio.sleep(0.1)
+            await rig.client.command("x", Jog(velocity=4.0, hold_s=0.4, renews=jog.command_id))
+        await rig.kill()
+        await asyncio.sleep(bound_s)  # twice `hold_s` with PIC-SERVO SC, `jog_reach_s` otherwise, and the ramp
+
+        assert await travelled(rig, 2.0) < STILL_MM
