@@ -73,13 +73,13 @@ def dated(pattern: Path, start: datetime) -> Path:
 
 
 async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
-    from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder  # noqa: PLC0415 - needs an optional package
+    from ldcnd.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
 
     recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes)
     on_end(recorder.end)
     try:
         with recorder:
-            async with client.published(recorder.take, KEPT_SAMPLES) as gave_way:
+            async with client.published(recorder.take, KEPT_SAMPLES, LINGER_S) as gave_way:
                 click.echo(f"recording rig {client.rig} to {out}", err=True)
                 await recorder.run(gave_way)
     finally:

@@ -118,6 +118,24 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
         raise explained(error, model) from None
 
 
+def read_received(payload: bytes, encoding: str) -> tuple[object, bytes]:
+    """Return what a daemon sent, as it is and as JSON with escapes as `decode_received` makes them; no model is built.
+
+    Raises:
+        PayloadTooLarge: the payload is too long.
+        MalformedRequest: it cannot be read.
+    """
+    if _told(payload, encoding) is Encoding.MSGPACK and 0 < len(payload) <= MAX_RECEIVED_BYTES:
+        value, text = _from_msgpack(payload)
+    else:
+        text = as_json(payload, encoding)
+        try:
+            value = pydantic_core.from_json(text)
+        except ValueError as error:
+            raise MalformedRequest(f"the payload is not valid JSON: {_short(str(error))}") from None
+    return value, _with_escapes(text) if _SUSPICIOUS.search(text) else text
+
+
 def decode_error(payload: bytes, encoding: str) -> LdcndError:
     """Return the error that a daemon answers with.
 
@@ -241,7 +259,7 @@ def as_json(payload: bytes, encoding: str, longest: int = MAX_RECEIVED_BYTES) ->
         )
     if not payload:
         return b"{}"
-    return _from_msgpack(payload) if _told(payload, encoding) is Encoding.MSGPACK else payload
+    return _from_msgpack(payload)[1] if _told(payload, encoding) is Encoding.MSGPACK else payload
 
 
 @lru_cache(maxsize=64)
@@ -259,9 +277,11 @@ def _told(payload: bytes, encoding: str) -> Encoding:
     return Encoding.JSON if payload[:1] == b"{" or payload[:1] in _WHITE_SPACE else Encoding.MSGPACK
 
 
-def _from_msgpack(payload: bytes) -> bytes:
+def _from_msgpack(payload: bytes) -> tuple[object, bytes]:
+    """Return what msgpack says, as it is and as JSON."""
     try:
-        return pydantic_core.to_json(msgpack.unpackb(payload))
+        value: object = msgpack.unpackb(payload)
+        return value, pydantic_core.to_json(value)
     # what msgpack cannot read, and what JSON cannot say: both libraries raise kinds of ValueError
     except (ValueError, msgpack.UnpackException) as error:
         raise MalformedRequest(

@@ -13,9 +13,8 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from ldcnd.errors import ConfigError
-from ldcnd.messaging.codec import to_json
 from ldcnd.model.frozen import Frozen
-from ldcnd.recording.messages import Published, message_of, schema_of
+from ldcnd.recording.messages import Entry, schema_of
 
 CHUNK_BYTES = 1024 * 1024
 """What is compressed and written together at most; `McapFile.flush` ends a chunk earlier."""
@@ -49,14 +48,13 @@ class McapFile:
         """Add a description of the rig, in JSON."""
         self._writer.add_attachment(now_ns, now_ns, f"{name}.json", "application/json", document)
 
-    def add(self, key: str, value: Published, now_ns: int) -> None:
+    def add(self, key: str, entry: Entry, now_ns: int) -> None:
         """Add a value that came at `now_ns`, UTC in ns since 1970."""
-        message = message_of(value)
         channel = self._channels.get(key)
         if channel is None:
-            channel = self._channels[key] = self._writer.register_channel(f"/{key}", "json", self._schema(message))
-        data = to_json(message)
-        self._writer.add_message(channel, now_ns, data, publish_time=value.t, sequence=value.seq & 0xFFFFFFFF)
+            schema = self._schema(entry.message)
+            channel = self._channels[key] = self._writer.register_channel(f"/{key}", "json", schema)
+        self._writer.add_message(channel, now_ns, entry.data, publish_time=entry.t, sequence=entry.seq & 0xFFFFFFFF)
 
     def flush(self) -> None:
         """Put what was added on the disk; returns when it is there."""
@@ -72,8 +70,8 @@ class McapFile:
             os.fsync(self._stream.fileno())
         self._part.rename(self.path)
 
-    def _schema(self, message: Frozen) -> int:
-        name, text = schema_of(type(message))
+    def _schema(self, message: type[Frozen]) -> int:
+        name, text = schema_of(message)
         number = self._schemas.get(name)
         if number is None:
             number = self._schemas[name] = self._writer.register_schema(name, "jsonschema", text.encode())

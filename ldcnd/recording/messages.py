@@ -5,12 +5,13 @@ Source: Foxglove's message schemas, `foxglove.Log`; a viewer knows it by its nam
 
 from collections.abc import Mapping
 from enum import IntEnum
-from functools import cache
+from functools import cache, lru_cache
 from types import MappingProxyType
+from typing import NamedTuple
 
 from pydantic import Field
 
-from ldcnd.messaging.codec import decode_received
+from ldcnd.messaging.codec import decode_received, read_received, to_json
 from ldcnd.messaging.keys import ROOT
 from ldcnd.messaging.session import Sample
 from ldcnd.model.events import CommandEvent, CommandStatus
@@ -113,6 +114,50 @@ class LogMessage(Frozen):
     """Nothing, likewise."""
     event: CommandEvent
     """The event as it was published."""
+
+
+class Entry(NamedTuple):
+    """A value as a recording holds it.
+
+    Attributes:
+        message: whose schema it has.
+        data: in JSON.
+        t: when it was true, UTC in ns since 1970.
+        seq: its number among those of its key.
+    """
+
+    message: type[Frozen]
+    data: bytes
+    t: int
+    seq: int
+
+
+def entry_of(sample: Sample) -> Entry | None:
+    """Return what is recorded of a sample, or None when its key is not known.
+
+    What has exactly the fields that its key carries is recorded as it is: building its model would cost more than all
+    the rest. Who reads the recording validates it.
+
+    Raises:
+        LdcndError: the payload is not what the key carries.
+    """
+    model = _known_model(sample.key)
+    if model is None:
+        return None
+    if model is not CommandEvent:
+        value, text = read_received(sample.payload, sample.encoding)
+        if isinstance(value, dict) and value.keys() == model.model_fields.keys():
+            t, seq = value["t"], value["seq"]
+            if type(t) is int and type(seq) is int:
+                return Entry(model, text, t, seq)
+    published = decode_received(model, sample.payload, sample.encoding)
+    message = message_of(published)
+    return Entry(type(message), to_json(message), published.t, published.seq)
+
+
+@lru_cache(maxsize=4096)
+def _known_model(key: str) -> type[Published] | None:
+    return model_of(key)
 
 
 def message_of(value: Published) -> Frozen:

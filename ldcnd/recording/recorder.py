@@ -9,10 +9,12 @@ from typing import Self
 from ldcnd.errors import ConfigError, LdcndError
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.recording.mcap_file import Losses, McapFile
-from ldcnd.recording.messages import decode_published
+from ldcnd.recording.messages import entry_of
 
 FLUSH_PERIOD_S = 1.0
 """What has come is put on the disk so often: a recorder that is killed loses no more."""
+LINGER_S = 0.1
+"""Samples are taken in batches of so long: waking up for each costs as much as recording it."""
 KEPT_SAMPLES = 16_384
 """So many samples may wait for a slow disk, for about 8 s of a line of 31 axes."""
 
@@ -108,18 +110,18 @@ class Recorder:
 
     def _record(self, sample: Sample) -> None:
         try:
-            value = decode_published(sample)
+            entry = entry_of(sample)
         except LdcndError:
             self.not_understood += 1
             return
-        if value is None:
+        if entry is None:
             return
         if self._file.size_bytes >= self._rotate_bytes:
             full, self._file = self._file, self._open()
             full.complete(self._facts())
-        self._file.add(sample.key, value, self._now_ns())
+        self._file.add(sample.key, entry, self._now_ns())
         self.messages += 1
-        self.losses.saw(f"/{sample.key}", value.seq)
+        self.losses.saw(f"/{sample.key}", entry.seq)
 
     def _open(self) -> McapFile:
         number = self._files + 1

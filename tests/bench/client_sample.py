@@ -89,9 +89,9 @@ class Cost:
 class Reader:
     """A program that takes samples and says what that has cost."""
 
-    def __init__(self, text: str, endpoint: str, stack: ExitStack) -> None:
+    def __init__(self, stack: ExitStack, text: str, *arguments: str) -> None:
         self._process = subprocess.Popen(  # noqa: S603 - our own programs
-            [sys.executable, "-c", text, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", text, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         stack.callback(self._process.communicate)
         stack.callback(self._process.kill)
@@ -105,6 +105,10 @@ class Reader:
         used, count = self._line().split()
         return float(used), int(count)
 
+    def end(self) -> None:
+        """Let it end by itself, and wait for that."""
+        self._process.communicate()
+
     def _line(self) -> str:
         assert self._process.stdout
         return self._process.stdout.readline()
@@ -117,7 +121,7 @@ async def costs(rates_hz: tuple[int, ...] = RATES_HZ, samples: int = SAMPLES) ->
     async with open_zenoh_session(ZenohSettings(mode="peer", listen=(endpoint,))) as session:
         topic = Publisher(session, Keys("bench"), Encoding.MSGPACK).item("x", TelemetryItem.POSITION)
         with ExitStack() as stack:
-            readers = [await asyncio.to_thread(Reader, text, endpoint, stack) for text in (BARE, TYPED)]
+            readers = [await asyncio.to_thread(Reader, stack, text, endpoint) for text in (BARE, TYPED)]
             for rate_hz in rates_hz:
                 await _publish(topic, rate_hz, round(rate_hz * WARM_UP_S))
                 before = [await asyncio.to_thread(reader.cost) for reader in readers]
