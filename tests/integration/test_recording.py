@@ -7,6 +7,7 @@ import signal
 import sys
 from asyncio.subprocess import PIPE
 
+import msgpack
 import pytest
 from mcap.reader import make_reader
 
@@ -254,6 +255,30 @@ async def test_what_is_missing_is_counted_in_the_file(tmp_path):
     }
     assert found[f"missing /{HEALTH}"] == "2"
     assert "2 missing" in recorder.summary
+
+
+@pytest.mark.parametrize(
+    ("changed", "recorded"),
+    [
+        ({}, {}),
+        ({"unit": "m\x1b[2Jm"}, {"unit": "m\\x1b[2Jm"}),
+        ({"made_by_a_newer_daemon": 1}, {"made_by_a_newer_daemon": None}),
+        ({"seq": "3"}, None),
+        ({"t": None}, None),
+    ],
+)
+async def test_a_sample_is_recorded_as_its_schema_has_it_or_not_at_all(tmp_path, changed, recorded):
+    sample = {"t": EPOCH_NS, "t_error_ns": 9, "seq": 3, "quality": "good", "value": 1.5, "unit": "mm", "turns": None}
+    sample |= {"counts": 1500, "following_error": 0.25}
+    with Recorder(tmp_path / "run.mcap", {}, lambda: EPOCH_NS, LARGE) as recorder:
+        payload = msgpack.packb(sample | changed)
+        recorder.take(Sample("ldcn/sim/tele/x/position", payload, "application/msgpack", SampleKind.PUT, None))
+
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        found = [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages()]
+    wanted = [] if recorded is None else [{k: v for k, v in (sample | recorded).items() if k in sample}]
+    assert found == wanted
+    assert recorder.not_understood == (recorded is None)
 
 
 async def test_what_the_recorder_was_too_slow_for_is_counted(tmp_path):
