@@ -8,6 +8,7 @@ import pytest
 from ldcnd.drivers.driver import Fault, Gains, Motion, StopMode
 from ldcnd.errors import (
     BadReply,
+    LeaseExpired,
     MalformedRequest,
     NotReferenced,
     OutcomeUnknown,
@@ -57,6 +58,41 @@ async def test_power_closes_and_opens_the_loop():
         await bench.send(Power(on=True))
         assert bench.drive.told[1:] == [("power", True)]
         assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.STANDSTILL, True)
+
+
+async def test_a_loop_that_was_to_be_closed_is_opened_again_when_permission_ends_among_the_packets():
+    async with axis_bench(powered=False) as bench:
+        await bench.settled()
+        bench.drive.during["power"] = raising(LeaseExpired("the lease has ended"))
+        with pytest.raises(LeaseExpired):
+            await bench.send(Power(on=True))
+        assert bench.drive.told == [("power", True), ("stop", StopMode.OFF)]
+
+        bench.drive.told.clear()
+        bench.drive.during["power"] = bench.stop
+        with pytest.raises(StopLatched):
+            await bench.send(Power(on=True))
+        assert bench.drive.told == [("power", True), ("stop", StopMode.OFF), ("stop", StopMode.OFF)]
+
+
+async def test_a_loop_that_is_closed_already_stays_closed_when_permission_ends():
+    async with axis_bench() as bench:
+        bench.drive.during["power"] = raising(LeaseExpired("the lease has ended"))
+        with pytest.raises(LeaseExpired):
+            await bench.send(Power(on=True))
+
+        assert bench.drive.told == [("power", True)]
+
+
+async def test_power_in_mid_stop_is_refused_by_the_latch():
+    async with axis_bench() as bench:
+        await bench.send(MoveVelocity(velocity=1.0))
+        await bench.pass_s(0.1, **RUNNING)
+        await bench.stop()
+
+        assert bench.tracker.state is AxisState.STOPPING
+        with pytest.raises(StopLatched):
+            await bench.send(Power(on=True))
 
 
 async def test_an_axis_that_is_switched_off_in_motion_is_not_said_to_stand():

@@ -191,11 +191,13 @@ def test_after_a_gap_the_axis_is_in_error_stop_and_not_referenced(moving):
 def test_reset_forgets_the_cause_and_the_latch(moving):
     moving.latch_stop()
     moving.observed(replace(OFF, faults=(OVERHEAT,)), at(2.5), 0)
+    assert moving.last_error
 
     moving.cleared(3.0)
     moving.observed(OFF, at(3.1), 0)
 
     assert (moving.state, moving.stop_latched, moving.first_fault) == (AxisState.DISABLED, False, None)
+    assert moving.last_error is None
 
 
 def test_an_adopted_drive_that_runs_is_in_motion():
@@ -314,6 +316,13 @@ def test_what_brings_an_axis_to_rest_early_is_the_reason_of_its_end():
     tracker.observed(ON, at(3.1), 0)
 
     assert ended == [(CommandStatus.FAILED, "the drive stopped at the switch"), (CommandStatus.DONE, None)]
+
+
+@pytest.mark.parametrize(("state", "keeps"), [(AxisState.DISCRETE_MOTION, False), (AxisState.STOPPING, True)])
+def test_what_takes_a_motion_over_is_no_error_of_it_and_what_stops_it_is(moving, state, keeps):
+    moving.begin(command(Verb.MOVE_RELATIVE, state), float("inf"))
+
+    assert (moving.last_error is not None) is keeps
 
 
 def test_an_unconfirmed_stop_is_one_fault_however_often_it_is_sent(moving):

@@ -95,6 +95,19 @@ async def test_a_mute_node_is_asked_more_and_more_seldom_and_recovers_at_once():
     assert len(poller.delivered) > (30.0 - LONGEST_BACKOFF_S) / 0.02
 
 
+async def test_a_mute_node_that_rejects_a_packet_is_mute_no_longer():
+    rig = Rig(toy.all_but(1))
+    poller = ToyPoller(1, 0.02)
+
+    def switch_on() -> None:
+        rig.line.script = lambda packet: [] if packet == toy.FLUSH else [Say(toy.reply(0, kind=toy.REJECTED))]
+
+    await polled(rig, [poller], 30.0, switch_on)
+
+    rejected = [error for error in poller.errors if isinstance(error, PacketRejected)]
+    assert len(rejected) > (30.0 - LONGEST_BACKOFF_S) / 0.02
+
+
 async def test_half_a_line_that_falls_mute_costs_the_other_half_little_and_is_back_at_once():
     rig = Rig(lambda packet: toy.answer(packet) if packet == toy.FLUSH or toy.node_of(packet) > 15 else [])
     greedy = ToyPoller(31, 0.0001)

@@ -33,6 +33,7 @@ from ldcnd.errors import (
     UnknownAxis,
 )
 from ldcnd.messaging.session import Query
+from ldcnd.model.catalogue import RENAMED
 from ldcnd.model.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
 from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.model.rig_commands import (
@@ -182,8 +183,9 @@ async def test_a_motion_is_executing_until_the_readings_end_it_and_other_command
         await rig.send(SetGains(kp=100, command_id="c0"))
         await rig.send(THERE.model_copy(update={"command_id": "c1"}))
         await rig.x.pass_s(0.1, **RUNNING)
-        assert [(await rig.send(ReadOutcome(command_id=each), "_")).status for each in ("c0", "c1")] == [
-            CommandStatus.DONE, CommandStatus.EXECUTING,
+        await rig.send(SetGains(kd=100, command_id="c2"))  # ends at once, also while something moves
+        assert [(await rig.send(ReadOutcome(command_id=each), "_")).status for each in ("c0", "c1", "c2")] == [
+            CommandStatus.DONE, CommandStatus.EXECUTING, CommandStatus.DONE,
         ]  # fmt: skip
         await rig.x.pass_s(0.1, **STANDING)
         assert (await rig.send(ReadOutcome(command_id="c1"), "_")).status is CommandStatus.DONE
@@ -384,6 +386,34 @@ async def test_a_renewed_or_wider_lease_keeps_what_moves_and_leave_running_lets_
         assert [event for event in rig.page() if event[1] == "acquire"] == [("x", "acquire", "done")]
 
 
+@pytest.mark.parametrize("mine", [True, False])
+async def test_a_lease_that_is_exchanged_for_another_keeps_what_moves_and_one_that_is_taken_does_not(mine):
+    async with commanded() as rig:
+        first = await rig.acquired("x")
+        await moving(rig, first.lease)
+        await rig.acquired("x", client="ann" if mine else "bob", force=True)
+        await asyncio.sleep(0.001)
+
+        assert rig.x.drive.calls == ([] if mine else ["stop"])
+        assert [event for event in rig.page() if event[1] == "acquire"] == (
+            [] if mine else [("x", "acquire", "aborted")]
+        )
+
+
+async def test_so_many_refused_acquires_leave_an_event_and_no_more():
+    async with commanded(required=True) as rig:
+        await rig.acquired("x", lease_s=60.0)
+        for _ in range(100):
+            with pytest.raises(LeaseHeld):
+                await rig.acquired("x", client="bob")
+        assert rig.page().count(("x", "acquire", "refused")) == 20
+
+        await asyncio.sleep(10.0)
+        with pytest.raises(LeaseHeld):
+            await rig.acquired("x", client="bob")
+        assert rig.page().count(("x", "acquire", "refused")) == 21
+
+
 async def test_holders_are_told_and_a_refused_acquire_leaves_an_event():
     async with commanded(required=True) as rig:
         await rig.acquired("x")
@@ -455,6 +485,22 @@ async def test_a_query_that_means_nothing_is_refused(axis, verb, payload, code):
         await asyncio.sleep(0.01)
 
     assert [answer["code"] for answer in rig.answers] == [code]
+
+
+async def test_a_command_that_was_renamed_is_refused_with_its_name_of_now():
+    (before, now), *_ = RENAMED.items()
+    async with commanded() as rig:
+        rig.requests.on_command(rig.query(KEYS.command("x", before)))
+        await asyncio.sleep(0.01)
+
+    assert f"is called '{now}' now" in rig.answers[0]["message"]
+
+
+async def test_a_halt_of_an_axis_that_stands_is_done_with_its_reply():
+    async with commanded() as rig:
+        await rig.send(Halt(command_id="h1"))
+
+        assert (await rig.send(ReadOutcome(command_id="h1"), "_")).status is CommandStatus.DONE
 
 
 async def test_a_daemon_that_ends_takes_stops_and_refuses_everything_else():

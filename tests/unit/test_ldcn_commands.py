@@ -97,7 +97,12 @@ def test_what_can_move_a_motor_says_so(to):
         commands.stop_motor(to, StopControl.AMP_ENABLE | StopControl.SMOOTH),
         commands.set_gain(to, GAINS),
     )
-    quiet = (commands.read_status(to, StatusItem.AUX), commands.no_operation(to), commands.clear_sticky_bits(to))
+    quiet = (
+        commands.read_status(to, StatusItem.AUX),
+        commands.no_operation(to),
+        commands.clear_sticky_bits(to),
+        commands.hard_reset(to),
+    )
 
     assert all(exchange.moves for exchange in moving)
     assert not any(exchange.moves for exchange in quiet)

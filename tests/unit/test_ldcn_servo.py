@@ -7,16 +7,17 @@ import pytest
 
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
-from ldcnd.drivers.ldcn.controls import HomingControl
+from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.errors import DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
 from ldcnd.model.commands import HomeMethod, PinMode
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
-from tests.support.direct_bus import DirectBus
+from tests.support.direct_bus import DirectBus, packet_of
 from tests.support.simulated_axis import SimulatedAxis
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
@@ -250,6 +251,22 @@ async def test_only_the_switches_ahead_of_a_motion_are_armed(motion, armed):
 
 
 @pytest.mark.parametrize(
+    ("limit_stop", "guarded", "armed"),
+    [
+        (True, True, HomingControl.INDEX | HomingControl.LIMIT2 | HomingControl.STOP_SMOOTH),
+        (True, False, HomingControl.INDEX | HomingControl.STOP_SMOOTH),
+        (None, True, HomingControl.INDEX | HomingControl.STOP_SMOOTH),
+    ],
+)
+async def test_a_guarded_search_ends_at_the_switch_ahead_where_switches_stop(limit_stop, guarded, armed):
+    drive = await powered(limit_stop=limit_stop)
+
+    await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH, guarded=guarded))
+
+    assert drive.module.loop.search.control == armed
+
+
+@pytest.mark.parametrize(
     ("plant", "way"), [(MotorPlant(forward_limit_counts=-1), 1), (MotorPlant(reverse_limit_counts=1), -1)]
 )
 async def test_a_motion_onto_the_switch_that_the_axis_stands_on_is_refused_and_one_away_from_it_is_not(plant, way):
@@ -288,6 +305,25 @@ async def test_a_drive_is_initialised_once_before_its_loop_is_closed():
     assert Command.LOAD_TRAJECTORY not in drive.bus.commands(before)
     assert Command.SET_GAIN not in drive.bus.commands(before)
     assert drive.module.loop.servo_on
+
+
+@pytest.mark.parametrize("absolute", [True, False, None])
+def test_the_sensor_is_read_unless_the_drive_is_known_not_to_position_by_it(absolute) -> None:
+    drive = Drive()
+    drive.axis.state.known = replace(drive.axis.state.known, absolute=absolute)
+
+    (mask,) = {packet_of(drive.axis.reading(frozenset()).request).data[0]}
+
+    assert bool(mask & StatusItem.ADC) is (absolute is not False)
+
+
+async def test_outputs_are_set_in_the_drive() -> None:
+    drive = Drive(model="picservo-v4", profile=PIC_SERVO_V4)
+
+    await drive.axis.set_outputs(PinMode.HIGH, None)
+
+    assert drive.bus.packets[-1].command is Command.IO_CONTROL
+    assert drive.bus.packets[-1].data == bytes([LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT])
 
 
 def test_readings_ask_for_no_more_than_is_wanted() -> None:

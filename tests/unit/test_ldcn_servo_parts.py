@@ -130,6 +130,9 @@ def test_the_three_kinds_of_motion_are_three_trajectories():
     assert trajectory_of(Motion(None, -velocity, acceleration), 1, LS_182AP) == Trajectory(
         velocity=67_109, acceleration=344, mode=ProfileMode.VELOCITY, reverse=True
     )
+    assert trajectory_of(Motion(None, velocity, acceleration), 1, LS_182AP) == Trajectory(
+        velocity=67_109, acceleration=344, mode=ProfileMode.VELOCITY
+    )
     assert trajectory_of(AnalogMotion(356, velocity, acceleration), 1, LS_182AP) == Trajectory(
         velocity=67_109, acceleration=344, pwm_or_target=356, mode=ProfileMode.VELOCITY
     )
@@ -240,6 +243,17 @@ def test_velocity_counts_in_the_ticks_of_the_servo_rate_divisor_but_not_on_sc():
 
     assert v4.reading(status(velocity=8)).velocity_counts_per_s == pytest.approx(8 / 0.002048)
     assert sc.reading(status(velocity=8)).velocity_counts_per_s == pytest.approx(8 / 0.000512)
+
+
+def test_a_search_is_armed_until_the_drive_says_that_it_is_over():
+    state = DriveState("x", LS_182AP)
+    state.homing_armed, state.guard = True, "forward limit"
+
+    state.reading(status(flags=StatusFlag.POWER_ON | StatusFlag.HOME_IN_PROGRESS))
+    assert (state.homing_armed, state.guard_hit) == (True, False)
+
+    state.reading(status())
+    assert (state.homing_armed, state.guard_hit) == (False, True)
 
 
 def test_a_servo_overrun_is_a_warning():

@@ -173,6 +173,7 @@ async def test_the_rate_changes_before_the_next_request():
     ]
     assert bench.line.wire.baud == 19_200
     assert bench.story == ["completed 1", "completed 2"]
+    assert [record.note for record in bench.log.records() if record.event is WireEvent.BAUD] == ["19200"]
 
 
 async def test_a_lost_reply_changes_no_rate():
@@ -393,6 +394,7 @@ async def test_stray_bytes_are_seen_on_a_line_that_has_come_to_rest():
 
     assert bench.line.phase is Phase.FENCE
     assert bench.statistics.stray_bytes == 1
+    assert [record.event for record in bench.log.records()][-2:] == [WireEvent.STRAY, WireEvent.RESYNC]
 
 
 async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_its_way():

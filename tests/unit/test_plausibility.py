@@ -50,6 +50,7 @@ def at(counts: int, velocity: float = 0.0) -> AxisReading:
 
 def test_the_first_reading_is_believed_but_nothing_has_jumped_away_from_it():
     gate = PlausibilityGate(CONFIG, Scale(1000.0))
+    assert (gate.jumped, gate.foreign) == (False, False)
 
     verdicts = [
         gate.judge(reading, Timing(now_s, now_s, now_s, now_s), standing=False)

@@ -141,6 +141,18 @@ async def test_clients_that_take_no_answers_hold_up_others_for_a_bounded_time() 
     assert loop.time() <= BLOCKED_S * (frozen / LEAVING_AT_ONCE + 1)
 
 
+async def test_reads_that_were_withdrawn_wait_no_longer() -> None:
+    desk = Desk(Library())
+    for who in ("a", "a", "b"):
+        assert desk.ask(who)
+    await turns(1)
+
+    desk.intake.close()
+
+    assert desk.answered == ["a", "a", "b"]  # refused
+    assert desk.intake.reads.withdraw(desk.intake) == []
+
+
 async def test_a_read_that_raises_is_answered_and_the_next_one_too() -> None:
     broker = MemoryBroker()
     raised: list[object] = []

@@ -134,6 +134,8 @@ def test_setting_must_be_echoed_with_its_data():
 
 def test_only_what_is_harmless_to_repeat_is_repeatable():
     assert reference(0, 0x0100).repeatable
+    assert read_monitor(0, SPEED_FEEDBACK).repeatable
+    assert read_operating_mode(0).repeatable
     assert write_ram(0, PN100, 60).repeatable
     assert write_trace_register(0, TraceRegister.SMPTMS, 8).repeatable
     assert probe(0).repeatable

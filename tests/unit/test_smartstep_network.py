@@ -9,6 +9,7 @@ from ldcnd.drivers.driver import AxisReading, Fault, Homes, Moves, ReadingListen
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import reference
+from ldcnd.drivers.smartstep.network import SmartStepPort
 from ldcnd.drivers.smartstep.packet import add_parity, decode_command
 from ldcnd.drivers.smartstep.parameters import PN100
 from ldcnd.drivers.smartstep.poller import Basic, Listeners, UnitPoller
@@ -18,6 +19,8 @@ from ldcnd.exchange import Timing
 from ldcnd.model.samples import MonitorName, TelemetryItem
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from ldcnd.wirelog.recorder import WireEvent
+from tests.support.recording_receiver import RecordingReceiver
+from tests.support.scripted_line import ScriptedLine
 from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line
 
 
@@ -29,6 +32,35 @@ async def test_each_packet_waits_until_the_line_has_been_quiet():
 
     exchange_s = 28 * 10 / 9600 + 0.01
     assert records[-1].at_s == pytest.approx(5 * exchange_s + 5 * 0.02, abs=1e-3)
+
+
+async def test_a_closed_port_sends_nothing_that_waited_for_silence_and_passes_nothing_on():
+    line, receiver = ScriptedLine(lambda _: ()), RecordingReceiver()
+    port = SmartStepPort(line, Framing.SEVEN_EVEN, 0.02)
+    port.attach(receiver)
+    port.data_received(b"before")
+    port.write(b"W")
+
+    await port.close()
+    port.data_received(b"after")
+    await asyncio.sleep(1.0)
+
+    assert line.packets() == []
+    assert receiver.data == b"before"
+
+
+async def test_a_port_gives_what_its_adapter_has_held_back():
+    line, receiver = ScriptedLine(lambda _: ()), RecordingReceiver()
+    port = SmartStepPort(line, Framing.SEVEN_EVEN, 0.02)
+    port.attach(receiver)
+    line.holds_back = True
+    port.expect(5)
+    line.say(b"ab")
+    assert receiver.data == b""
+
+    port.collect()
+
+    assert receiver.data == b"ab"
 
 
 async def test_soft_parity_serves_a_port_of_eight_bits():

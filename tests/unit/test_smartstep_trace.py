@@ -6,6 +6,7 @@ import pytest
 
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.smartstep.commands import reference
+from ldcnd.drivers.smartstep.modes import EXECUTE_ATTEMPTS
 from ldcnd.drivers.smartstep.parameters import PN202, PN203
 from ldcnd.drivers.smartstep.profiles import (
     SMARTSTEP,
@@ -23,6 +24,7 @@ from ldcnd.errors import (
     ByteCountRefused,
     DriveFault,
     NotSupported,
+    OutcomeUnknown,
     ValueOutOfRange,
     WrongState,
 )
@@ -239,6 +241,17 @@ async def test_a_lost_execute_starts_the_trace_within_seconds(lost):
 
         assert executes_in_a_fresh_mode_only(frames(line))
         assert list(recorded.raw[0]) == unit.drive.recorder.rings[0]
+
+
+@pytest.mark.parametrize("lost", ["request", "reply"])
+async def test_a_trace_that_cannot_be_started_leaves_nothing_armed(lost):
+    unit = losing_once(1, b"W112001", *[lost] * EXECUTE_ATTEMPTS)
+    async with smartstep_line([unit]) as line:
+        with pytest.raises(OutcomeUnknown, match="5 attempts"):
+            await line.axis("u1").tracer.arm(TakeTrace(channels=("run",)))
+
+        assert unit.drive.mode == 0
+        assert executes_in_a_fresh_mode_only(frames(line))
 
 
 async def test_a_triggered_trace_whose_execute_got_lost_waits_in_a_drive_that_has_started():

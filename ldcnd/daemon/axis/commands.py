@@ -330,9 +330,7 @@ class AxisCommands:
         )
 
     def _check_may_start(self, request: Move) -> None:
-        if self.retargets(request) or (isinstance(request, MoveVelocity) and runs(self._tracker)):
-            guards.check_may_follow(self._tracker.view())
-        else:
+        if not (self.retargets(request) or (isinstance(request, MoveVelocity) and runs(self._tracker))):
             guards.check_may_move(self._tracker.view())
 
     def check(self, request: Move) -> None:
