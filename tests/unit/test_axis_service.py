@@ -91,6 +91,20 @@ async def test_a_stop_refuses_what_waits_and_what_is_under_way():
         assert bench.drive.calls == ["load", "stop"]
 
 
+async def test_what_waits_when_the_daemon_ends_is_refused():
+    async with axis_bench() as bench:
+        bench.drive.during["load"] = asyncio.Event().wait
+        first = asyncio.create_task(outcome(bench.send(THERE)), name="first")
+        await asyncio.sleep(0)
+        waiting = [asyncio.create_task(outcome(bench.send(Halt())), name="waiting") for _ in range(3)]
+        await asyncio.sleep(0)
+    await asyncio.wait(waiting, timeout=1.0)
+
+    assert [type(task.result()) for task in waiting] == [ShuttingDown] * 3
+    first.cancel()
+    await asyncio.wait([first])
+
+
 async def test_so_many_commands_wait_and_no_more():
     async with axis_bench() as bench:
         released = asyncio.Event()
@@ -419,6 +433,36 @@ async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away(
         assert not asks_again
         assert bench.tracker.state is AxisState.ERROR_STOP
         assert not bench.tracker.referenced
+
+
+async def test_a_jump_during_a_command_is_left_to_the_command():
+    async with axis_bench() as bench:
+        await moving(bench)
+        for counts in (0, 0, 500_000, 500_000):
+            slow = _reading(bench, position_counts=counts, velocity_counts_per_s=0.0)
+            bench.axis.judged(slow, frozenset(), now())
+            await asyncio.sleep(0.05)
+
+        assert bench.tracker.state is AxisState.DISCRETE_MOTION
+        assert bench.tracker.referenced
+
+
+@pytest.mark.parametrize("gap", ["disconnected", "missed"])
+async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(gap):
+    async with axis_bench() as bench:
+        for _ in range(2):
+            bench.axis.judged(bench.drive.shown, frozenset(), now())
+            await asyncio.sleep(0.05)
+        if gap == "disconnected":
+            bench.axis.disconnected()
+        else:
+            for _ in range(3):
+                bench.axis.missed(LOST)
+        for counts in (500_000, 500_000):
+            bench.axis.judged(_reading(bench, position_counts=counts), frozenset(), now())
+            await asyncio.sleep(0.05)
+
+        assert "position_jump" not in [fault.code for fault in bench.tracker.active_faults]
 
 
 async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost():

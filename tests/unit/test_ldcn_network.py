@@ -1,24 +1,26 @@
 """A line from whatever state to drives that can be polled."""
 
 import asyncio
+import contextlib
 
 import pytest
 
 from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
 from ldcnd.drivers.ldcn.addressing import Expected, Identity, differences
+from ldcnd.drivers.ldcn.commands import Node, read_status
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import actual_baud
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.line import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
-from ldcnd.errors import NetworkMismatch, NotSupported, StopLatched
+from ldcnd.errors import NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
 from ldcnd.model.commands import HomeMethod
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
-from tests.support.bare_network import bare_network, specs
+from tests.support.bare_network import BareNetwork, bare_network, specs
 
 ADOPT = LineSpec(start=StartPolicy.ADOPT)
 PAIR = specs("ls-182ap", "pic-servo-v4")
@@ -287,3 +289,56 @@ def test_differences_are_told_by_address():
         "address 1 (axis x): expected Logosol LS-182AP, Logosol LS-173AP (id 90, version 1)",
         "address 2 (axis y): expected PIC-SERVO version 4, nothing there",
     )
+
+
+# -- modules that lost power -------------------------------------------------------------------------------------------
+
+
+async def restart(chain: Chain, line: BareNetwork, address: int) -> None:
+    """Switch a drive off and on, and notice that it does not answer."""
+    now_s = asyncio.get_running_loop().time()
+    chain.modules[address - 1].power(on=False, at_s=now_s)
+    chain.modules[address - 1].power(on=True, at_s=now_s)
+    with contextlib.suppress(ReplyTimeout):
+        await line.bus.execute(read_status(Node(address, PIC_SERVO_V4), StatusItem.AUX))
+    assert line.bus.misses(address)
+
+
+@pytest.mark.parametrize("fails", [True, False])
+async def test_after_a_search_for_newcomers_all_are_at_the_working_rate_also_when_it_failed(fails):
+    chain = chain_of("ls182ap", "picservo-v4")
+
+    def restarted(name: str) -> None:
+        assert name == "a2"
+        if fails:
+            raise ReplyTimeout("the line failed")
+
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        await restart(chain, line, 2)
+        if fails:
+            with pytest.raises(ReplyTimeout):
+                await line.network.rejoin(restarted)
+        else:
+            assert await line.network.rejoin(restarted) == {"a2"}
+
+        assert line.bus.baud == 115_200
+        assert chain.modules[0].baud == actual_baud(0x0A)
+        assert await line.bus.execute(read_status(Node(1, LS_182AP), StatusItem.AUX))
+
+
+@pytest.mark.parametrize(("baud", "hears"), [(19_200, True), (57_600, False)])
+async def test_on_a_port_with_one_rate_newcomers_are_looked_for_only_at_the_rate_of_power_up(baud, hears):
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR, baud, fixed_baud=baud) as line:
+        if hears:
+            await line.network.bring_up()
+            await restart(chain, line, 2)
+        else:
+            line.bus._mute.missed(2)
+        seen = len(line.sent())
+
+        found = await line.network.rejoin(lambda _: None)
+
+        assert found == ({"a2"} if hears else set())
+        assert bool(line.sent(seen)) is hears
