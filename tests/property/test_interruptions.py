@@ -52,7 +52,7 @@ from ldcnd.model.samples import StateSample
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, run_with_copies
+from tests.support.interruptions import Chosen, CopiedLoop, Interruptions, in_new_loop, run_with_copies
 from tests.support.witness import Witness
 
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -372,12 +372,11 @@ class Run:
         loop.leave(self.witness.wrong)
 
 
-def interrupted(share: float, seed: int, *, kill: bool) -> Interruptions:
-    """Run the scenario once, interrupted at a share of its steps."""
-    dice = random.Random(seed)
+def interrupted(seed: int, chosen: Chosen, *, kill: bool) -> Interruptions:
+    """Run the scenario once, interrupted at chosen steps."""
     run = Run(seed, kill=kill)
     with capture_logs():
-        came = run_with_copies(run.scenario, lambda _: dice.random() < share)
+        came = run_with_copies(run.scenario, chosen)
     what = "killed" if kill else "suspended"
     print(f"seed {seed}: {what} at {came.visited} of {came.steps} steps of {run.sent} commands")
     assert not run.refused, f"{run.refused} commands of the uninterrupted run were refused: {run.why}"
@@ -389,15 +388,22 @@ def interrupted(share: float, seed: int, *, kill: bool) -> Interruptions:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
 def test_a_daemon_may_be_interrupted_anywhere(kill):
-    came = interrupted(0.01, 1, kill=kill)
+    dice = random.Random(1)
+
+    came = interrupted(1, lambda _: dice.random() < 0.01, kill=kill)
 
     assert came.visited > 10
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(3600 * 6)
-@pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
-def test_a_daemon_may_be_interrupted_at_every_await(kill):
-    came = interrupted(1.0, 1, kill=kill)
+PARTS = 25
+"""All steps are visited in so many runs, each at every so many steps: any of them can be had by itself."""
 
-    assert came.visited == came.steps > 1000
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
+@pytest.mark.parametrize("part", range(PARTS))
+def test_a_daemon_may_be_interrupted_at_every_await(part, kill):
+    came = interrupted(1, lambda step: step % PARTS == part, kill=kill)
+
+    assert came.visited == sum(step % PARTS == part for step in range(1, came.steps + 1)) > 100

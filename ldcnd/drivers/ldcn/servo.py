@@ -314,13 +314,11 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
 
     async def _stop_motor(self, control: StopControl, lane: Lane = Lane.COMMAND) -> None:
         """Send Stop Motor, and take note of what became of power driver and loop."""
-        acknowledged = False
         try:
             await self._bus.execute(commands.stop_motor(self._node, control), lane)
-            acknowledged = True
-        finally:
-            if not acknowledged:
-                self.state.switched_unconfirmed()
+        except BaseException:
+            self.state.switched_unconfirmed()
+            raise
         self.state.switched(pic_ae=bool(control & StopControl.AMP_ENABLE), closed=not control & StopControl.MOTOR_OFF)
 
     async def _clear_sticky_bits(self) -> None:
