@@ -144,7 +144,11 @@ class Campaign:
                 return verdict, test
         lines = range(mutant.lines[0], mutant.lines[1] + 1)
         is_early = not mutant.function or self._covering.is_imported(mutant.path, lines)
-        covering = self._covering.of_module(mutant.path) if is_early else self._covering.of(mutant.path, lines)
+        covering = self._covering.of(mutant.path, lines)
+        if is_early:  # those that run the line first, then those that only import it
+            covering = list(dict.fromkeys([*covering, *self._covering.of_module(mutant.path)]))
+        elif not covering:  # coverage loses sight of a coroutine behind an `await` in a comprehension
+            covering = self._covering.of(mutant.path, self._lines_of_function(mutant))
         tests = [test for test in covering if test in self._items]
         if not tests:
             return Verdict.UNCOVERED, ""
@@ -202,6 +206,10 @@ class Campaign:
                 os.killpg(child, signal.SIGKILL)
             status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         return _Run(tests[max(begun, 0)]) if status else _Run()
+
+    def _lines_of_function(self, mutant: Mutant) -> set[int]:
+        codes = (code for each in self._loaded(mutant) for code in _codes(each.__code__))
+        return {line for code in codes for _, _, line in code.co_lines() if line}
 
     def _loaded(self, mutant: Mutant) -> Sequence[FunctionType]:
         return self._functions.get((str(ROOT / mutant.path), mutant.function), ())

@@ -28,6 +28,16 @@ async def test_a_caller_gets_its_decoded_reply():
     assert rig.bus.statistics.replies == 1
 
 
+async def test_latency_counts_from_when_an_exchange_was_asked_for():
+    rig = Rig()
+    async with running(rig):
+        await asyncio.sleep(10.0)
+        await rig.bus.execute(toy.exchange(1))
+
+    latency = rig.bus.statistics.latency[Lane.COMMAND]
+    assert 0.001 < latency.longest_s < 0.01
+
+
 async def test_stop_overtakes_queued_commands_and_polls():
     rig = Rig()
     poller = ToyPoller(5, 0.01)

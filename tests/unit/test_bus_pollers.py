@@ -77,12 +77,14 @@ async def test_a_poller_without_a_reply_is_asked_again():
     assert len(poller.delivered) in (10, 11)
 
 
-async def test_a_mute_node_is_asked_more_and_more_seldom_and_recovers_at_once():
+@pytest.mark.parametrize("bytewise", [False, True])
+async def test_a_mute_node_is_asked_more_and_more_seldom_and_recovers_at_once(*, bytewise: bool):
     rig = Rig(toy.all_but(1))
     poller = ToyPoller(1, 0.02)
 
     def switch_on() -> None:
         rig.line.script = toy.answer
+        rig.line.bytewise = bytewise
 
     await polled(rig, [poller], 30.0, switch_on)
 

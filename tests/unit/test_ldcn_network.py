@@ -7,6 +7,7 @@ import pytest
 
 from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
 from ldcnd.drivers.ldcn.addressing import Expected, Identity, differences
+from ldcnd.drivers.ldcn.adoption import Found
 from ldcnd.drivers.ldcn.commands import Node, read_status
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
@@ -23,6 +24,7 @@ from ldcnd.sim.plant import MotorPlant
 from tests.support.bare_network import BareNetwork, bare_network, specs
 
 ADOPT = LineSpec(start=StartPolicy.ADOPT)
+ADOPT_OR_RESET = LineSpec(start=StartPolicy.ADOPT, adopt_fallback=AdoptFallback.RESET)
 PAIR = specs("ls-182ap", "pic-servo-v4")
 
 
@@ -230,6 +232,30 @@ async def test_adoption_refuses_drives_at_different_rates():
         assert {packet.command for packet in line.sent()} <= {Command.READ_STATUS, Command.NO_OPERATION}
 
 
+@pytest.mark.parametrize("codes", [(0x14, 0x81), (0x0A, 0x81), (0x14, 0x3F), (0x3F, 0x0A)])
+async def test_drives_at_rates_of_their_own_are_brought_together_where_more_than_reading_is_allowed(codes):
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+    for module, code in zip(chain.modules, codes, strict=True):
+        module.baud = actual_baud(code)
+    async with bare_network(chain, PAIR, line=ADOPT_OR_RESET) as line:
+        report = await line.network.bring_up()
+
+        assert (report.baud, report.reset, len(report.remarks)) == (115_200, False, 1)
+        assert [module.baud for module in chain.modules] == [actual_baud(0x0A)] * 2
+        assert Command.HARD_RESET not in {packet.command for packet in line.sent()}
+
+
+async def test_a_module_of_unknown_kind_may_move_for_all_that_is_known():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        adoption = line.network._adoption
+        adoption.found = {address: Found(19_200, Identity(77, 1)) for address in (1, 2)}
+
+        assert ["its status is unknown" in each for each in await adoption.not_standing()] == [True, True]
+
+
 async def test_a_drive_that_may_move_keeps_the_fallback_from_resetting():
     chain = chain_of("ls182ap", "picservo-v4")
     async with bare_network(chain, PAIR) as line:
@@ -239,8 +265,7 @@ async def test_a_drive_that_may_move_keeps_the_fallback_from_resetting():
         await axis.load(Motion(None, 5000.0, 50_000.0))
         await axis.start()
     chain.modules[1].power(on=False, at_s=asyncio.get_running_loop().time())
-    spec = LineSpec(start=StartPolicy.ADOPT, adopt_fallback=AdoptFallback.RESET)
-    async with bare_network(chain, PAIR, line=spec) as line:
+    async with bare_network(chain, PAIR, line=ADOPT_OR_RESET) as line:
         with pytest.raises(NetworkMismatch, match=r"not reset either: address 1, .* moves"):
             await line.network.bring_up()
 
@@ -302,6 +327,22 @@ async def restart(chain: Chain, line: BareNetwork, address: int) -> None:
     with contextlib.suppress(ReplyTimeout):
         await line.bus.execute(read_status(Node(address, PIC_SERVO_V4), StatusItem.AUX))
     assert line.bus.misses(address)
+
+
+async def test_a_line_that_was_taken_over_at_another_rate_has_the_configured_one_after_a_reset():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR, 57_600) as line:
+        await line.network.bring_up()
+    async with bare_network(chain, PAIR, 115_200, ADOPT_OR_RESET) as line:
+        taken_over = await line.network.bring_up()
+        assert taken_over.baud == 57_600
+        assert "the configuration asks for 115200 baud; the line stays at 57600" in taken_over.remarks
+        for address in (1, 2):
+            await restart(chain, line, address)
+
+        report = await line.network.bring_up()
+
+    assert (report.baud, report.reset) == (115_200, True)
 
 
 @pytest.mark.parametrize("fails", [True, False])

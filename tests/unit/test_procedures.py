@@ -34,6 +34,8 @@ from ldcnd.model.commands import (
     MoveAnalog,
     MoveVelocity,
     Power,
+    Probe,
+    ProbeSource,
     SetPwm,
     Track,
 )
@@ -258,6 +260,45 @@ async def test_after_a_search_the_axis_moves_on_once_it_rests():
         assert loads(bench)[1].target_counts == 1000 - 10_000
         assert bench.drive.calls.count("start") == 2
         assert status(bench, "home") == [(CommandStatus.DONE, None)]
+
+
+async def test_a_step_that_nobody_knows_to_have_started_is_not_taken_twice_and_the_procedure_goes_on():
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=False)
+        await bench.send(ONTO_SWITCH.model_copy(update={"find_velocity": 15.0}), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        bench.drive.during["start"] = raising(OutcomeUnknown("no reply"))
+        await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
+        await bench.pass_s(0.1, **RESTING)
+        assert bench.drive.calls.count("start") == 2
+        await asyncio.sleep(1.0)
+        assert bench.drive.calls.count("start") == 2
+        assert status(bench, "home") == []
+
+        await bench.pass_s(0.1, forward_limit=False, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
+        await bench.settled(homing=False)
+
+        assert bench.tracker.referenced
+        assert status(bench, "home") == [(CommandStatus.DONE, None)]
+
+
+async def test_a_stop_ends_a_procedure_whose_step_nobody_knows_to_have_started():
+    async def stopped() -> None:
+        await bench.stop()
+        raise OutcomeUnknown("no reply")
+
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=False)
+        await bench.send(ONTO_SWITCH.model_copy(update={"find_velocity": 15.0}), "home")
+        await bench.pass_s(0.1, **SEARCHING)
+        bench.drive.during["start"] = stopped
+        await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
+        await bench.pass_s(0.1, **RESTING)
+        await bench.settled(homing=False)
+
+        assert bench.axis._commands.procedure is None
+        assert not bench.tracker.referenced
 
 
 async def test_an_axis_that_does_not_rest_after_its_search_does_not_move_on():
@@ -897,3 +938,37 @@ async def test_a_relative_move_counts_from_the_target_of_a_group_move():
 
         assert one.axis._motion.target_counts == 10_000
         assert replace(one.drive.shown).position_counts == 10_004
+
+
+# -- probes ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("distance", "ahead"), [(5.0, HomeMethod.FORWARD_LIMIT), (-5.0, HomeMethod.REVERSE_LIMIT)])
+async def test_a_probe_that_the_switch_ahead_has_stopped_has_found_nothing(distance, ahead):
+    async with axis_bench() as bench:
+        bench.drive.stands_on = lambda limit, _reading: limit is ahead
+        await bench.send(Probe(sources=(ProbeSource.INDEX,), distance=distance, velocity=1.0), "probe")
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, **CAPTURED)
+        await bench.settled(homing=False)
+
+        failure = f"the drive stopped at the {ahead.value.replace('_', ' ')} switch"
+        assert status(bench, "probe") == [(CommandStatus.FAILED, failure)]
+        assert bench.published(TelemetryItem.LATCH) is None
+
+
+@pytest.mark.parametrize("distance", [5.0, -5.0])
+async def test_a_probe_publishes_what_was_latched_and_stops(distance):
+    async with axis_bench() as bench:
+        bench.drive.home_counts = 777
+        await bench.send(Probe(sources=(ProbeSource.INDEX,), distance=distance, velocity=1.0), "probe")
+        assert loads(bench)[0][0].target_counts == round(distance * 1000)
+        await bench.pass_s(0.1, **SEARCHING)
+        assert bench.published(TelemetryItem.LATCH) is None
+        await bench.pass_s(0.1, **CAPTURED)
+        await bench.settled(homing=False)
+
+        latched = bench.published(TelemetryItem.LATCH)
+        assert (latched.counts, latched.value, latched.command_id) == (777, 0.777, "probe")
+        assert status(bench, "probe") == [(CommandStatus.DONE, None)]
+        assert bench.tracker.referenced

@@ -1,10 +1,15 @@
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 
+from ldcnd.bus.bus import Bus
 from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.commands import Refusal
+from ldcnd.drivers.smartstep.commands import Refusal, execute
 from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.words import drive_error
+from ldcnd.drivers.smartstep.words import drive_error, stray_packets
 from ldcnd.errors import AddressRefused, BusyTracing, ByteCountRefused, DataRefused
+from ldcnd.wirelog.recorder import WireEvent, WireLog
 
 
 @pytest.mark.parametrize(
@@ -33,3 +38,16 @@ def test_a_setting_meets_a_busy_drive_while_it_traces():
 
     assert type(raised) is BusyTracing
     assert raised.retryable
+
+
+def test_only_what_came_unasked_since_an_instant_is_stray():
+    first, second, third = (execute(unit).request for unit in (1, 2, 3))
+    log = WireLog()
+    log.add(1.0, WireEvent.STRAY, first)
+    log.add(2.0, WireEvent.SENT, second)
+    log.add(3.0, WireEvent.STRAY, third[:4])
+    log.add(3.1, WireEvent.STRAY, third[4:])
+    bus = cast("Bus", SimpleNamespace(wire_log=log))
+
+    assert stray_packets(bus, 0.0) == [first, third]
+    assert stray_packets(bus, 2.0) == [third]

@@ -263,11 +263,10 @@ class Rejoin:
         rates = {each.baud for each in found.values()}
         if len(rates) == 1 and not (lost and await self._rate.who_is_at(self._rate.at_reset, UNADDRESSED)):
             return False
-        for baud in rates - {self._rate.at_reset, self._bus.baud}:
+        for baud in rates - {self._rate.at_reset}:
             await self._rate.host_to(baud)
             await self._addressing.without_leaders()
             await self._rate.everybody_to(self._rate.at_reset)
-            await self._rate.host_to(self._rate.working)
         await self._at_reset_baud(lost, addressing)
         return True
 
