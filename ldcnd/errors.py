@@ -432,7 +432,7 @@ class LeaseRequired(RequestRefused):
 
 
 class LeaseHeld(RequestRefused):
-    """Somebody else controls the axis."""
+    """Another client controls the axis."""
 
     code = ErrorCode.LEASE_HELD
     retryable = True
@@ -482,7 +482,7 @@ class UnknownCommand(RequestRefused):
 
 
 class NotPermitted(RequestRefused):
-    """Whoever asks is not known, or asks from where nobody may; the console says so to browsers."""
+    """The sender is unknown, or asks from where it may not; the console says so to browsers."""
 
     code = ErrorCode.NOT_PERMITTED
     way_out = "open the console with the link that it prints"

@@ -55,7 +55,7 @@ def command(  # noqa: PLR0917 - click passes them by name
 ) -> None:
     """Try the drives on PORT, which no daemon may use meanwhile.
 
-    Reads only, unless --move is given. Then somebody must keep Enter pressed: the drive is stopped when it is released.
+    Reads only, unless --move is given. Then you must keep Enter pressed: the drive is stopped when it is released.
     This is no emergency stop; have one within reach. Exits with 1 when an assumption is refuted.
     """
     if list_only:

@@ -26,7 +26,7 @@ DEFAULT_ADDRESS = "127.0.0.1:5064"
 def command(target: Target, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, moves: bool) -> None:  # noqa: FBT001 - click's
     """Serve AXES (all of them by default) as motor records until SIGTERM or SIGINT.
 
-    Channel Access asks nobody who they are: with --moves, whoever reaches the address moves the axes.
+    Channel Access does not authenticate clients: with --moves, any client that reaches the address moves axes.
     """
     target.run(lambda client: _serve(client, address, axes, prefix, moves=moves))
 

@@ -17,7 +17,7 @@ DAYS = 730
 def command() -> None:
     """Make certificates for mutual TLS, and the access rules that go with them.
 
-    FOLDER belongs to one site. Keep it on one machine: whoever has ca.key can make operators.
+    FOLDER belongs to one site. Keep it on one machine: anyone who has ca.key can make operators.
     """
 
 

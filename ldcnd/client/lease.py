@@ -105,7 +105,7 @@ async def control(
             `loss.client` says.
 
     Raises:
-        LeaseHeld: somebody else controls one of the axes.
+        LeaseHeld: another client controls one of the axes.
     """
     request = Acquire(client=name, axes=axes, lease_s=lease_s, force=force)
     held = Control(client, await client.ask(request))

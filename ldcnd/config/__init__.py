@@ -1,4 +1,4 @@
 """The configuration file: what a rig, its lines, its axes and its simulated lines are, validated whole.
 
-For the daemon, `check-config` and whoever reads the reference. Start with `rig`.
+For the daemon, `check-config` and the reference. Start with `rig`.
 """

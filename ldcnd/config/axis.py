@@ -93,7 +93,7 @@ class TrackingConfig(Frozen):
 
 
 class LossPolicy(StrEnum):
-    """What an axis does when somebody it depends on disappears."""
+    """What an axis does when a client, the line or the daemon disappears."""
 
     RUN_TO_TARGET = "run_to_target"
     """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive."""
@@ -106,7 +106,7 @@ class LossPolicy(StrEnum):
 
 
 class LossConfig(Frozen):
-    """What the axis does when somebody disappears in mid-motion."""
+    """What the axis does when a client, the line or the daemon disappears in mid-motion."""
 
     client: LossPolicy = LossPolicy.HALT
     """The lease under which it moves was not renewed."""
@@ -186,7 +186,7 @@ counts as 0. The latter only for a line that no host has used since: after a res
     """How its polls fare while the line cannot carry all of them: the highest go first; low ones give way, but still \
 come now and then."""
     loss: LossConfig = LossConfig()
-    """What the axis does when somebody disappears in mid-motion."""
+    """What the axis does when a client, the line or the daemon disappears in mid-motion."""
     limit_switches: Literal["ignore", "stop"] = "ignore"
     """stop: the drive itself decelerates when a motion runs onto the limit switch ahead, also if the host is dead; \
 moving off a switch stays possible. Not for `track`, nor on drives that do not stop on their limit inputs."""

@@ -76,7 +76,7 @@ class Gateway:
                 await record.take(sample, monitor)
 
     async def _hold(self, record: MotorRecord) -> None:
-        """Control an axis; what another program has taken is never taken back by force."""
+        """Control an axis; control that another program has is never taken by force."""
         while True:
             try:
                 async with self._rig.control(record.info.axis, client=WHO, lease_s=LEASE_S) as axis:
@@ -97,7 +97,7 @@ class Gateway:
         return task
 
     def _start_motion(self, work: Coroutine[object, object, None], name: str) -> asyncio.Future[None]:
-        """Start what may fail without ending the gateway: whoever has put it learns of it."""
+        """Start what may fail without ending the gateway: the client that has put it learns of it."""
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         ended.add_done_callback(lambda future: future.cancelled() or future.exception())  # nobody may wait for it
 

@@ -51,7 +51,7 @@ class MotorRecord:
 
     Args:
         info: what the axis is.
-        defaults: its velocity and acceleration, in units a second and a second squared, when nobody says otherwise.
+        defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
         start: keeps a task until its end.
         stop: stops the axis and latches, without control.
         moves: whether puts move it at all.

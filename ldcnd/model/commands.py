@@ -285,7 +285,7 @@ class BufferMode(StrEnum):
     """What a move does that finds the axis moving; PLCopen's buffer modes, and a refusal."""
 
     REFUSE = "refuse"
-    """It is refused: whoever sends it did not know."""
+    """It is refused: the sender did not know of the motion under way."""
     ABORTING = "aborting"
     """What it was doing ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that drive
     goes on to the new goal within the new velocity and acceleration, without a halt."""

@@ -27,7 +27,7 @@ class CommandStatus(StrEnum):
     FAILED = "failed"
     """The drive or the line failed."""
     UNKNOWN = "unknown"
-    """It may or may not have been executed; nobody can tell."""
+    """It may or may not have been executed; the outcome is unknown."""
 
 
 FINAL = frozenset(
@@ -60,7 +60,7 @@ class CommandEvent(Frozen):
     """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, which nobody asked
     for."""
     client: str | None
-    """By whom, as it calls itself; nobody has checked that."""
+    """The client, as it calls itself; not authenticated."""
     login: str | None = None
     """Common name of the certificate of the link that it came over; null behind a router, on links without certificates
     and when the sender does not say which link is its own: then nothing about it is authenticated."""

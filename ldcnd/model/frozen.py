@@ -42,7 +42,7 @@ class Frozen(BaseModel):
 
 
 def build_models(model: type[Frozen] = Frozen) -> None:
-    """Build all models that are known by now, so that whoever is to answer in time does not wait for it then."""
+    """Build all models that are known by now, so that no answer waits for it later."""
     for known in model.__subclasses__():
         known.model_rebuild()
         build_models(known)

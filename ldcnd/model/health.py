@@ -102,7 +102,7 @@ class BusHealth(Frozen):
     resynchronisations: int = Field(ge=0)
     """How often the line was fenced."""
     stray_bytes: int = Field(ge=0)
-    """Bytes that nobody had asked for."""
+    """Bytes that belong to no request."""
     losses: int = Field(ge=0)
     """How often the port was lost."""
     lanes: tuple[LaneHealth, ...]

@@ -65,7 +65,7 @@ class ModuleInfo(Frozen):
     title: str
     """What it is."""
     model: str | None
-    """Model name as in the configuration; null for a device that nobody described: it is never moved."""
+    """Model name as in the configuration; null for an unknown device: it is never moved."""
     device_id: int
     """As it reports."""
     version: int
@@ -112,7 +112,7 @@ class BusInfo(Frozen):
     resynchronisations: int
     """How often the line was fenced."""
     stray_bytes: int
-    """Bytes that nobody had asked for."""
+    """Bytes that belong to no request."""
     losses: int
     """How often the port was lost."""
     wire_busy_s: float
@@ -135,7 +135,7 @@ class Provenance(StrEnum):
     WRITTEN_AND_ACKNOWLEDGED = "written_and_acknowledged"
     """This daemon wrote it and the drive acknowledged."""
     ASSUMED = "assumed"
-    """From the configuration or from what the manual says about a reset; nobody has confirmed it."""
+    """From the configuration or from what the manual says about a reset; not confirmed."""
     UNKNOWN = "unknown"
     """Anything may be in it."""
 

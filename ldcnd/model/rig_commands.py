@@ -39,7 +39,7 @@ class Acquire(Command[LeaseReply]):
     lease_s: float = Field(default=1.0, ge=SHORTEST_LEASE_S, le=60)
     """For how long, in seconds; it must be renewed before."""
     force: bool = False
-    """Take control away from whoever has it; that is logged."""
+    """Take control from its present holder; that is logged."""
 
 
 class LeaseRequest(Frozen):
@@ -67,7 +67,7 @@ class Release(Command[LeaseReply]):
     lease: str
     """As the reply to acquire named it."""
     leave_running: bool = False
-    """Let what moves go on to its own end, with nobody in control."""
+    """Let what moves go on to its own end, without anyone in control."""
 
 
 class Holder(Frozen):
@@ -76,7 +76,7 @@ class Holder(Frozen):
     axis: str
     """The axis."""
     client: str | None
-    """Who; null when nobody does."""
+    """The client in control; null without one."""
 
 
 class HolderList(Frozen):

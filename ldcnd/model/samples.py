@@ -32,7 +32,7 @@ class Quality(StrEnum):
 
     GOOD = "good"
     UNCERTAIN = "uncertain"
-    """Measured, but with a doubt: the drive missed polls lately, or its scale is not configured."""
+    """Measured, but uncertain: the drive missed polls lately, or its scale is not configured."""
     BAD = "bad"
     """Not a measurement any more: the last known value of a drive that does not answer."""
 

@@ -214,7 +214,7 @@ class TraceAbortReply(CommandReply):
     """The trace has ended, and the drive takes settings again."""
 
     trace_id: str | None
-    """The trace that was ended; null for one that somebody else had left armed in the drive."""
+    """The trace that was ended; null for one that another host had left armed in the drive."""
 
 
 class TakeTrace(AxisCommand[TraceReply]):

@@ -1,7 +1,7 @@
 """Access rules: what a viewer and an operator may do, in the words of Zenoh's access control.
 
 Everything is denied that no rule allows. Readers may ask for `**`, because it covers neither `@cmd` nor `@stop`; the
-rules for the way out decide what they get. Nobody but the daemon may publish, answer, or show a token of a daemon.
+rules for the way out decide what they get. Only the daemon may publish, answer, or show a token of a daemon.
 The rules see the neighbour on a link, not the origin of a message: behind a router they see the router.
 
 Source: Zenoh 1.10.2, configuration `access_control`; a rule counts only when its key expression includes the message's.
@@ -98,7 +98,7 @@ def access_control(
 
     Args:
         subject: by what logins are known.
-        logins: who has which role. A role that nobody has is left out, because Zenoh refuses an empty list.
+        logins: who has which role. A role without logins is left out, because Zenoh refuses an empty list.
         permitted: what each role permits.
     """
     present = {role: names for role in permitted if (names := logins.get(role, ()))}

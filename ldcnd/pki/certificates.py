@@ -1,6 +1,6 @@
 """Certificates: an authority that signs for one site, and what it signs; the only module that knows cryptography.
 
-A viewer's or operator's certificate is good for connecting only, so nobody can pose as a daemon with it. There are no
+A viewer's or operator's certificate is good for connecting only, so it cannot be used to pose as a daemon. There are no
 revocation lists, because Zenoh reads none: who may do what is told by the policy, by common name.
 """
 
@@ -28,7 +28,7 @@ class Credentials:
 
 
 def new_authority(name: str, now: dt.datetime) -> Credentials:
-    """Return a new authority; whoever has its key can make operators."""
+    """Return a new authority; the holder of its key can make operators."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = _name(name)
     certificate = (

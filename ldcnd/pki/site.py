@@ -97,7 +97,7 @@ class Site:
         self._authority = self._credentials(AUTHORITY)
 
     def add(self, login: Login, now: dt.datetime, days: int) -> Path:
-        """Give somebody a login, and return the Zenoh configuration to hand over.
+        """Make a login, and return the Zenoh configuration to hand over.
 
         Args:
             login: who, and in which role.
@@ -170,7 +170,7 @@ class Site:
         return self._listener(own, "peer", PERMITTED_BEHIND_ROUTER)
 
     def _router(self, own: Credentials) -> dict[str, object]:
-        """Return what a Zenoh router starts with; which other routers it connects to is for whoever starts it."""
+        """Return what a Zenoh router starts with; the operator adds which other routers it connects to."""
         return {
             **self._listener(own, "router", PERMITTED_AT_ROUTER),
             "connect": {"retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]}},

@@ -16,7 +16,7 @@ BUS_TITLES = ("", "bus", "line", "busy", "exchanges", "errors", "resent", "poll 
 
 def axis_cells(row: AxisGlance) -> tuple[str, ...]:
     """Return the cells of an axis, one for each of `AXIS_TITLES`."""
-    doubt = "" if row.quality in {None, Quality.GOOD} else "?"
+    mark = "" if row.quality in {None, Quality.GOOD} else "?"
     state = row.state.value if row.state else UNKNOWN
     if row.link is LinkState.DOWN:
         state = "no answer"
@@ -28,7 +28,7 @@ def axis_cells(row: AxisGlance) -> tuple[str, ...]:
         row.bus,
         row.axis,
         state,
-        UNKNOWN if row.position is None else f"{row.position:.3f}{doubt} {row.unit}",
+        UNKNOWN if row.position is None else f"{row.position:.3f}{mark} {row.unit}",
         UNKNOWN if row.velocity is None else f"{row.velocity:.3f}",
         UNKNOWN if row.target is None else f"{row.target:.3f}",
         UNKNOWN if row.adc_volts is None else f"{row.adc_volts:.2f} V",
@@ -67,8 +67,8 @@ def _verdict(glance: RigGlance) -> str:
         return glance.trouble
     if wrong := glance.count(Severity.WRONG):
         return f"not working: {wrong}"
-    if doubtful := glance.count(Severity.NOTICE):
-        return f"to look at: {doubtful}"
+    if notices := glance.count(Severity.NOTICE):
+        return f"to look at: {notices}"
     return "nothing is wrong"
 
 

@@ -105,7 +105,14 @@ def demands(site: Site) -> tuple[Demand, ...]:
     """Return what the table compares."""
     everything, states, once_a_second = site.all_hz, site.state_hz, float(site.items)
     return (
-        Demand("each rig is watched at its own edge", everything, 1, 0.0, 0, "nothing: what nobody takes stays away"),
+        Demand(
+            "each rig is watched at its own edge",
+            everything,
+            1,
+            0.0,
+            0,
+            "nothing: samples without subscribers stay away",
+        ),
         Demand("one recorder of everything at the root", everything, 0, everything, 1, "-"),
         Demand("the same, and three displays of everything", everything, 0, everything, 4, "-"),
         Demand("states and faults at the root", states, 0, states, 1, "a narrower subscription"),

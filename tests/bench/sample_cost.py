@@ -64,8 +64,8 @@ def rows() -> list[Row]:
     return [
         Row("payload of a position sample", len(payload), "bytes"),
         Row("the same on a link, with all that Zenoh adds", asyncio.run(_wire_bytes()), "bytes"),
-        Row("daemon: to build, encode and publish a sample that nobody takes", unheard_us, "us"),
-        Row("daemon: the same for a sample that somebody takes", heard_us, "us"),
+        Row("daemon: to build, encode and publish a sample without subscribers", unheard_us, "us"),
+        Row("daemon: the same for a sample with a subscriber", heard_us, "us"),
         Row("router: to take a sample in", one_us - out_us, "us"),
         Row("router: to send it to one more", out_us, "us"),
         Row("our client: to take and decode a sample", asyncio.run(_received_us()), "us"),

@@ -259,7 +259,7 @@ class Dispatcher:
         if command.instance not in (None, self._instance):
             raise CommandExpired(
                 f"axis {axis}: {command.verb} was sent to another run of the daemon;"
-                " nobody knows whether it was carried out",
+                " it is unknown whether it was carried out",
                 axis=axis,
                 value=command.instance,
                 limit=self._instance,
