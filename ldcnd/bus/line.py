@@ -150,12 +150,17 @@ class Line:
             self._distrusted, self._missing = True, NOT_PLAIN
 
     def close(self, reason: str) -> None:
-        """Leave the line; the turn on the wire, if any, is lost. Safe to call twice."""
+        """Leave the line; the turn on the wire, if any, is lost, and no poll counts as missed by its drive.
+
+        Safe to call twice.
+        """
         if self.phase is Phase.CLOSED:
             return
         self.phase = Phase.CLOSED
         self._watchdog.cancel()
         turn, self._turn = self._turn, None
+        if turn and turn.lane is POLL:
+            turn = None
         if turn and turn.lost(ReplyTimeout(f"node {turn.exchange.node}: {reason} before the reply came")):
             self._users.again(turn)
         self._users.line_lost(reason)

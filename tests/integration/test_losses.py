@@ -3,6 +3,7 @@
 import asyncio
 
 import pytest
+from structlog.testing import capture_logs
 
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
@@ -60,6 +61,15 @@ async def pull(rig: RunningRig, chain: Chain) -> None:
     await asyncio.sleep(OUTAGE_S)
     chain.replug()
     await rig.until("x", lambda state: state.link is LinkState.UP)
+
+
+async def test_an_orderly_end_is_no_loss_of_a_drive():
+    with capture_logs() as records:
+        async with running_rig():
+            await asyncio.sleep(2.0)
+
+    assert "ended" in [record["event"] for record in records]
+    assert [record for record in records if record["event"] == "drive does not answer"] == []
 
 
 @pytest.mark.parametrize(
