@@ -77,9 +77,16 @@ class MemoryBroker:
         self.tokens: list[str] = []
 
     @asynccontextmanager
-    async def session(self, login: str | None = None) -> AsyncIterator["MemorySession"]:
-        """Join the network for as long as the context lasts; `login` stands in for a certificate."""
-        session = MemorySession(self, login)
+    async def session(
+        self, login: str | None = None, overhear: OnSample | None = None
+    ) -> AsyncIterator["MemorySession"]:
+        """Join the network for as long as the context lasts.
+
+        Args:
+            login: stands in for a certificate.
+            overhear: gets every sample that the session publishes, at once and without losing any.
+        """
+        session = MemorySession(self, login, overhear)
         try:
             yield session
         finally:
@@ -115,9 +122,10 @@ class MemoryBroker:
 class MemorySession(Session):
     """One participant; made by `MemoryBroker.session`."""
 
-    def __init__(self, broker: MemoryBroker, login: str | None = None) -> None:
+    def __init__(self, broker: MemoryBroker, login: str | None = None, overhear: OnSample | None = None) -> None:
         self._broker = broker
         self._login = login
+        self._overhear = overhear
         self._loop = asyncio.get_running_loop()
         self._declarations: list[Declaration] = []
         self._reads = Reads(self._loop)
@@ -138,9 +146,11 @@ class MemorySession(Session):
         del qos, attachment
         if self._closed:
             raise SessionError("the session is closed")
-        subscriptions = self._broker.subscriptions
-        if subscriptions:
-            self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+        if self._broker.subscriptions or self._overhear:
+            sample = Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns)
+            if self._overhear:
+                self._overhear(sample)
+            self._offer(sample)
 
     def delete(self, key: str) -> None:
         """Offer the news to every subscription that matches."""

@@ -3,6 +3,7 @@
 NAME.toml is the rig, NAME.capture what was on its line, NAME.jsonl what its daemon published meanwhile.
 """
 
+import argparse
 import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.capture.captures import lines_of
 from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.replay import config_of, overheard, play, published_line, virtual_time
+from ldcnd.daemon.process.replay import config_of, play, published_line, virtual_time
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.session import Sample
 from ldcnd.model.commands import MoveAbsolute, Power
@@ -64,7 +65,7 @@ async def _record(name: str) -> Recording:
         published.append(published_line(sample))
 
     broker = MemoryBroker()
-    async with broker.session() as clients, overheard(broker, take) as session, asyncio.TaskGroup() as group:
+    async with broker.session() as clients, broker.session(overhear=take) as session, asyncio.TaskGroup() as group:
         daemon = build_daemon(config, session, now_ns, "recorded")
         running = group.create_task(daemon.run(), name="daemon")
         await daemon.wait_up()
@@ -88,5 +89,6 @@ def _files() -> Iterator[tuple[Path, str]]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for path, text in _files():
         path.write_text(text, encoding="utf-8")

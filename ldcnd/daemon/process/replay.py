@@ -6,13 +6,11 @@ what that one published. No port is opened, no network is joined, nothing is wri
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
 from pydantic import ValidationError
-from typing_extensions import override
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import of_one_line
@@ -23,7 +21,7 @@ from ldcnd.errors import ConfigError, MalformedRequest, ReplayDeviation
 from ldcnd.messaging.codec import Encoding, as_json
 from ldcnd.messaging.keys import RIG_ITSELF, Keys
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
-from ldcnd.messaging.session import Qos, Sample, SampleKind
+from ldcnd.messaging.session import Sample
 from ldcnd.model.rig_commands import Acquire
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.transport.port_url import SOCKET
@@ -48,38 +46,6 @@ class Played:
     packets: int
     commands: int
     late_s: float
-
-
-class OverheardSession(MemorySession):
-    """A session that shows what is published to somebody first, at once and without losing any."""
-
-    def __init__(self, broker: MemoryBroker, take: Take) -> None:
-        super().__init__(broker)
-        self._take = take
-
-    @override
-    def publish(
-        self,
-        key: str,
-        payload: bytes,
-        *,
-        encoding: str,
-        qos: Qos,
-        measured_at_ns: int | None = None,
-        attachment: bytes | None = None,
-    ) -> None:
-        self._take(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
-        super().publish(key, payload, encoding=encoding, qos=qos, measured_at_ns=measured_at_ns, attachment=attachment)
-
-
-@asynccontextmanager
-async def overheard(broker: MemoryBroker, take: Take) -> AsyncIterator[OverheardSession]:
-    """Join the network of this process for as long as the context lasts."""
-    session = OverheardSession(broker, take)
-    try:
-        yield session
-    finally:
-        await session.close()
 
 
 def published_line(sample: Sample) -> str:
@@ -154,7 +120,11 @@ async def play(capture: Capture, config: RigConfig, take: Take) -> Played:
         if not replay.ended.done():
             take(sample)
 
-    async with broker.session() as clients, overheard(broker, overhear) as session, asyncio.TaskGroup() as group:
+    async with (
+        broker.session() as clients,
+        broker.session(overhear=overhear) as session,
+        asyncio.TaskGroup() as group,
+    ):
         asking: list[asyncio.Task[None]] = []
 
         def ask(text: str) -> None:
