@@ -1,8 +1,8 @@
 """A client that asks the daemon and the bare queryable in turn and prints how long each round trip took."""
 
+import argparse
 import json
 import random
-import sys
 import time
 
 import zenoh
@@ -49,4 +49,9 @@ def _round_trip_s(session: zenoh.Session, key: str, payload: bytes) -> float | N
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], int(sys.argv[3]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("daemon", help="endpoint of the daemon")
+    parser.add_argument("bare", help="endpoint of the bare queryable")
+    parser.add_argument("count", type=int, help="round trips")
+    options = parser.parse_args()
+    main(options.daemon, options.bare, options.count)

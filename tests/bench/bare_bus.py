@@ -1,8 +1,8 @@
 """A bus that polls the drives of a paced line as fast as it can and does nothing with what they say."""
 
+import argparse
 import asyncio
 import logging
-import sys
 from dataclasses import replace
 
 import structlog
@@ -59,4 +59,8 @@ async def main(terminal: str, modules: int) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1], int(sys.argv[2])))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("terminal")
+    parser.add_argument("modules", type=int)
+    options = parser.parse_args()
+    asyncio.run(main(options.terminal, options.modules))

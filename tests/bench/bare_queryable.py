@@ -1,7 +1,7 @@
 """A process that answers queries at once, over the kind of session that the daemon has: the price of a round trip."""
 
+import argparse
 import asyncio
-import sys
 
 from ldcnd.messaging.session import Query
 from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
@@ -22,4 +22,6 @@ async def main(endpoint: str) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("endpoint")
+    asyncio.run(main(parser.parse_args().endpoint))

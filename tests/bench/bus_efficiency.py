@@ -127,8 +127,10 @@ def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, r
         for name, uvloop in (("ldcnd, asyncio", False), ("ldcnd, uvloop", True)):
             line = stack.enter_context(new_line())
             config = folder / f"bench-{baud}-{uvloop}.toml"
-            rig = {"modules": MODULES, "baud": baud, "hz": 2000.0, "items": ITEMS, "drive": PIC_SERVO}
-            config.write_text(config_text(*line.terminals, uvloop=uvloop, **rig))
+            rig = config_text(
+                *line.terminals, uvloop=uvloop, modules=MODULES, baud=baud, hz=2000.0, items=ITEMS, drive=PIC_SERVO
+            )
+            config.write_text(rig)
             endpoint = free_endpoint()
             running = stack.enter_context(daemon(config, endpoint))
             listeners[name] = stack.enter_context(subscriber(endpoint))

@@ -4,9 +4,9 @@ Run as `python -m tests.bench.client_sample`; prints the processor time of a sam
 Both take the same samples at the same time, so what else the machine does blurs both alike.
 """
 
+import argparse
 import asyncio
 import subprocess
-import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -15,7 +15,8 @@ from ldcnd.messaging.codec import Encoding
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import PositionSample, Quality, TelemetryItem
+from ldcnd.model.samples import TelemetryItem
+from tests.bench.sample_cost import publish_position
 from tests.support.process import free_port
 
 RATES_HZ = (20, 100, 500, 2000)
@@ -139,25 +140,13 @@ async def _publish(topic: Topic, rate_hz: int, count: int) -> None:
     loop = asyncio.get_running_loop()
     began_s = loop.time()
     for number in range(count):
-        topic.publish(_sample(number))
+        publish_position(topic, number)
         if (ahead_s := began_s + (number + 1) / rate_hz - loop.time()) > 0:
             await asyncio.sleep(ahead_s)
 
 
-def _sample(seq: int) -> PositionSample:
-    return PositionSample(
-        t=1_700_000_000_000_000_000 + seq,
-        t_error_ns=250_000,
-        seq=seq,
-        quality=Quality.GOOD,
-        value=12.345678,
-        unit="mm",
-        counts=123_456,
-        following_error=0.001,
-    )
-
-
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for each in asyncio.run(costs()):
         print(
             f"{each.rate_hz:5} samples/s: bare {each.bare_us:6.1f} us, typed {each.typed_us:6.1f} us,"

@@ -12,6 +12,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
@@ -99,7 +100,8 @@ class Bench:
     async def _stop_s(self) -> float:
         began_s = time.monotonic()
         answer = await self.browser.post("/api/stop")
-        assert len(answer.document["rigs"]["bench"]["confirmed"]) == AXES
+        rigs: Any = answer.document["rigs"]
+        assert len(rigs["bench"]["confirmed"]) == AXES
         return time.monotonic() - began_s
 
     def _used_s(self) -> float:
@@ -110,6 +112,8 @@ async def _measured(
     endpoint: str, link: str, console: "subprocess.Popen[str]", seconds: float, rounds: int
 ) -> list[Row]:
     at = urlsplit(link)
+    assert at.hostname
+    assert at.port
     browser = await Browser(partial(ask_over_tcp, at.hostname, at.port), f"http://{at.netloc}").enter(link)
     async with asyncio.timeout(START_TIME_S):
         while not await _is_up(browser):
@@ -148,7 +152,7 @@ def _median(name: str, windows: list[Window]) -> float:
 
 
 async def _is_up(browser: Browser) -> bool:
-    rigs = (await browser.get("/api/rigs")).document["rigs"]
+    rigs: Any = (await browser.get("/api/rigs")).document["rigs"]
     return bool(rigs) and all(bus["up"] for rig in rigs for bus in rig["buses"])
 
 

@@ -4,6 +4,7 @@ Run as `python -m tests.bench.fleet_load`. Rigs hang on edge routers, edge route
 every sample at the cost that `tests.bench.sample_cost` has measured; bursts, queries and losses are not modelled.
 """
 
+import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -176,4 +177,5 @@ def _shown(use: Use) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(as_markdown(Site(), Costs()))

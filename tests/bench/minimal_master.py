@@ -7,11 +7,11 @@ it is what those cost.
 usage: python -m tests.bench.minimal_master TERMINAL BAUD MODULES STATUS_ITEMS ENDPOINT
 """
 
+import argparse
 import asyncio
 import json
 import os
 import struct
-import sys
 import termios
 import tty
 from itertools import cycle
@@ -87,4 +87,10 @@ async def main(terminal: str, baud: int, modules: int, items: int, endpoint: str
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1], *map(int, sys.argv[2:5]), sys.argv[5]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("terminal")
+    for name in ("baud", "modules", "items"):
+        parser.add_argument(name, type=int)
+    parser.add_argument("endpoint")
+    options = parser.parse_args()
+    asyncio.run(main(options.terminal, options.baud, options.modules, options.items, options.endpoint))

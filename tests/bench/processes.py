@@ -91,7 +91,7 @@ def heard(running: subprocess.Popen) -> str:
     """
     assert running.stdout
     if not select.select([running.stdout], [], [], PATIENCE_S)[0]:
-        raise RuntimeError(f"{running.args}: not a word within {PATIENCE_S:g} s; this machine is too busy to measure")
+        raise RuntimeError(f"{running.args!r}: not a word within {PATIENCE_S:g} s; this machine is too busy to measure")
     return running.stdout.readline()
 
 

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 
 import zenoh
 from zenoh.handlers import Callback
@@ -24,12 +25,16 @@ def session(endpoint: str) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(client)))
 
 
+def _ignore(_reply: zenoh.Reply) -> None:
+    """Have the link read an answer and nothing else."""
+
+
 def read(link: zenoh.Session, selector: str, outstanding: int, answered: threading.Semaphore) -> None:
     """Keep so many queries unanswered for good."""
     ended = threading.Semaphore(0)
     while True:
         for _ in range(outstanding):
-            link.get(selector, Callback(lambda _: None, ended.release, indirect=False), timeout=10.0)
+            link.get(selector, Callback(_ignore, ended.release, indirect=False), timeout=10.0)
             outstanding = 0
         ended.acquire()
         answered.release()
@@ -40,7 +45,7 @@ def ask_and_freeze(endpoint: str, selector: str, outstanding: int) -> None:
     """Ask so many times, then stop as a whole: nothing is read any more."""
     link = session(endpoint)
     for _ in range(outstanding):
-        link.get(selector, Callback(lambda _: None, lambda: None, indirect=False), timeout=10.0)
+        link.get(selector, Callback(_ignore, lambda: None, indirect=False), timeout=10.0)
     print("asked", flush=True)
     os.kill(os.getpid(), signal.SIGSTOP)
 
@@ -70,6 +75,8 @@ def main() -> None:
         return
     begun = threading.Semaphore(0)
     for _ in range(options.links):
+        run: Callable[..., None]
+        arguments: tuple[object, ...]
         if options.freeze:
             one = (options.endpoint, options.selector, "1", str(options.outstanding), "--freeze", "0")
             run, arguments = replace_for_good, ([sys.executable, "-m", __spec__.name, *one], options.freeze, begun)

@@ -6,6 +6,7 @@ first byte of the request to last byte of the reply, as the flight recorder of t
 with the bare queryable: it is Zenoh twice and the daemon once.
 """
 
+import argparse
 import asyncio
 import json
 import logging
@@ -122,5 +123,6 @@ def _quantile(values: list[float], share: float) -> float:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     print(table(rows()))

@@ -4,6 +4,7 @@ Run as `python -m tests.bench.sample_cost`. A router is a Python session in rout
 without plugins. Processor times are those of the processes, so other load on the machine only blurs them.
 """
 
+import argparse
 import asyncio
 import os
 import subprocess
@@ -14,12 +15,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from ldcnd.daemon.publish.publisher import Publisher
+from ldcnd.daemon.publish.publisher import Publisher, Topic
 from ldcnd.messaging.codec import Encoding, encode
 from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import PositionSample, Quality, TelemetryItem
+from ldcnd.model.samples import Quality, TelemetryItem
 from tests.bench.report import Row, table
 from tests.support.process import free_port
 from tests.support.router import PROGRAM as ROUTER
@@ -54,110 +56,119 @@ asyncio.run(main())
 """
 
 
-def rows() -> list[Row]:
-    """Measure everything."""
-    unheard_us, _ = asyncio.run(_published(0))
-    heard_us, one_us = asyncio.run(_published(1))
-    _, many_us = asyncio.run(_published(MANY))
+def rows(samples: int = SAMPLES) -> list[Row]:
+    """Measure everything, each figure with so many samples."""
+    unheard_us, _ = asyncio.run(_published(0, samples))
+    heard_us, one_us = asyncio.run(_published(1, samples))
+    _, many_us = asyncio.run(_published(MANY, samples))
     out_us = (many_us - one_us) / (MANY - 1)
-    payload, _ = encode(_sample(0), Encoding.MSGPACK)
     return [
-        Row("payload of a position sample", len(payload), "bytes"),
-        Row("the same on a link, with all that Zenoh adds", asyncio.run(_wire_bytes()), "bytes"),
+        Row("payload of a position sample", asyncio.run(_payload_bytes()), "bytes"),
+        Row("the same on a link, with all that Zenoh adds", asyncio.run(_wire_bytes(samples)), "bytes"),
         Row("daemon: to build, encode and publish a sample without subscribers", unheard_us, "us"),
         Row("daemon: the same for a sample with a subscriber", heard_us, "us"),
         Row("router: to take a sample in", one_us - out_us, "us"),
         Row("router: to send it to one more", out_us, "us"),
-        Row("our client: to take and decode a sample", asyncio.run(_received_us()), "us"),
-        Row("router: memory for a key that is published on", asyncio.run(_key_bytes()), "bytes"),
+        Row("our client: to take and decode a sample", asyncio.run(_received_us(samples)), "us"),
+        Row("router: memory for a key that is published on", asyncio.run(_key_bytes(samples)), "bytes"),
     ]
 
 
-def _sample(seq: int) -> PositionSample:
-    return PositionSample(
-        t=1_700_000_000_000_000_000 + seq,
-        t_error_ns=250_000,
-        seq=seq,
-        quality=Quality.GOOD,
+def publish_position(topic: Topic, number: int) -> None:
+    """Publish what a poll reads, as the daemon does."""
+    topic.publish(
+        1_700_000_000_000_000_000 + number,
+        250_000,
+        Quality.GOOD,
         value=12.345678,
         unit="mm",
+        turns=None,
         counts=123_456,
         following_error=0.001,
     )
 
 
-async def _published(subscribers: int) -> tuple[float, float]:
+async def _payload_bytes() -> int:
+    async with MemoryBroker().session() as session:
+        topic = Publisher(session, KEYS, Encoding.MSGPACK).item("x", TelemetryItem.POSITION)
+        publish_position(topic, 0)
+        assert topic.sample
+        return len(encode(topic.sample, Encoding.MSGPACK)[0])
+
+
+async def _published(subscribers: int, samples: int) -> tuple[float, float]:
     """Return the processor time of publisher and router for a sample, in us."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ExitStack() as running:
-        router = running.enter_context(_program(ROUTER, endpoint))
+        router = running.enter_context(program(ROUTER, endpoint))
         if subscribers:
-            running.enter_context(_program(SUBSCRIBER, endpoint, str(subscribers)))
+            running.enter_context(program(SUBSCRIBER, endpoint, str(subscribers)))
         async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
             publisher = Publisher(session, KEYS, Encoding.MSGPACK)
-            await _publish(publisher, SAMPLES // 10)  # until everything is declared
+            await _publish(publisher, max(1, samples // 10))  # until everything is declared
             await asyncio.sleep(0.5)
             began_s, routed_s = time.process_time(), _processor_s(router.pid)
-            await _publish(publisher, SAMPLES)
+            await _publish(publisher, samples)
             own_s = time.process_time() - began_s
             await asyncio.sleep(0.5)
             router_s = _processor_s(router.pid) - routed_s
-    return own_s / SAMPLES * 1e6, router_s / SAMPLES * 1e6
+    return own_s / samples * 1e6, router_s / samples * 1e6
 
 
-async def _wire_bytes() -> float:
+async def _wire_bytes(samples: int) -> float:
     """Return how many bytes a sample has on the link to a router, several in a batch."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with _program(ROUTER, endpoint), _program(SUBSCRIBER, endpoint, "1"), _Relay(endpoint).running() as relay:
+    with program(ROUTER, endpoint), program(SUBSCRIBER, endpoint, "1"), _Relay(endpoint).running() as relay:
         async with open_zenoh_session(ZenohSettings(mode="client", connect=(relay.endpoint,))) as session:
             publisher = Publisher(session, KEYS, Encoding.MSGPACK)
-            await _publish(publisher, SAMPLES // 10)
+            await _publish(publisher, max(1, samples // 10))
             await asyncio.sleep(0.5)
             before = relay.bytes
-            await _publish(publisher, SAMPLES // 10)
+            await _publish(publisher, max(1, samples // 10))
             await asyncio.sleep(0.5)
-            return (relay.bytes - before) / (SAMPLES // 10)
+            return (relay.bytes - before) / (max(1, samples // 10))
 
 
 async def _publish(publisher: Publisher, count: int) -> None:
     for number in range(count):
-        publisher.item("x", TelemetryItem.POSITION).publish(_sample(number))
+        publish_position(publisher.item("x", TelemetryItem.POSITION), number)
         if number % BATCH == BATCH - 1:
             await asyncio.sleep(PAUSE_S)
 
 
-async def _received_us() -> float:
+async def _received_us(samples: int) -> float:
     """Return the processor time of a program that iterates over `RigClient.samples`, for a sample."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with _program(ROUTER, endpoint), _program(CLIENT, endpoint) as client:
+    with program(ROUTER, endpoint), program(CLIENT, endpoint) as client:
         async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
             publisher = Publisher(session, KEYS, Encoding.MSGPACK)
-            await _publish(publisher, SAMPLES // 10)
+            await _publish(publisher, max(1, samples // 10))
             await asyncio.sleep(0.5)
             before_s = _processor_s(client.pid)
-            await _publish(publisher, SAMPLES)
+            await _publish(publisher, samples)
             await asyncio.sleep(0.5)
-            return (_processor_s(client.pid) - before_s) / SAMPLES * 1e6
+            return (_processor_s(client.pid) - before_s) / samples * 1e6
 
 
-async def _key_bytes() -> float:
+async def _key_bytes(samples: int) -> float:
     """Return by how much a router grows with each key that a daemon publishes on and a subscriber takes."""
+    keys = min(KEYS_DECLARED, samples)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with _program(ROUTER, endpoint) as router, _program(SUBSCRIBER, endpoint, "1"):
+    with program(ROUTER, endpoint) as router, program(SUBSCRIBER, endpoint, "1"):
         async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
             publisher = Publisher(session, KEYS, Encoding.MSGPACK)
-            await _publish(publisher, SAMPLES // 10)
+            await _publish(publisher, max(1, samples // 10))
             before = _resident_bytes(router.pid)
-            for number in range(KEYS_DECLARED):
-                publisher.item(f"a{number}", TelemetryItem.POSITION).publish(_sample(0))
+            for number in range(keys):
+                publish_position(publisher.item(f"a{number}", TelemetryItem.POSITION), 0)
                 if number % BATCH == 0:
                     await asyncio.sleep(PAUSE_S)
             await asyncio.sleep(2.0)
-            return (_resident_bytes(router.pid) - before) / KEYS_DECLARED
+            return (_resident_bytes(router.pid) - before) / keys
 
 
 @contextmanager
-def _program(text: str, *arguments: str) -> "Iterator[subprocess.Popen[bytes]]":
+def program(text: str, *arguments: str) -> "Iterator[subprocess.Popen[bytes]]":
     """Run a Python program until the context ends; it has said "ready" when the context begins."""
     process = subprocess.Popen(  # noqa: S603 - our own programs
         [sys.executable, "-c", text, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -224,4 +235,6 @@ class _Relay:
 
 
 if __name__ == "__main__":
-    print(table(rows()))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=SAMPLES, help="for each figure")
+    print(table(rows(parser.parse_args().samples)))

@@ -115,14 +115,16 @@ def _measure(
     dice = random.Random(1)
     loads: dict[Shape, list[Load]] = {shape: [] for shape in shapes}
     with ExitStack() as stack:
-        subjects = {}
+        subjects: dict[Shape, Subject] = {}
         for shape in shapes:
             paced = stack.enter_context(
                 paced_lines(line_program, lines=shape.lines, modules=shape.axes, ready_baud=0, burst=in_one_piece)
             )
             config, endpoint = folder / f"scaling-{len(subjects)}.toml", free_endpoint()
-            settings = {"modules": shape.axes, "baud": BAUD, "hz": 2000.0, "items": shape.items}
-            config.write_text(config_text(*paced.terminals, uvloop=True, **settings))
+            rig = config_text(
+                *paced.terminals, uvloop=True, modules=shape.axes, baud=BAUD, hz=2000.0, items=shape.items
+            )
+            config.write_text(rig)
             running = stack.enter_context(daemon(config, endpoint))
             stack.enter_context(subscriber(endpoint))
             subjects[shape] = Subject(str(shape), running, paced)

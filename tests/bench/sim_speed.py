@@ -7,6 +7,7 @@ Run as `python -m tests.bench.sim_speed`. Two questions:
   with nothing to do.
 """
 
+import argparse
 import asyncio
 import os
 import select
@@ -21,7 +22,7 @@ from pathlib import Path
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.driver import AxisSpec, Gains, Motion
+from ldcnd.drivers.driver import AxisSpec, Gains, Motion, Moves
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
@@ -99,22 +100,23 @@ async def _virtual(modules: int) -> tuple[float, float, float]:
         running = group.create_task(bus.run(), name="bus")
         await bus.wait_opened()
         await network.bring_up()
-        for axis in network.axes.values():
-            await axis.power(on=True)
-            await axis.load(Motion(FAR, 20_000.0, 200_000.0))
-            await axis.start()
+        for drive in network.axes.values():
+            assert isinstance(drive, Moves)
+            await drive.power(on=True)
+            await drive.load(Motion(FAR, 20_000.0, 200_000.0))
+            await drive.start()
         loop = asyncio.get_running_loop()
 
         began_s = time.process_time()
         for module in chain.modules:
-            module.catch_up(loop.time() + VIRTUAL_S)  # type: ignore[attr-defined]
+            module.catch_up(loop.time() + VIRTUAL_S)
         unpolled = VIRTUAL_S / (time.process_time() - began_s)
         await asyncio.sleep(VIRTUAL_S)
 
         began_s, from_s, count = time.process_time(), loop.time(), 0
-        for axis in cycle(specs):
+        for spec in cycle(specs):
             await bus.execute(
-                commands.read_status(Node(axis.address, LS_182AP), StatusItem.POSITION | StatusItem.VELOCITY)
+                commands.read_status(Node(spec.address, LS_182AP), StatusItem.POSITION | StatusItem.VELOCITY)
             )
             count += 1
             if loop.time() >= from_s + VIRTUAL_S:
@@ -176,4 +178,5 @@ def _processor_s(process: int) -> float:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()

@@ -5,6 +5,7 @@ of their own on bare Zenoh. Rounds without and with a load take turns, so that w
 Daemon and stopping client go ahead of other programs, the readers behind: they stand for other machines.
 """
 
+import argparse
 import asyncio
 import contextlib
 import gc
@@ -203,4 +204,5 @@ def _median(values: list[float]) -> float:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(table(rows()))

@@ -1,7 +1,7 @@
 """A remote client that takes everything a daemon publishes and does nothing with it."""
 
+import argparse
 import signal
-import sys
 import threading
 
 import zenoh
@@ -29,10 +29,11 @@ def main(endpoint: str) -> None:
     first.wait(60)
     print("receiving", flush=True)
     signal.signal(signal.SIGUSR1, lambda *_: print(received, flush=True))
-    while True:
+    while subscription:
         signal.pause()
-    del subscription
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("endpoint")
+    main(parser.parse_args().endpoint)

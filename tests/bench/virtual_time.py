@@ -15,6 +15,8 @@ from ldcnd.daemon.process.service import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.sim.ldcn.module import SimulatedModule
+from ldcnd.sim.line import SimulatedLine
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.bench import commands_and_polls, trace_upload
 from tests.bench.report import Row
@@ -70,8 +72,12 @@ async def _saturated(rig: RunningRig, seconds: float) -> tuple[float, float]:
 
 
 async def _with_one_dead(rig: RunningRig, seconds: float) -> tuple[float, float]:
-    chain = _bus(rig)._line.wire._transport._chain
-    chain.modules[-1].power(on=False, at_s=asyncio.get_running_loop().time())
+    line = _bus(rig)._line
+    assert line
+    assert isinstance(line.wire.transport, SimulatedLine)
+    module = line.wire.transport._chain.modules[-1]
+    assert isinstance(module, SimulatedModule)
+    module.power(on=False, at_s=asyncio.get_running_loop().time())
     return await _saturated(rig, seconds)
 
 

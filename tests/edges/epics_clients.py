@@ -3,6 +3,7 @@
 Each prints nothing and exits with 0, or raises. A process for each: libca reads its environment once.
 """
 
+import argparse
 import asyncio
 import sys
 import time
@@ -119,4 +120,8 @@ def caproto_tools(record: str) -> None:
 CLIENTS = {client.__name__: client for client in (caget, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools)}
 
 if __name__ == "__main__":
-    CLIENTS[sys.argv[1]](sys.argv[2])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("client", choices=CLIENTS)
+    parser.add_argument("record")
+    options = parser.parse_args()
+    CLIENTS[options.client](options.record)

@@ -4,10 +4,10 @@ Run as `python -m tests.support.killed_recorder FILE SECONDS AXES`; prints how m
 flush, and how many in all.
 """
 
+import argparse
 import asyncio
 import os
 import signal
-import sys
 from pathlib import Path
 
 from ldcnd.recording.mcap_file import McapFile
@@ -35,5 +35,10 @@ async def record_and_die(path: Path, seconds: float, axes: int) -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("axes", type=int)
+    options = parser.parse_args()
     with asyncio.Runner(loop_factory=JumpingLoop) as runner:
-        runner.run(record_and_die(Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])))
+        runner.run(record_and_die(options.file, options.seconds, options.axes))

@@ -1,5 +1,6 @@
 """The table of verbs and where each can be reached; `python -m tests.support.verb_table` writes the page anew."""
 
+import argparse
 import functools
 import inspect
 import re
@@ -180,4 +181,5 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     PAGE.write_text(verb_table(), encoding="utf-8")

@@ -1,0 +1,60 @@
+"""Every module that can be started with `-m` starts: each says what it is for, and nothing on a page is broken."""
+
+import runpy
+import sys
+
+import pytest
+
+from tests.bench.sample_cost import rows
+from tests.support.process import ROOT
+
+IN_THE_GUEST = "tests/guest/agent.py"
+"""Runs in the virtual machine only, which has no `tests`."""
+STARTED = "if __name__ ==" + ' "__main__":'
+
+
+def started() -> list[str]:
+    files = [file for folder in ("ldcnd", "tests") for file in (ROOT / folder).rglob("*.py")]
+    names = {
+        str(file.relative_to(ROOT))
+        for file in files
+        if file.name == "__main__.py" or STARTED in file.read_text(encoding="utf-8")
+    }
+    return sorted(names - {IN_THE_GUEST})
+
+
+@pytest.mark.parametrize("file", started())
+def test_a_module_that_can_be_started_says_what_it_is_for(file, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [file, "--help"])
+
+    try:
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(ROOT / file), run_name="__main__")
+    except ModuleNotFoundError as error:
+        if str(error.name).partition(".")[0] in {"ldcnd", "tests"}:
+            raise
+        pytest.skip(f"needs {error.name}")
+
+    assert not ended.value.code
+    assert "usage:" in capsys.readouterr().out.lower()
+
+
+def test_all_that_pages_tell_readers_to_start_can_be_started():
+    pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "CONTRIBUTING.md", ROOT / "README.md"]
+    told = {
+        word.rstrip("`.,;:)")
+        for page in pages
+        for part in page.read_text(encoding="utf-8").split("python -m tests")[1:]
+        for word in [f"tests{part.split()[0]}"]
+    }
+
+    assert len(told) > 5
+    known = {file.removesuffix(".py").removesuffix("/__main__").replace("/", ".") for file in started()}
+    assert told <= known | {"tests.bench", "tests.mutants"}
+
+
+@pytest.mark.real_time
+def test_the_cost_of_a_sample_is_measured():
+    figures = {row.name: row.value for row in rows(samples=20)}
+
+    assert figures["payload of a position sample"] < figures["the same on a link, with all that Zenoh adds"] < 1000
