@@ -4,13 +4,13 @@ import asyncio
 
 from ldcnd.client import presence
 from ldcnd.client.rig_client import RigClient, find_rigs
-from ldcnd.client.trouble import axis_troubles
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.messaging.session import Session
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, DaemonInfo
 from ldcnd.model.samples import FaultSample, StateSample
+from ldcnd.model.trouble import axis_troubles, line_troubles
 
 ASKED_AT_ONCE = 8
 """So many rigs are asked one beside the other."""
@@ -120,7 +120,7 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
     problems = []
     if health and health.loop_lag_s > LATE_S:
         problems.append(f"the daemon is late by {health.loop_lag_s:.2f} s")
-    problems += [f"line {bus.bus} is not up" for bus in buses if not bus.up]
+    problems += [f"{bus.bus}: {trouble.text}" for bus in buses for trouble in line_troubles(up=bus.up)]
     down = {bus.bus for bus in buses if not bus.up}
     problems += [
         f"{axis.info.axis}: {trouble.text}"

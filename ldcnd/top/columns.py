@@ -1,7 +1,7 @@
 """The words in which a glance is shown: one table of axes, one of lines."""
 
-from ldcnd.client.trouble import Severity
 from ldcnd.model.samples import LinkState, Moving, Quality
+from ldcnd.model.trouble import Severity
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 UNKNOWN = "-"

@@ -1,8 +1,8 @@
 """A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
 
-from ldcnd.client.trouble import Severity
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
+from ldcnd.model.trouble import Severity
 
 
 class Glance(Frozen):

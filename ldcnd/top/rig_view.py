@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-from ldcnd.client.trouble import Severity, Trouble, axis_troubles
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind
@@ -24,6 +23,7 @@ from ldcnd.model.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.model.trouble import Severity, axis_troubles, line_troubles
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 SILENT_S = 3.0
@@ -123,7 +123,8 @@ class RigView:
         fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
-        worst = next(iter(axis_troubles(state, fault, health)), _news(state))
+        worst = next(iter(axis_troubles(state, fault, health)), None)
+        news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
             axis=info.axis,
             bus=info.bus,
@@ -140,8 +141,8 @@ class RigView:
             rate_wanted_hz=health.rate_wanted_hz if health else None,
             link=state.link if state else None,
             holder=self._description.holders.get(info.axis) if self._description else None,
-            severity=worst.severity,
-            trouble=worst.text,
+            severity=worst.severity if worst else Severity.NOTICE if news else Severity.FINE,
+            trouble=worst.text if worst else news,
         )
 
     def _bus(self, report: BusHealth) -> BusGlance:
@@ -150,8 +151,8 @@ class RigView:
         errors = _errors(report)
         grown = errors - _errors(before) if before else 0
         severity, trouble = Severity.FINE, ""
-        if not report.up:
-            severity, trouble = Severity.WRONG, "down: its drives are not polled"
+        if down := line_troubles(up=report.up):
+            severity, trouble = down[0].severity, down[0].text
         elif grown > 0:
             severity, trouble = Severity.NOTICE, f"{grown} exchanges brought nothing to be trusted in the last second"
         poll, stop = _lane(report, "poll"), _lane(report, "stop")
@@ -175,11 +176,6 @@ class RigView:
     @staticmethod
     def _decoded(kept: _Kept, model: type[ModelT]) -> ModelT:
         return decode_received(model, kept.sample.payload, kept.sample.encoding)
-
-
-def _news(state: StateSample | None) -> Trouble:
-    """Return what is shown of an axis without trouble: how its last command ended, if that was not as it was asked."""
-    return Trouble(Severity.NOTICE, state.last_error) if state and state.last_error else Trouble(Severity.FINE, "")
 
 
 def _errors(report: BusHealth) -> int:

@@ -5,18 +5,23 @@ import os
 import signal
 import statistics
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
 from ldcnd.config.rig import HeartbeatConfig, RigConfig
+from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.process.heartbeat import Heartbeat
 from ldcnd.errors import ConfigError
 from ldcnd.messaging.codec import decode
 from ldcnd.model.health import DaemonHealth, HeartbeatHealth
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.transport.level import LevelFile
+from ldcnd.transport.level import LevelFile, Output
 from tests.support.chain_rig import rig_on, simulated_config
 from tests.support.process import ROOT, answering, free_port
 
@@ -87,7 +92,7 @@ async def test_it_does_not_begin_before_every_line_is_up(tmp_path, changes_s):
         found = await health(rig)
 
     assert changes_s == []
-    assert found.why == "line line0 is not up"
+    assert found.why == "line0: the line is not up"
 
 
 async def test_it_stops_when_a_line_no_longer_answers_and_goes_on_when_it_does(tmp_path, changes_s):
@@ -119,7 +124,7 @@ async def test_it_stops_when_one_drive_is_lost(tmp_path, changes_s):
         found = await health(rig)
 
     assert changes_s[-1] <= down_s + HALF_S + ALMOST_S
-    assert found.why == "the drive of axis y does not answer"
+    assert found.why == "y: the drive does not answer"
 
 
 async def test_it_stops_while_a_stop_is_not_confirmed(tmp_path, changes_s):
@@ -160,6 +165,31 @@ async def test_an_output_that_is_gone_is_opened_again(tmp_path, changes_s, monke
 
     assert found.why == "the output is gone: [Errno 5] Input/output error"
     assert len(changes_s) > seen
+
+
+@pytest.mark.real_time
+async def test_work_that_fills_the_threads_of_the_loop_does_not_hold_it():
+    loop, changed, over = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+    pool = ThreadPoolExecutor(max_workers=1)
+    loop.set_default_executor(pool)
+    pool.submit(over.wait)
+
+    class Wire(Output):
+        def set(self, level):
+            loop.call_soon_threadsafe(changed.set)
+
+        def close(self):
+            pass
+
+    heartbeat = Heartbeat(HeartbeatConfig(file=Path("level")), Rig("sim", (), {}), lambda _config: Wire())
+    beating = asyncio.create_task(heartbeat.run(), name="heartbeat")
+    try:
+        async with asyncio.timeout(10.0):
+            await changed.wait()
+    finally:
+        over.set()
+        beating.cancel()
+        await asyncio.gather(beating, return_exceptions=True)
 
 
 async def test_the_line_goes_on_when_the_output_cannot_be_opened(tmp_path):

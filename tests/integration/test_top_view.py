@@ -3,9 +3,9 @@
 import asyncio
 from contextlib import asynccontextmanager
 
-from ldcnd.client.trouble import Severity
 from ldcnd.model.commands import Halt, MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.model.trouble import Severity
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.top.columns import as_text, headline
 from ldcnd.top.follow import follow

@@ -114,7 +114,7 @@ async def test_a_line_that_is_lost_is_told_once_and_not_for_each_of_its_axes():
 
         (view,) = await survey(session)
 
-    assert view.problems == ("line line0 is not up",)
+    assert view.problems == ("line0: the line is not up",)
 
 
 async def test_what_is_wrong_with_an_axis_is_told_in_words():

@@ -145,7 +145,7 @@ async def test_ready_comes_first_and_stopping_last(manager: Manager):
         messages = await manager.listen(2)
 
     messages += manager.heard()
-    assert messages[0].startswith("READY=1\nSTATUS=rig sim: 0/1 buses, 0/4 axes up; bus line0: ")
+    assert messages[0].startswith("READY=1\nSTATUS=rig sim: 0/1 buses, 0/4 axes up; line0: the line is not up: ")
     assert any("STATUS=rig sim: 1/1 buses, 4/4 axes up" in message for message in messages)
     assert messages[-1] == "STOPPING=1\nSTATUS=stopping: axes come to rest"
 
@@ -192,7 +192,7 @@ async def test_port_that_is_not_there_is_told_and_does_not_starve_the_watchdog(m
         fed = sum("WATCHDOG=1" in message for message in await manager.listen(60))
         text = describe(daemon.rig)
 
-    assert text.startswith("rig sim: 0/1 buses, 0/4 axes up; bus line0: ")
+    assert text.startswith("rig sim: 0/1 buses, 0/4 axes up; line0: the line is not up: ")
     assert "/dev/ldcn-is-not-there" in text
     assert fed >= 60 / WATCHDOG_S * 2
 

@@ -4,9 +4,9 @@ from importlib import resources
 
 import pytest
 
-from ldcnd.client.trouble import Severity, Trouble, axis_troubles
 from ldcnd.model.health import AxisHealth, ItemHealth
 from ldcnd.model.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
+from ldcnd.model.trouble import Severity, Trouble, axis_troubles, line_troubles
 
 
 def state(**changes) -> StateSample:
@@ -47,12 +47,16 @@ def health(rate_hz: float, *, wanted_hz: float = 20.0, asked_hz: float | None = 
     )
 
 
-def notice(text: str) -> tuple[Trouble, ...]:
-    return (Trouble(Severity.NOTICE, text),)
+def said(troubles: tuple[Trouble, ...]) -> list[tuple[Severity, str]]:
+    return [(trouble.severity, trouble.text) for trouble in troubles]
 
 
-def wrong(text: str) -> tuple[Trouble, ...]:
-    return (Trouble(Severity.WRONG, text),)
+def notice(text: str) -> list[tuple[Severity, str]]:
+    return [(Severity.NOTICE, text)]
+
+
+def wrong(text: str) -> list[tuple[Severity, str]]:
+    return [(Severity.WRONG, text)]
 
 
 def test_an_axis_that_is_well_has_none():
@@ -60,13 +64,19 @@ def test_an_axis_that_is_well_has_none():
 
 
 def test_what_was_never_heard_of_is_a_doubt():
-    assert axis_troubles(None, None, None) == notice("nothing was heard of it yet")
+    assert said(axis_troubles(None, None, None)) == notice("nothing was heard of it yet")
+
+
+def test_a_line_that_is_not_up_is_wrong_and_says_why_where_that_is_known():
+    assert line_troubles(up=True) == ()
+    assert said(line_troubles(up=False)) == wrong("the line is not up")
+    assert said(line_troubles(up=False, problem="no such port")) == wrong("the line is not up: no such port")
 
 
 def test_of_a_drive_that_does_not_answer_nothing_else_is_said():
     gone = state(link=LinkState.DOWN, state=AxisState.ERROR_STOP, stop_latched=True)
 
-    assert axis_troubles(gone, faults(entry("link_lost")), health(0.0)) == wrong("the drive does not answer")
+    assert said(axis_troubles(gone, faults(entry("link_lost")), health(0.0))) == wrong("the drive does not answer")
 
 
 def test_a_stop_that_no_drive_has_confirmed_comes_before_everything_even_of_a_drive_that_does_not_answer():
@@ -98,7 +108,7 @@ def test_faults_that_stop_come_before_warnings_and_the_first_cause_before_its_co
     [("home: no switch", "in error stop: home: no switch"), (None, "in error stop: reset it to go on")],
 )
 def test_an_error_stop_whose_fault_is_over_is_wrong_all_the_same(last_error, text):
-    assert axis_troubles(state(state=AxisState.ERROR_STOP, last_error=last_error), faults(), None) == wrong(text)
+    assert said(axis_troubles(state(state=AxisState.ERROR_STOP, last_error=last_error), faults(), None)) == wrong(text)
 
 
 def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on():
@@ -117,25 +127,26 @@ def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on(
     ],
 )
 def test_samples_that_come_too_seldom_are_told(report, told):
-    assert axis_troubles(state(), faults(), report) == (notice(told) if told else ())
+    assert said(axis_troubles(state(), faults(), report)) == (notice(told) if told else [])
 
 
 def test_polls_that_are_missed_explain_a_low_rate():
     found = axis_troubles(state(link=LinkState.DEGRADED), faults(), health(1.0))
 
-    assert found == notice("the drive missed its latest polls")
+    assert said(found) == notice("the drive missed its latest polls")
 
 
 def test_the_console_says_it_in_the_same_words():
     script = resources.files("ldcnd.console").joinpath("static/parts/problems.js").read_text(encoding="utf-8")
-    said = [
+    shown = [
         axis_troubles(state(link=LinkState.DOWN), None, None),
         axis_troubles(state(link=LinkState.DEGRADED), None, None),
         axis_troubles(state(stop_latched=True), None, None),
         axis_troubles(state(stop_pending=True), None, None),
     ]
 
-    for (trouble,) in said:
+    for (trouble,) in shown:
         assert f'"{trouble.text[0].upper()}{trouble.text[1:]}."' in script
+    assert "The line is not up: " in script
     for part in ("In error stop: ", "reset it to go on", "ewer samples a second than asked for:"):
         assert part in script

@@ -9,6 +9,7 @@ This is no safety function: it is software on a common computer. See docs/how-to
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ldcnd.config.rig import HeartbeatConfig
@@ -17,11 +18,13 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.model.health import HeartbeatHealth
-from ldcnd.model.samples import LinkState
+from ldcnd.model.trouble import Kind, axis_troubles, line_troubles
 from ldcnd.transport.level import GpioLine, LevelFile, ModemLine, Output
 
 log = get_logger("heartbeat")
 
+HOLDING = frozenset({Kind.NO_ANSWER, Kind.STOP_PENDING})
+"""What of an axis holds the level: faults and latched stops are the drive's own and the machine's business."""
 REOPEN_S = 1.0
 """Pause between two attempts to open an output that is gone."""
 
@@ -72,29 +75,34 @@ class Heartbeat:
     async def run(self) -> None:
         """Change the level until cancelled; an output that is gone is opened again once it is back."""
         loop = asyncio.get_running_loop()
-        while True:
-            try:
-                output = await loop.run_in_executor(None, self._open_wire, self._config)
-            except (OSError, ConfigError) as error:
-                self._tell(f"the output cannot be opened: {error}")
+        # a thread of its own: reloads and captures that fill the loop's do not hold it
+        thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="heartbeat")
+        try:
+            while True:
+                try:
+                    output = await loop.run_in_executor(thread, self._open_wire, self._config)
+                except (OSError, ConfigError) as error:
+                    self._tell(f"the output cannot be opened: {error}")
+                    await asyncio.sleep(REOPEN_S)
+                    continue
+                try:
+                    await self._change(output, thread)
+                except OSError as error:
+                    self._tell(f"the output is gone: {error}")
+                finally:
+                    output.close()
                 await asyncio.sleep(REOPEN_S)
-                continue
-            try:
-                await self._change(output)
-            except OSError as error:
-                self._tell(f"the output is gone: {error}")
-            finally:
-                output.close()
-            await asyncio.sleep(REOPEN_S)
+        finally:
+            thread.shutdown(wait=False, cancel_futures=True)
 
-    async def _change(self, output: Output) -> None:
+    async def _change(self, output: Output, thread: ThreadPoolExecutor) -> None:
         """Change the level every half period, in step with the loop's clock and one change at a time."""
         loop = asyncio.get_running_loop()
         while True:
             self._tell(self._trouble(loop.time()))
             if not self._why:
                 self._level = not self._level
-                await loop.run_in_executor(None, output.set, self._level)
+                await loop.run_in_executor(thread, output.set, self._level)
                 self._changes += 1
             await asyncio.sleep(self._config.half_period_ms / 1000)
 
@@ -112,17 +120,16 @@ class Heartbeat:
         if replies != before:
             since_s = now_s
         self._replies[name] = (replies, since_s)
-        if line.report is None:
-            return f"line {name} is not up"
+        for trouble in line_troubles(up=line.report is not None):
+            return f"{name}: {trouble.text}"
         if now_s - since_s > silence_s:
-            return f"line {name} has been silent for more than {silence_s:g} s"
+            return f"{name}: no reply for more than {silence_s:g} s"
         if not line.bus.turning(now_s):
-            return f"line {name} does not keep to its plan"
+            return f"{name}: the line does not keep to its plan"
         for axis in line.axes:
-            if axis.tracker.link is LinkState.DOWN:
-                return f"the drive of axis {axis.config.name} does not answer"
-            if axis.stop_is_pending:
-                return f"no drive has confirmed the stop of axis {axis.config.name}"
+            for trouble in axis_troubles(axis.tracker):
+                if trouble.kind in HOLDING:
+                    return f"{axis.config.name}: {trouble.text}"
         return ""
 
     def _tell(self, why: str) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import NamedTuple
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.line.rig import Rig
@@ -23,7 +24,8 @@ from ldcnd.daemon.process.systemd import Notifier
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.model.plan import RigBudget
-from ldcnd.model.samples import LinkState
+from ldcnd.model.samples import FaultEntry, LinkState
+from ldcnd.model.trouble import axis_troubles, line_troubles
 from ldcnd.planning.plan import require_plan
 
 log = get_logger("service")
@@ -266,18 +268,23 @@ class Service:
 
 
 def describe(rig: Rig) -> str:
-    """Return in one line what of a rig works and what does not."""
-    buses_up = sum(bus.report is not None for bus in rig.buses)
-    down = [name for name, axis in rig.axes.items() if axis.tracker.link is LinkState.DOWN]
-    parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {len(rig.axes) - len(down)}/{len(rig.axes)} axes up"]
+    """Return in one line what of a rig works and what does not; what is true of several axes is said once."""
+    wrong: dict[str, list[str]] = {}
     for bus in rig.buses:
-        if bus.report is None:
-            why = bus.problem if bus.bus.is_open else bus.bus.loss_reason or bus.problem
-            parts.append(f"bus {bus.bus.settings.name}: {why}")
-    lost = [axis for bus in rig.buses if bus.report for axis in down if axis in {one.config.name for one in bus.axes}]
-    if lost:
-        parts.append(f"no answer from {', '.join(lost)}")
-    faulty = [name for name, axis in rig.axes.items() if axis.tracker.active_faults]
-    if faulty:
-        parts.append(f"faults on {', '.join(faulty)}")
-    return "; ".join(parts)
+        name, up = bus.bus.settings.name, bus.report is not None
+        why = bus.problem if bus.bus.is_open else bus.bus.loss_reason or bus.problem
+        for trouble in line_troubles(up=up, problem=why):
+            wrong.setdefault(trouble.text, []).append(name)
+        for axis in bus.axes if up else ():
+            tracker = axis.tracker
+            for trouble in axis_troubles(tracker, _Faults(tracker.active_faults, tracker.first_fault))[:1]:
+                wrong.setdefault(trouble.text, []).append(axis.config.name)
+    buses_up = sum(bus.report is not None for bus in rig.buses)
+    axes_up = sum(axis.tracker.link is not LinkState.DOWN for axis in rig.axes.values())
+    parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
+    return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
+
+
+class _Faults(NamedTuple):
+    active: tuple[FaultEntry, ...]
+    first: FaultEntry | None

@@ -3,7 +3,7 @@
 import { number, words } from "./format.js";
 
 const BUSY = 0.9;
-/** As `ldcnd/client/trouble.py` has it, in whose words this speaks: a report sees a sample more or less at its edges. */
+/** As `ldcnd/model/trouble.py` has it, in whose words this speaks: a report sees a sample more or less at its edges. */
 const ENOUGH = 0.9;
 const EDGE_HZ = 1;
 /** A few repeated exchanges a minute are a line's daily life; more deserve a look. */
@@ -40,7 +40,7 @@ function* ofRig(rig) {
 
 function* ofBus(rig, bus) {
   const at = { where: `${rig.name} · ${bus.name}`, link: "#/network" };
-  if (bus.info && !bus.info.up) yield { ...at, level: "bad", text: `The line is down: ${bus.info.problem}` };
+  if (bus.info && !bus.info.up) yield { ...at, level: "bad", text: `The line is not up: ${bus.info.problem}` };
   for (const remark of bus.info?.remarks ?? []) yield { ...at, level: "warn", text: remark };
   if (!bus.health) return;
   const errors = COUNTERS.reduce((sum, counter) => sum + bus.lately(counter), 0);
