@@ -4,13 +4,12 @@ import asyncio
 from typing import Any, TypeVar
 
 from ldcnd.bus.line import Line, Phase
-from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import ExchangeQueue, Lane
+from ldcnd.bus.queue import ExchangeQueue, Lane, PhaseOrder
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Job, PollTurn, StopProbe, Turn
+from ldcnd.bus.wire import BusStatistics
 from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
 from ldcnd.exchange import Exchange, Timing, condition_in_force
 from ldcnd.log import get_logger

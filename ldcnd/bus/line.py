@@ -15,9 +15,8 @@ from typing import Protocol
 from ldcnd.bus.queue import POLL
 from ldcnd.bus.resync import Fence, Probe, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
-from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import AT_ONCE, LANES, Turn
-from ldcnd.bus.wire import NEVER_S, Pieces, Watchdog, Whole, Wire
+from ldcnd.bus.wire import NEVER_S, BusStatistics, Pieces, Watchdog, Whole, Wire
 from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
 from ldcnd.exchange import ReplyVerdict, Timing
 from ldcnd.transport.transport import Transport

@@ -6,9 +6,8 @@ from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import POLL, Lane
+from ldcnd.bus.queue import POLL, Lane, PhaseOrder
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Condition, Exchange, Timing
 from ldcnd.wirelog.recorder import AT_ONCE_REMARK

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-from ldcnd.bus.order import PhaseOrder
 from ldcnd.bus.poller import Poller, next_on_grid
-from ldcnd.bus.queue import PollQueue
+from ldcnd.bus.queue import PhaseOrder, PollQueue
 from ldcnd.bus.settings import ServoCycle
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, ReplyVerdict, Timing

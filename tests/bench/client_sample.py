@@ -7,6 +7,7 @@ Both take the same samples at the same time, so what else the machine does blurs
 import argparse
 import asyncio
 import subprocess
+import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 

@@ -4,7 +4,7 @@ import asyncio
 
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.daemon.command.events import KEPT_EVENTS
+from ldcnd.daemon.command.ledger import KEPT_EVENTS
 from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
 from ldcnd.model.commands import Halt, Power
 from ldcnd.model.events import CommandStatus, ReadEvents

@@ -7,7 +7,7 @@ from itertools import accumulate, pairwise
 import pytest
 
 from ldcnd.bus.queue import Lane
-from ldcnd.bus.statistics import bucket_limit_s
+from ldcnd.bus.wire import bucket_limit_s
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.publish.health import _Rate
 from ldcnd.families.smartstep.family import LEDGER_FILE

@@ -7,8 +7,8 @@ from ldcnd.bus.line import Line
 from ldcnd.bus.queue import Lane
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.statistics import BusStatistics
 from ldcnd.bus.turn import Turn
+from ldcnd.bus.wire import BusStatistics
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.wirelog.recorder import WireLog

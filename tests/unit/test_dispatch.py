@@ -12,8 +12,7 @@ from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority
 from ldcnd.daemon.command.dispatch import Dispatcher
-from ldcnd.daemon.command.events import EventLog
-from ldcnd.daemon.command.ledger import Ledger
+from ldcnd.daemon.command.ledger import EventLog, Ledger
 from ldcnd.daemon.command.requests import PENDING_REQUESTS, Requests
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.drivers.driver import StopMode
@@ -79,8 +78,7 @@ class Commanded:
         clock = Clock(lambda: round(asyncio.get_running_loop().time() * 1e9))
         events = EventLog(x._publisher, clock, INSTANCE)
         ledger = Ledger(events.changed, clock.now_s)
-        ids = iter(f"made-{number}" for number in range(1000))
-        self.dispatcher = Dispatcher(self.rig, self.authority, ledger, events, clock, lambda: next(ids), INSTANCE)
+        self.dispatcher = Dispatcher(self.rig, self.authority, ledger, events, clock, INSTANCE)
         self.dispatcher.leases.group = group
         self.requests = Requests(self.rig, KEYS, group, self.dispatcher)
         for bench in (x, y):

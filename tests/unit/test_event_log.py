@@ -4,8 +4,7 @@ import asyncio
 from unittest.mock import Mock
 
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.events import PAGE_BYTES, TOLD_AFTER_S, UNTOLD_EVENTS, EventLog
-from ldcnd.daemon.command.ledger import Entry
+from ldcnd.daemon.command.ledger import PAGE_BYTES, TOLD_AFTER_S, UNTOLD_EVENTS, Entry, EventLog
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import BusDown, SessionError
 from ldcnd.messaging.codec import to_json

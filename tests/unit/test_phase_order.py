@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from ldcnd.bus.order import MOST_GUARD, PhaseOrder, PhaseTracker
+from ldcnd.bus.queue import MOST_GUARD, PhaseOrder, PhaseTracker
 from ldcnd.bus.settings import ServoCycle
 from ldcnd.exchange import Timing
 from tests.support.polled_chain import saturated

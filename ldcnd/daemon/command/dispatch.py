@@ -11,8 +11,7 @@ from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, Lease
-from ldcnd.daemon.command.events import EventLog
-from ldcnd.daemon.command.ledger import Entry, Ledger
+from ldcnd.daemon.command.ledger import Entry, EventLog, Ledger
 from ldcnd.daemon.command.loss import LeaseWatch, concerned, rehearse
 from ldcnd.daemon.command.why import explain
 from ldcnd.daemon.line.modules import ModuleService
@@ -80,11 +79,10 @@ class Dispatcher:
         ledger: Ledger,
         events: EventLog,
         clock: Clock,
-        next_command_id: Callable[[], str],
         instance: str,
     ) -> None:
         self.authority = authority
-        self.leases = LeaseWatch(rig, authority, events, clock, next_command_id)
+        self.leases = LeaseWatch(rig, authority, events, clock)
         self.events = events
         self.rival: str | None = None
         self._journal = Journal(rig)
@@ -92,7 +90,6 @@ class Dispatcher:
         self._rig = rig
         self._ledger = ledger
         self._clock = clock
-        self._next_command_id = next_command_id
         self._under_way: dict[str, asyncio.Event] = {}
 
     async def answer(self, axis: str, command: Command[Frozen], login: str | None = None) -> Frozen:
@@ -149,11 +146,11 @@ class Dispatcher:
         if isinstance(command, Jog) and command.renews is not None:
             self._admit(axis_name, command)
             return axis.renew_jog(command, command.renews)
-        command_id = command.command_id or self._next_command_id()
+        command_id = command.command_id or self.events.next_command_id()
         if entry := self._ledger.repeated(command_id, axis_name, command):
             if command.effect is not Effect.REST:
                 return await self._answer_again(entry)
-            command_id = self._next_command_id()
+            command_id = self.events.next_command_id()
         client = self._admit(axis_name, command) or command.client
         right = UNCONDITIONAL if command.effect is Effect.REST else self._right(axis_name, command)
         hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
@@ -214,7 +211,7 @@ class Dispatcher:
                     CommandStatus.UNKNOWN,
                     "the drive did not confirm it yet; the axis is latched",
                 )
-            command_id = self._next_command_id()
+            command_id = self.events.next_command_id()
             self._ledger.open(Entry(command_id, name, command, command.client, login, status, reason))
 
     def why(self, axis: AxisService, request: Why) -> WhyReply:

@@ -5,13 +5,13 @@ that covers less, given back - an axis that moves then does what its `loss.clien
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from ldcnd.config.axis import LossPolicy
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, Lease
-from ldcnd.daemon.command.events import EventLog
+from ldcnd.daemon.command.ledger import EventLog
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.drivers.driver import StopMode
@@ -37,15 +37,12 @@ class LeaseWatch:
         group: where policies run; None until the daemon runs, and until then nobody has control.
     """
 
-    def __init__(
-        self, rig: Rig, authority: Authority, events: EventLog, clock: Clock, next_command_id: Callable[[], str]
-    ) -> None:
+    def __init__(self, rig: Rig, authority: Authority, events: EventLog, clock: Clock) -> None:
         self.group: asyncio.TaskGroup | None = None
         self._rig = rig
         self._authority = authority
         self._events = events
         self._clock = clock
-        self._next_command_id = next_command_id
         self._refusals = LogLimit(now_s=clock.now_s)
 
     async def run(self) -> None:
@@ -112,7 +109,6 @@ class LeaseWatch:
 
     def _note(self, axis: str, lease: Lease, status: CommandStatus, reason: str, code: ErrorCode | None) -> None:
         self._events.note(
-            self._next_command_id(),
             axis,
             Acquire.verb,
             status,
@@ -124,7 +120,6 @@ class LeaseWatch:
     def _refused(self, request: Acquire, error: LdcndError) -> None:
         if error.axis is not None and self._refusals.admit() is not None:
             self._events.note(
-                self._next_command_id(),
                 error.axis,
                 Acquire.verb,
                 CommandStatus.REFUSED,

@@ -4,7 +4,6 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from itertools import count
 from types import MappingProxyType
 from typing import Any
 
@@ -16,8 +15,7 @@ from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, random_token
 from ldcnd.daemon.command.dispatch import Dispatcher
-from ldcnd.daemon.command.events import EventLog
-from ldcnd.daemon.command.ledger import Ledger
+from ldcnd.daemon.command.ledger import EventLog, Ledger
 from ldcnd.daemon.command.requests import EarlyStops
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.modules import ModuleService
@@ -84,19 +82,14 @@ def build_daemon(
     """
     clock = Clock(now_ns)
     publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
-    serial = count(1)
-
-    def next_command_id() -> str:
-        return f"{instance}-{next(serial)}"
-
     events = EventLog(publisher, clock, instance)
     ledger = Ledger(events.changed, clock.now_s)
 
     def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
-        events.note(next_command_id(), axis, verb, status, reason, code=code)
+        events.note(axis, verb, status, reason, code=code)
 
     def make_axis(axis: AxisConfig, bus: Bus, driver: Drive) -> AxisService:
-        return AxisService(axis, bus, driver, publisher, clock, next_command_id, ledger.ended, note)
+        return AxisService(axis, bus, driver, publisher, clock, events.next_command_id, ledger.ended, note)
 
     open_lines = {name: FAMILIES[name].open_lines(config.state_dir) for name in {bus.family for bus in config.bus}}
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
@@ -108,7 +101,7 @@ def build_daemon(
     )
     rig = Rig(config.rig, buses, groups, modules)
     authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
-    dispatcher = Dispatcher(rig, authority, ledger, events, clock, next_command_id, instance)
+    dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance)
 
     heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
     return Daemon(config, session, rig, dispatcher, publisher, clock, instance, stops=stops, heartbeat=heartbeat)
