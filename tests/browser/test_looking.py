@@ -11,6 +11,7 @@ from ldcnd.client.traces import fetch_trace
 from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
+from tests.support.process import ROOT
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
@@ -221,3 +222,26 @@ async def test_what_needs_attention_is_said_once_and_links_keep_the_axis(house):
         await desk.page.get_by_role("link", name="Trace", exact=True).last.click()
         await expect(desk.page.get_by_role("heading", name="Record y")).to_be_visible()
     await house.sim.quiet("x", "y")
+
+
+async def test_a_page_is_added_by_its_list(house, tmp_path):
+    main = tmp_path / "main.js"
+    text = (ROOT / "ldcnd" / "console" / "static" / "main.js").read_text(encoding="utf-8")
+    for before, added in (
+        ("import { problems }", 'import { LampPage } from "./pages/lamp.js";\n'),
+        ('  ["events", "Events", EventsPage],', '  ["lamp", "Lamp", LampPage],\n'),
+    ):
+        assert before in text
+        text = text.replace(before, added + before, 1)
+    main.write_text(text, encoding="utf-8")
+    page = tmp_path / "lamp.js"
+    page.write_text(
+        'import { html } from "../html.js";\nexport function LampPage() { return html`<h2>The lamp is on</h2>`; }\n',
+        encoding="utf-8",
+    )
+    async with house.desk() as desk:
+        await desk.page.route("**/main.js", lambda route: route.fulfill(path=main, content_type="text/javascript"))
+        await desk.page.route("**/lamp.js", lambda route: route.fulfill(path=page, content_type="text/javascript"))
+        await desk.open("rig")
+        await desk.page.get_by_role("link", name="Lamp", exact=True).click()
+        await desk.page.get_by_role("heading", name="The lamp is on").wait_for()

@@ -1,43 +1,51 @@
 """The lists in CONTRIBUTING name all that has to change: a change is made by them in a copy of the house."""
 
+import json
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.support.process import ROOT
 
-VERB = "blink"
 PROGRAM = """
-import asyncio
-from tests.support.verb_table import empty_cells
-from tests.support.rig import running_rig
-from ldcnd.daemon.publish.contract import all_schemas, channels
+import asyncio, json
+from ldcnd.cli.quantities import sample_text
 from ldcnd.client.rig import Rig
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.daemon.publish.contract import all_schemas, channels
 from ldcnd.model.samples import LinkState
+from tests.support.rig import SIMULATED, running_rig
+from tests.support.verb_table import empty_cells
+
+def config():
+    document = load_config(SIMULATED).model_dump(mode="json", exclude_unset=True)
+    bus = document["bus"][0]
+    bus["axis"] = [bus["axis"][0] | {"model": "ls-999"}]
+    document["sim"][0]["module"] = [{"model": "ls-999"}]
+    return RigConfig.model_validate(document)
 
 async def main():
-    async with running_rig() as rig:
+    async with running_rig(config()) as rig:
         await rig.until("x", lambda state: state.link is LinkState.UP)
         async with Rig(rig.client, await rig.client.daemon()).control("x", client="ann") as x:
             reply = await x.blink(3)
-        info = {axis.axis: axis for axis in await rig.client.axes()}["x"]
-    print(reply.verb, "blink" in info.capabilities, "blink_request" in all_schemas())
-    print(any(channel.key.endswith("/blink") for channel in channels()), [str(verb) for verb, _ in empty_cells()])
+        (info,) = await rig.client.axes()
+        async with rig.client.samples("x", "doubled") as samples:
+            _, sample = await anext(samples)
+    print(json.dumps({
+        "verb": reply.verb, "capabilities": info.capabilities, "schemas": sorted(all_schemas()),
+        "keys": [channel.key for channel in channels()], "unreachable": [str(verb) for verb, _ in empty_cells()],
+        "items": info.items, "text": sample_text(sample), "value": sample.value,
+        "model": info.model, "identity": info.identity,
+    }))
 
 asyncio.run(main())
 """
-
-
-@pytest.fixture
-def house(tmp_path: Path) -> Path:
-    """Return a copy of what a verb is made of."""
-    for part in ("ldcnd", "tests/support", "docs", "config"):
-        shutil.copytree(ROOT / part, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__", "images"))
-    (tmp_path / "tests" / "__init__.py").touch()
-    return tmp_path
 
 
 def insert(file: Path, before: str, text: str) -> None:
@@ -48,12 +56,12 @@ def insert(file: Path, before: str, text: str) -> None:
 
 def run(house: Path, *words: str) -> list[str]:
     command = [sys.executable, *words]
-    done = subprocess.run(command, cwd=house, capture_output=True, text=True, check=False, timeout=50)  # noqa: S603
+    done = subprocess.run(command, cwd=house, capture_output=True, text=True, check=False, timeout=110)  # noqa: S603
     assert done.returncode == 0, done.stderr[-600:]
     return [line for line in done.stdout.splitlines() if not line.startswith("20")]
 
 
-def test_a_verb_is_added_by_its_list(house: Path):
+def add_verb(house: Path) -> None:
     commands = house / "ldcnd" / "model" / "commands.py"
     insert(commands, '    SET_OUTPUTS = "set_outputs"\n', '    BLINK = "blink"\n')
     insert(
@@ -79,24 +87,116 @@ def test_a_verb_is_added_by_its_list(house: Path):
             '    """Blink with the lamp of AXIS."""\n    sender.send(axis, Blink(times=1))\n'
         )
     (house / "docs" / "how-to" / "blink.md").write_text("# Blink\n\n`ldcnd axis blink x` blinks.\n", encoding="utf-8")
-    table = house / "tests" / "support" / "verb_table.py"
-    table.write_text(
-        table.read_text(encoding="utf-8").replace(
-            "EXPLAINED = {\n", 'EXPLAINED = {\n    ("blink", "console"): "a page cannot see the lamp",\n', 1
-        ),
-        encoding="utf-8",
+    insert(
+        house / "tests" / "support" / "verb_table.py",
+        '    ("',
+        '    ("blink", "console"): "a page cannot see the lamp",\n',
     )
-    run(house, "-m", "ldcnd", "schema", "client")
 
-    told = run(house, "-c", PROGRAM)
 
-    assert told[-2:] == ["blink True True", "True []"]
+def add_item(house: Path) -> None:
+    samples = house / "ldcnd" / "model" / "samples.py"
+    insert(samples, '    ADC = "adc"\n', '    DOUBLED = "doubled"\n')
+    insert(
+        samples,
+        "class AdcSample(Sample):",
+        'class DoubledSample(Sample):\n    """Twice the position."""\n\n'
+        '    value: float\n    """In axis units."""\n\n\n',
+    )
+    insert(samples, "    TelemetryItem.ADC: AdcSample,\n", "    TelemetryItem.DOUBLED: DoubledSample,\n")
+    insert(
+        house / "ldcnd" / "daemon" / "axis" / "telemetry.py",
+        "        if TelemetryItem.VELOCITY in asked:\n",
+        "        topic = self._publisher.item(self._tracker.name, TelemetryItem.DOUBLED)\n"
+        "        topic.publish(t, t_error_ns, quality, value=2.0 * self.position(reading.position_counts))\n",
+    )
+    words = house / "ldcnd" / "cli" / "quantities.py"
+    insert(words, "    LatchSample,\n", "    DoubledSample,\n")
+    insert(
+        words,
+        "        case AdcSample():\n",
+        '        case DoubledSample():\n            return f"doubled  {sample.value:.1f}"\n',
+    )
+
+
+def add_model(house: Path) -> None:
+    profiles = house / "ldcnd" / "drivers" / "ldcn" / "profiles.py"
+    insert(
+        profiles,
+        'LS_231 = Profile("ls-231"',
+        'LS_999 = replace(LS_182AP, name="ls-999", title="Logosol LS-999", device_id=91, versions=range(1, 2))\n',
+    )
+    insert(profiles, "        LS_231,\n", "        LS_999,\n")
+    chain = house / "ldcnd" / "sim" / "ldcn" / "chain.py"
+    insert(chain, "    LS_182AP,\n", "    LS_999,\n")
+    insert(
+        chain,
+        "            (LS_182AP, ",
+        "            (LS_999, ModuleSettings(version=1, always_obeys_global_reset=True)),\n",
+    )
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a copy in which a verb, an item and a model were added, each by its list."""
+    copy = tmp_path_factory.mktemp("house")
+    for part in ("ldcnd", "tests/support", "docs", "config"):
+        shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__", "images"))
+    (copy / "tests" / "__init__.py").touch()
+    for add in (add_verb, add_item, add_model):
+        add(copy)
+    run(copy, "-m", "ldcnd", "schema", "client")
+    return copy
+
+
+@pytest.fixture(scope="module")
+def seen(house: Path) -> dict[str, Any]:
+    """Return what a program sees of a daemon of that copy."""
+    found: dict[str, Any] = json.loads(run(house, "-c", PROGRAM)[-1])
+    return found
+
+
+def test_a_verb_is_added_by_its_list(house: Path, seen: dict[str, Any]):
+    assert seen["verb"] == "blink"
+    assert "blink" in seen["capabilities"]
+    assert "blink_request" in seen["schemas"]
+    assert any(key.endswith("/blink") for key in seen["keys"])
+    assert seen["unreachable"] == []
     assert "Blink with the lamp of AXIS." in "\n".join(run(house, "-m", "ldcnd", "axis", "blink", "--help"))
 
 
-def test_the_list_names_the_files_that_the_test_changes():
-    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    listed = page.partition("## Where a change goes")[2].partition("\n## ")[0]
+def test_a_telemetry_item_is_added_by_its_list(seen: dict[str, Any]):
+    assert "doubled" in seen["items"]
+    assert "doubled_sample" in seen["schemas"]
+    assert seen["text"] == f"doubled  {seen['value']:.1f}"
 
-    for name in ("ldcnd/model/commands.py", "ldcnd/daemon/axis/commands.py", "ldcnd/cli/axis.py", "docs/how-to"):
-        assert name in listed
+
+def test_a_drive_model_is_added_by_its_list(seen: dict[str, Any]):
+    assert (seen["model"], seen["identity"]) == ("ls-999", "Logosol LS-999 (id 91, version 1)")
+
+
+LISTED = {
+    "A new verb": ("ldcnd/model/commands.py", "ldcnd/daemon/axis/commands.py", "ldcnd/cli/axis.py", "docs/how-to"),
+    "A new telemetry item": (
+        "ldcnd/model/samples.py",
+        "ldcnd/daemon/axis/telemetry.py",
+        "ldcnd/cli/quantities.py",
+        "docs/how-to",
+    ),
+    "A new drive model": ("ldcnd/drivers/ldcn/profiles.py", "ldcnd/sim/ldcn/chain.py"),
+    "A new page": ("ldcnd/console/static/main.js", "ldcnd/console/static/pages"),
+    "A new drive family": ("ldcnd/families/known.py",),
+}
+"""What the tests change, here, in `tests/browser` and with the family of `tests/toy`."""
+MOST_FILES = 7
+
+
+@pytest.mark.parametrize("change", LISTED)
+def test_a_list_names_the_files_that_its_test_changes_and_no_more_than_seven(change: str):
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    part = page.partition("## Where a change goes")[2].partition("\n## ")[0]
+    listed = re.split(r"\nA new |\.\sA new ", part.partition(change)[2])[0]
+    files = re.findall(r"`((?:ldcnd|docs)/[^`]*)`", listed.partition("\n\n1. ")[2])
+
+    assert {name for name in LISTED[change] if not any(file.startswith(name) for file in files)} == set()
+    assert 0 < len(files) <= MOST_FILES

@@ -13,16 +13,8 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import SAMPLE_MODELS, MonitorName, MonitorSample, Quality, Sample, TelemetryItem
 from ldcnd.model.traces import TraceChunk, TraceHeader
 
-QOS = {
-    TelemetryItem.POSITION: Qos.TELEMETRY,
-    TelemetryItem.VELOCITY: Qos.TELEMETRY,
-    TelemetryItem.ADC: Qos.TELEMETRY,
-    TelemetryItem.INPUTS: Qos.EVENT,
-    TelemetryItem.LATCH: Qos.EVENT,
-    TelemetryItem.IO: Qos.TELEMETRY,
-    TelemetryItem.FAULT: Qos.EVENT,
-    TelemetryItem.STATE: Qos.EVENT,
-}
+EVENTS = frozenset({TelemetryItem.INPUTS, TelemetryItem.LATCH, TelemetryItem.FAULT, TelemetryItem.STATE})
+"""Items that are published when they change: none may be lost on the way. The others come again soon."""
 
 
 Values = dict[str, Any]  # of any type: they are what the fields of some model hold
@@ -136,7 +128,8 @@ class Publisher:
 
     def item(self, axis: str, item: TelemetryItem) -> Topic:
         """Return the topic of one item of an axis."""
-        return self._topic(self._keys.telemetry(axis, item), SAMPLE_MODELS[item], QOS[item])
+        qos = Qos.EVENT if item in EVENTS else Qos.TELEMETRY
+        return self._topic(self._keys.telemetry(axis, item), SAMPLE_MODELS[item], qos)
 
     def monitor(self, axis: str, name: MonitorName) -> Topic:
         """Return the topic of one monitor of a drive."""
