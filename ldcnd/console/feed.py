@@ -5,11 +5,58 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from typing import Self
 
-from ldcnd.console.frames import MOST_NEWS, Batch, frame
+import msgpack
+
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
+
+MOST_NEWS = 200
+"""A frame carries so many events at most, the latest."""
+
+_TRIPLE = b"\x93"
+
+
+class Batch:
+    """What a frame tells: keys whose values have changed, events, and samples of streams in order.
+
+    Attributes:
+        paths: whose latest values it carries, as they are when it is encoded.
+        news: entries of events.
+        stream: entries of samples.
+    """
+
+    def __init__(self, paths: frozenset[str], news: tuple[bytes, ...] = (), stream: tuple[bytes, ...] = ()) -> None:
+        self.paths = paths
+        self.news = news
+        self.stream = stream
+        self._body: bytes | None = None
+
+    def after(self, older: "Batch", *, streams: bool) -> "Batch":
+        """Return this and what came before it as one; without the older streams if they are to be dropped."""
+        return Batch(
+            self.paths | older.paths,
+            (older.news + self.news)[-MOST_NEWS:],
+            older.stream + self.stream if streams else self.stream,
+        )
+
+    def body(self, entry: Callable[[str], bytes]) -> bytes:
+        """Return its entries as one msgpack array, made at the first call."""
+        if self._body is None:
+            self._body = _array(tuple(chain(self.stream, self.news, map(entry, self.paths))))
+        return self._body
+
+
+def frame(sent_ns: int, dropped: int, body: bytes) -> bytes:
+    """Return a frame."""
+    return b"".join((_TRIPLE, msgpack.packb(sent_ns), msgpack.packb(dropped), body))
+
+
+def _array(entries: tuple[bytes, ...]) -> bytes:
+    return msgpack.Packer().pack_array_header(len(entries)) + b"".join(entries)
+
 
 STREAM_HZ = 60.0
 """Frames a second of a page that wants every sample of something."""
