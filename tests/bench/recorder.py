@@ -4,6 +4,7 @@ Run as `python -m tests.bench.recorder`: prints the processor time of a sample, 
 that does nothing but unpack. Afterwards every sample of the file is held to the model of its schema.
 """
 
+import argparse
 import asyncio
 import sys
 import tempfile
@@ -105,10 +106,11 @@ def _valid(path: Path) -> int:
     """Return how many samples of a file are what their schemas say."""
     with path.open("rb") as stream:
         messages = (message for _, _, message in make_reader(stream).iter_messages())
-        return sum(1 for message in messages if PositionSample.model_validate_json(message.data, strict=True))
+        return len([PositionSample.model_validate_json(message.data, strict=True) for message in messages])
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     found = asyncio.run(cost())
     print(
         f"{found.sample_us:.1f} us of processor a sample, {1e6 / found.sample_us:.0f} samples a second and processor;"
