@@ -201,6 +201,7 @@ async def test_what_the_pages_compute_is_what_one_computes_by_hand(house, tmp_pa
 
 async def test_what_needs_attention_is_said_once_and_links_keep_the_axis(house):
     await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")
     await house.sim.rig.stop("x")
     await house.sim.rig.stop("y")
     async with house.desk(width=1280) as desk:
