@@ -299,8 +299,13 @@ class Moves(Readable):
         """Start what was loaded; never repeated."""
 
     @abstractmethod
-    async def stop(self, mode: StopMode) -> None:
-        """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing."""
+    async def stop(self, mode: StopMode) -> StopMode:
+        """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing.
+
+        Returns:
+            How: a motor that was switched off, or is being, is switched off again whatever was asked, as a stop that
+            holds would close its loop.
+        """
 
     @abstractmethod
     async def reset(self) -> None:

@@ -121,8 +121,9 @@ class FakeDrive(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs):
         await self._take("start")
 
     @override
-    async def stop(self, mode: StopMode) -> None:
+    async def stop(self, mode: StopMode) -> StopMode:
         await self._take("stop", mode)
+        return mode
 
     @override
     def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:

@@ -146,8 +146,9 @@ class ToyStage(Moves):
         await self._ask(Op.START)
 
     @override
-    async def stop(self, mode: StopMode) -> None:
+    async def stop(self, mode: StopMode) -> StopMode:
         await self._ask(Op.DISABLE if mode is StopMode.OFF else Op.STOP)
+        return mode
 
     @override
     async def reset(self) -> None:

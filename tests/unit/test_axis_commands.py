@@ -212,6 +212,19 @@ async def test_a_fault_that_shows_while_the_loop_is_open_is_reset_as_well():
         assert bench.drive.calls == ["reset"]
 
 
+@pytest.mark.parametrize(("fault", "call"), [(OVERHEAT, "reset"), (WARNING, "clear_warnings")])
+async def test_a_stop_that_comes_during_a_reset_keeps_its_latch(fault, call):
+    async with axis_bench() as bench:
+        bench.show(faults=(fault,))
+        bench.drive.during[call] = bench.stop
+
+        with pytest.raises(StopLatched):
+            await bench.send(Reset())
+
+        assert bench.drive.calls[-2:] == [call, "stop"]
+        assert bench.tracker.stop_latched
+
+
 async def test_a_reset_of_a_mere_warning_leaves_the_loop_as_it_is():
     async with axis_bench() as bench:
         await bench.settled(faults=(WARNING,))

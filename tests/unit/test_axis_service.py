@@ -162,7 +162,7 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
         assert bench.drive.calls == ["stop"]  # nothing is owed any more
 
 
-async def test_a_weaker_stop_that_is_confirmed_does_not_settle_a_stronger_one():
+async def test_of_two_stops_the_stronger_one_is_sent_while_it_is_owed():
     async with axis_bench() as bench:
         await moving(bench)
         bench.bus.is_open = False
@@ -171,11 +171,25 @@ async def test_a_weaker_stop_that_is_confirmed_does_not_settle_a_stronger_one():
         assert bench.drive.calls == ["stop"]  # no further round on a closed line
 
         bench.bus.is_open = True
-        assert await bench.axis.bring_to_rest(StopMode.SMOOTH)
+        assert await bench.axis.bring_to_rest(StopMode.SMOOTH)  # it may be off already: a weaker one would close it
 
-        assert bench.axis.stop_is_pending
-        await bench.axis.send_pending_stop()
         assert bench.drive.told[-1] == ("stop", StopMode.OFF)
+        assert bench.tracker.state is AxisState.DISABLED
+        assert not bench.axis.stop_is_pending
+
+
+async def test_a_drive_that_was_switched_off_instead_is_disabled():
+    async def switched_off(mode: StopMode) -> StopMode:
+        assert mode is StopMode.SMOOTH
+        return StopMode.OFF
+
+    async with axis_bench() as bench:
+        await moving(bench)
+        bench.drive.stop = switched_off
+
+        assert await bench.axis.stop(StopMode.SMOOTH)
+
+        assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.DISABLED, False)
         assert not bench.axis.stop_is_pending
 
 

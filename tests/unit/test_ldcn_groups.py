@@ -183,6 +183,16 @@ async def test_only_whole_groups_are_stopped_by_one_packet():
     assert pair.bus.sent == []
 
 
+async def test_no_packet_for_all_closes_the_loop_of_a_member_that_was_switched_off():
+    pair = await Pair().up()
+    await pair.drives["a"].stop(StopMode.OFF)
+    pair.bus.sent.clear()
+
+    await pair.groups.stop(StopMode.SMOOTH, frozenset({"a", "b"}))
+
+    assert pair.bus.sent == []
+
+
 async def test_the_group_of_everybody_is_used_only_where_there_is_nothing_but_axes():
     pair = await Pair(GroupPlan((), {1: "a", 2: "b"})).up()
     for module in pair.host.chain.modules:

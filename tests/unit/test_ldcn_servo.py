@@ -250,6 +250,27 @@ async def test_only_the_switches_ahead_of_a_motion_are_armed(motion, armed):
     assert drive.module.loop.search.control == armed
 
 
+@pytest.mark.parametrize("mode", [StopMode.SMOOTH, StopMode.ABRUPT])
+async def test_no_stop_closes_the_loop_of_a_motor_that_was_switched_off_or_is_being(mode):
+    drive = await powered()
+    stopped = []
+
+    async def stop() -> None:
+        stopped.append(await drive.axis.stop(mode))
+
+    drive.bus.instead[Command.STOP_MOTOR] = stop  # it is on the line when the other one comes
+    await drive.axis.stop(StopMode.OFF)
+    assert not drive.module.loop.servo_on
+    await stop()
+    assert not drive.module.loop.servo_on
+    assert stopped == [StopMode.OFF] * 2
+
+    await drive.power_on()
+    await stop()
+    assert drive.module.loop.servo_on
+    assert stopped[-1] is mode
+
+
 @pytest.mark.parametrize(
     ("limit_stop", "guarded", "armed"),
     [

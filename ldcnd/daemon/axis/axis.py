@@ -462,7 +462,7 @@ class AxisService:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
             self._bus.withdraw(self.driver.spec.address, overtaken)
-            return await self._confirmed_stop(mode, verb, STOP_ROUNDS)
+            return await self._confirmed_stop(self._pending, verb, STOP_ROUNDS)
         finally:
             if self._pending is not None:
                 self._not_confirmed()
@@ -553,7 +553,7 @@ class AxisService:
             mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
         for _ in range(rounds):
             try:
-                await self._moves.stop(mode)
+                mode = await self._moves.stop(mode)
             except BusError as error:
                 log.error("stop not confirmed", axis=self.config.name, reason=error.message)
                 if self._bus.is_open:

@@ -303,6 +303,7 @@ class AxisCommands:
             tracker.switched(on=False, now_s=self._motion.clock.now_s())
         elif tracker.active_faults and isinstance(self._driver, Warns):
             await self._driver.clear_warnings()
+        turn.still_wanted()  # a stop that came meanwhile keeps its latch
         tracker.cleared(self._motion.clock.now_s())
         self._motion.publish_state()
         return self._motion.reply(turn)

@@ -76,7 +76,7 @@ class QuietDrive(Protocol):
     def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
     def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
-    async def stop(self, mode: StopMode) -> None: ...  # noqa: D102
+    async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
     async def reset(self) -> None: ...  # noqa: D102
 
 
@@ -129,7 +129,7 @@ class Unmoved(Moves):
         self._refuse("move")
 
     @override
-    async def stop(self, mode: StopMode) -> None:
+    async def stop(self, mode: StopMode) -> StopMode:
         self._refuse("be stopped")
 
     @override

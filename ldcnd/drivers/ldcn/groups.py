@@ -61,6 +61,7 @@ class Groups:
         Raises:
             BusError: the line failed.
         """
+        names = frozenset(name for name in names if not self._drives[name].switched_off)  # it would close their loops
         groups = [group for group in self._plan.within(names) if self._usable(group)] if self.proven else []
         if not groups:
             return

@@ -184,6 +184,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         self._book = RegisterBook(profile)
         self._gains = spec.gains
         self._initialised = False
+        self._switching_off = 0
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
 
     def forget(self) -> None:
@@ -343,14 +344,27 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         )
         await self._load(trajectory)
 
-    async def stop(self, mode: StopMode) -> None:
+    @property
+    def switched_off(self) -> bool:
+        """Whether its motor was switched off, or is being by a packet that is on its way."""
+        return self._switching_off > 0 or self.state.known.pic_ae is False
+
+    async def stop(self, mode: StopMode) -> StopMode:
         """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
+        if self.switched_off:
+            mode = StopMode.OFF
         self._book.doubt(("velocity",))
-        await self._stop_motor(STOP_CONTROLS[mode], Lane.STOP)
+        off = mode is StopMode.OFF
+        self._switching_off += off
+        try:
+            await self._stop_motor(STOP_CONTROLS[mode], Lane.STOP)
+        finally:
+            self._switching_off -= off
         if self.state.homing_armed:
             await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
             self.state.homing_armed = False
         self.state.guard, self.state.guard_hit = "", False
+        return mode
 
     async def reset(self) -> None:
         """See `Moves`: power driver off, sticky bits cleared (LS-182AP manual, "To restore the normal operation").
