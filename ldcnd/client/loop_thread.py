@@ -2,7 +2,6 @@
 
 import asyncio
 import concurrent.futures
-import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import AbstractAsyncContextManager, contextmanager
 from typing import Any, TypeVar, TypeVarTuple
@@ -71,7 +70,11 @@ class LoopThread:
 
 @contextmanager
 def loop_thread() -> Iterator[LoopThread]:
-    """Run an event loop in a thread for as long as the context lasts."""
+    """Run an event loop in a thread for as long as the context lasts.
+
+    Raises:
+        OSError: there can be no loop, such as without a file descriptor left.
+    """
     running: concurrent.futures.Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = concurrent.futures.Future()
 
     async def stay() -> None:
@@ -79,11 +82,19 @@ def loop_thread() -> Iterator[LoopThread]:
         running.set_result((asyncio.get_running_loop(), ending))
         await ending.wait()
 
-    thread = threading.Thread(target=lambda: asyncio.run(stay()), name="ldcnd client")
-    thread.start()
-    loop, ending = running.result()
-    try:
-        yield LoopThread(loop)
-    finally:
-        loop.call_soon_threadsafe(ending.set)
-        thread.join()
+    def live() -> None:
+        with asyncio.Runner() as runner:
+            runner.get_loop()  # before there is a coroutine that would never run
+            runner.run(stay())
+
+    with concurrent.futures.ThreadPoolExecutor(1, "ldcnd client") as threads:
+        living = threads.submit(live)
+        first: set[concurrent.futures.Future[Any]] = {running, living}
+        concurrent.futures.wait(first, return_when=concurrent.futures.FIRST_COMPLETED)
+        if not running.done():
+            living.result()  # raises why there is no loop
+        loop, ending = running.result()
+        try:
+            yield LoopThread(loop)
+        finally:
+            loop.call_soon_threadsafe(ending.set)

@@ -2,6 +2,7 @@
 
 import ast
 import asyncio
+import errno
 import inspect
 import os
 import sys
@@ -17,6 +18,7 @@ from ldcnd.cli.client_reference import client_reference
 from ldcnd.cli.verb_methods import method_name, verb_methods, with_blocking_methods
 from ldcnd.client import blocking
 from ldcnd.client.axis import Axis
+from ldcnd.client.loop_thread import loop_thread
 from ldcnd.client.rig import Rig
 from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedRequest, SessionError, UnknownAxis
 from ldcnd.model.catalogue import COMMANDS
@@ -232,7 +234,17 @@ def test_what_cannot_be_opened_is_an_error_and_leaves_no_thread():
     with pytest.raises(SessionError), blocking.connect(free_endpoint()):
         pass
 
-    assert "ldcnd client" not in {thread.name for thread in threading.enumerate()}
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("ldcnd client")]
+
+
+def test_a_thread_that_cannot_have_a_loop_is_an_error(monkeypatch):
+    def none_left():
+        raise OSError(errno.EMFILE, "too many open files")
+
+    monkeypatch.setattr(asyncio.events, "new_event_loop", none_left)
+
+    with pytest.raises(OSError, match="too many"), loop_thread():
+        pass
 
 
 async def run_program(text: str, endpoint: str) -> list[str]:
