@@ -44,10 +44,8 @@ def _serve(
     with ExitStack() as stack:
         observer = None
         if wire_log:
-            if line.cutter is None:
-                raise click.UsageError(f"--wire-log: a line of family {family} has none")
             try:
-                observer = stack.enter_context(WireLogFile.open(wire_log, family, line.cutter()))
+                observer = stack.enter_context(WireLogFile.open(wire_log, family, line.cutter(), line.baud))
             except OSError as error:
                 raise click.ClickException(f"no wire log: {error}") from error
         try:
@@ -104,7 +102,7 @@ class WireLogFile:
 
     @classmethod
     @contextmanager
-    def open(cls, path: Path, family: str, cutter: PacketCutter) -> Iterator[Self]:
+    def open(cls, path: Path, family: str, cutter: PacketCutter, baud: int) -> Iterator[Self]:
         """Create the file and write the header.
 
         Raises:
@@ -115,7 +113,7 @@ class WireLogFile:
             bus="simulated",
             family=family,
             port="pty",
-            baud=19_200,
+            baud=baud,
             instance="sim",
             zero_ns=time.time_ns(),
             started_s=0.0,

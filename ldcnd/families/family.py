@@ -151,14 +151,16 @@ class ServedLine:
     Attributes:
         chain: with its drives.
         described: what `--json` says about it.
+        baud: the rate at which its drives begin.
+        cutter: makes what cuts the host's bytes into packets, for the wire log.
         baud_check: bytes at another rate are garbage.
-        cutter: makes what cuts the host's bytes into packets, for the wire log; None where there is no such log.
     """
 
     chain: Chain
     described: Mapping[str, Any]
+    baud: int
+    cutter: Callable[[], PacketCutter]
     baud_check: bool = False
-    cutter: Callable[[], PacketCutter] | None = None
 
 
 OpenLine = Callable[[BusT, Opener | None, Chain | None], Line]

@@ -36,10 +36,10 @@ async def answered(terminal: int, packet: bytes) -> bytes:
 
 @pytest.mark.real_time
 async def test_drives_of_a_file_answer_behind_a_terminal(tmp_path: Path):
-    file = tmp_path / "units.toml"
+    file, log = tmp_path / "units.toml", tmp_path / "host.capture"
     file.write_text(UNITS)
     running = await asyncio.create_subprocess_exec(
-        *LDCND, "sim", "--smartstep", str(file), "--json", stdout=PIPE, cwd=ROOT
+        *LDCND, "sim", "--smartstep", str(file), "--wire-log", str(log), "--json", stdout=PIPE, cwd=ROOT
     )
     try:
         async with asyncio.timeout(40):
@@ -57,6 +57,7 @@ async def test_drives_of_a_file_answer_behind_a_terminal(tmp_path: Path):
     assert ready["units"] == [1, 2]
     assert stored[7:11] == b"0037"
     assert alarm[7:11] == b"0010"
+    assert "unit 1: REFERENCE 0102H, 0037H" in log.read_text()
 
 
 @pytest.mark.real_time

@@ -2,12 +2,14 @@
 
 from ldcnd.cli.sim import WireLogFile
 from ldcnd.drivers.ldcn.packet import PacketReader
+from ldcnd.drivers.smartstep.packet import add_parity
+from ldcnd.drivers.smartstep.transcript import CommandCutter
 from ldcnd.wirelog.capture import parse_capture
 from ldcnd.wirelog.recorder import WireEvent
 
 
-def written(path, deeds):
-    with WireLogFile.open(path, "ldcn", PacketReader()) as log:
+def written(path, deeds, family="ldcn", cutter=PacketReader):
+    with WireLogFile.open(path, family, cutter(), 19_200) as log:
         for deed, *arguments in deeds:
             getattr(log, deed)(*arguments)
     return parse_capture(path.read_text())
@@ -26,6 +28,23 @@ def test_packets_are_records_however_the_host_cuts_them(tmp_path):
     assert [record.data.hex() for record in capture.records] == ["000000", "aa002101ff21", "aa01132034", "aa01"]
     assert [record.at_s for record in capture.records] == [0.1, 0.2, 0.3, 0.3]
     assert capture.header.family == "ldcn"
+
+
+def test_packets_of_a_smartstep_line_are_records_however_the_host_cuts_them(tmp_path):
+    path = tmp_path / "host.capture"
+    packet = b"W1001020000ED\r"
+    deeds = [
+        ("sent", 0.1, b"\r" + packet[:5], None),
+        ("sent", 0.2, packet[5:] + packet[:3] + packet, None),
+        ("received", 0.3, b"W1001020037B6\r"),
+        ("sent", 0.4, add_parity(packet), None),
+    ]
+    capture = written(path, deeds, "smartstep", CommandCutter)
+
+    sent = [record.data for record in capture.records if record.event is WireEvent.SENT]
+    assert sent == [b"\r", packet, packet[:3], packet, add_parity(packet)]
+    assert path.read_text().count("unit 1: REFERENCE 0102H, 0037H") == 1
+    assert path.read_text().count("unit 1: REFERENCE 0102H, 0000H") >= 2
 
 
 def test_rates_and_replies_are_records_and_packets_are_put_into_words(tmp_path):

@@ -1,9 +1,24 @@
-"""The records of a SmartStep line in words."""
+"""A host's characters on a SmartStep line cut into packets, and records of the line in words."""
 
-from ldcnd.drivers.smartstep.packet import decode_command, decode_reply
+from ldcnd.drivers.smartstep.packet import END, START, decode_command, decode_reply
 from ldcnd.drivers.transcript import Parts
 from ldcnd.errors import BadReply
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
+
+CHARACTER = 0x7F
+"""The eighth bit is the parity, where the host makes it."""
+
+
+class CommandCutter:
+    """Cuts what a host sends: W begins a packet, CR ends it."""
+
+    def begins(self, byte: int) -> bool:
+        """Tell whether this byte would begin a packet."""
+        return byte & CHARACTER == START[0]
+
+    def feed(self, byte: int) -> bool:
+        """Take a byte; tell whether it completes a packet."""
+        return byte & CHARACTER == END[0]
 
 
 class SmartStepTranscript:

@@ -157,7 +157,7 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
             "baud_check": spec.baud_check,
             "seed": spec.seed,
         }
-        return ServedLine(build_chain(spec), described, baud_check=spec.baud_check, cutter=PacketReader)
+        return ServedLine(build_chain(spec), described, RESET_BAUD, PacketReader, baud_check=spec.baud_check)
 
 
 LDCN = LdcnFamily()

@@ -28,7 +28,7 @@ from ldcnd.drivers.smartstep.parameters import digit_texts
 from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Echo, Framing, SmartStepProfile
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP as PROFILE
-from ldcnd.drivers.smartstep.transcript import SmartStepTranscript
+from ldcnd.drivers.smartstep.transcript import CommandCutter, SmartStepTranscript
 from ldcnd.drivers.smartstep.transfer import check_values, listed
 from ldcnd.drivers.transcript import Describe
 from ldcnd.errors import ConfigError
@@ -219,7 +219,7 @@ rates = {{ position = 0.5, velocity = 1, state = 1 }}
         config = _described(described)
         plan = faults(DEFAULT_SEED if options["seed"] is None else options["seed"])
         chain = smartstep_chain(simulated_units(config.unit, 0.0), config.wiring, config.framing, faults=plan)
-        return ServedLine(chain, {"units": [unit.number for unit in config.unit]})
+        return ServedLine(chain, {"units": [unit.number for unit in config.unit]}, BAUD, CommandCutter)
 
 
 SMARTSTEP = SmartStepFamily()
