@@ -1,7 +1,7 @@
 """An axis as a motor record: its fields, and what puts to them do.
 
 Fields follow the motor record of the EPICS collaboration. What the gateway cannot do has no field: retries, backlash,
-jogs. Limit switches are not published by the daemon, so HLS and LLS are always 0.
+jogs.
 """
 
 import asyncio
@@ -20,6 +20,7 @@ from ldcnd.model.samples import (
     AdcSample,
     AxisState,
     FaultSample,
+    InputsSample,
     LinkState,
     MonitorSample,
     Moving,
@@ -35,6 +36,7 @@ NO_LIMIT = 1e30
 REST_S = 10.0
 """Longest wait for the standstill after a motion that was ended early, in seconds."""
 SILENT = Alarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
+UNDEFINED = Alarm(AlarmStatus.UDF, AlarmSeverity.INVALID_ALARM)
 QUALITIES = {
     Quality.GOOD: NO_ALARM,
     Quality.UNCERTAIN: Alarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
@@ -42,7 +44,7 @@ QUALITIES = {
 }
 SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
 MSTA_PLUS, MSTA_DONE, MSTA_POSITION, MSTA_PROBLEM, MSTA_MOVING, MSTA_COMM = 0x1, 0x2, 0x100, 0x200, 0x400, 0x1000
-MSTA_GAIN, MSTA_HOMED = 0x800, 0x4000
+MSTA_GAIN, MSTA_HOMED, MSTA_HIGH_SWITCH, MSTA_LOW_SWITCH = 0x800, 0x4000, 0x4, 0x2000
 """Bits of MSTA that the gateway knows."""
 
 
@@ -77,6 +79,7 @@ class MotorRecord:
         self._moving = Moving.UNKNOWN
         self._changed = asyncio.Event()
         self._alarm = SILENT
+        self._switches = 0  # bits of MSTA
         velocity, acceleration = defaults
         self._highest_velocity = info.limits.velocity or NO_LIMIT
         self._make(velocity, acceleration)
@@ -212,6 +215,8 @@ class MotorRecord:
                     await self["TDIR"].show(int(sample.value > 0))
             case AdcSample():
                 await self._show_beside("adc", sample.volts, alarm, at_s)
+            case InputsSample() if self.info.limit_stop:
+                await self._take_inputs(sample, alarm, at_s)
             case FaultSample():
                 await self._show_beside("faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
                 await self._show_beside("first_fault", sample.first.code if sample.first else "")
@@ -239,12 +244,24 @@ class MotorRecord:
         await self["CNEN"].show("Enable" if sample.enabled else "Disable")
         await self["MSTA"].show(
             (MSTA_DONE if sample.moving is Moving.NO else MSTA_MOVING)
+            | self._switches
             | MSTA_GAIN * sample.enabled
             | MSTA_HOMED * sample.referenced
             | MSTA_PROBLEM * (sample.state is AxisState.ERROR_STOP)
             | MSTA_COMM * (sample.link is LinkState.DOWN)
         )
         await self.show_motion()
+
+    async def _take_inputs(self, sample: InputsSample, alarm: Alarm, at_s: float) -> None:
+        """Show the switches at the high and the low end of the axis; a drive may not show them for a while."""
+        ends = [sample.forward_limit, sample.reverse_limit]
+        if self.info.direction == "reverse":
+            ends.reverse()
+        self._switches = 0
+        for field, level, bit in zip(("HLS", "LLS"), ends, (MSTA_HIGH_SWITCH, MSTA_LOW_SWITCH), strict=True):
+            on = level is (self.info.limit_stop == "high")
+            self._switches |= bit * on
+            await self[field].show(int(on), UNDEFINED if level is None else alarm, at_s)
 
     async def silent(self) -> None:
         """Show that nothing is known of the axis: the daemon does not publish."""

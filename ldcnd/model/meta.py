@@ -189,6 +189,8 @@ class AxisInfo(Frozen):
     """A rotary axis: positions repeat after so many axis units; null for others."""
     limits: AxisLimits
     """Software limits in axis units."""
+    limit_stop: Literal["high", "low"] | None = None
+    """Level of the limit switch inputs at which the drive stops a motion towards the switch; null when it does not."""
     group: str | None = None
     """Its group: axes that `move_together` starts in the same servo cycle; null when it is in none."""
     capabilities: tuple[Verb, ...]

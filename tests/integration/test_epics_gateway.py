@@ -2,17 +2,26 @@
 
 import asyncio
 import random
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 
 import pytest
-from caproto import AccessRights, AlarmSeverity, CaprotoError, ChannelType, Forbidden
+from caproto import AccessRights, AlarmSeverity, Forbidden
 
 from ldcnd.client.rig import Rig
 from ldcnd.epics.gateway import gateway
-from ldcnd.errors import CommandAborted, LdcndError, LeaseRequired, PositionLimit, ValueOutOfRange, WrongState
+from ldcnd.errors import (
+    CommandAborted,
+    DriveFault,
+    LeaseRequired,
+    PositionLimit,
+    ValueOutOfRange,
+    WrongState,
+)
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.rig_commands import Acquire
 from ldcnd.model.samples import LinkState, Moving
+from tests.support.dialect_rig import LS_182AP, dialect_rig
+from tests.support.epics_records import VALUES, put, shows
 from tests.support.rig import running_rig, two_axes
 
 FIELDS = [
@@ -80,20 +89,6 @@ async def records(*, moves: bool = True, power: bool = True):
             yield running, made
 
 
-async def put(made, name: str, value) -> None:
-    """Put with completion, as a client does."""
-    kind = {str: ChannelType.STRING, int: ChannelType.LONG, float: ChannelType.DOUBLE}[type(value)]
-    data = [value.encode()] if isinstance(value, str) else [value]
-    async with asyncio.timeout(120):
-        await made.variables[name].auth_write("host", "user", data, kind, None)
-
-
-async def shows(made, name: str, wanted) -> None:
-    async with asyncio.timeout(30):
-        while made.variables[name].value != wanted:
-            await asyncio.sleep(0.01)
-
-
 async def test_a_put_returns_when_the_axis_stands_at_its_target():
     async with records() as (running, made):
         moving = asyncio.create_task(put(made, "T:x", 3.0))
@@ -118,6 +113,29 @@ async def test_the_record_has_the_fields_that_clients_use():
 
     assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
     assert beside == {"adc", "control", "faults", "first_fault", "message", "state", "velocity"}
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+async def test_a_limit_switch_shows_at_the_end_of_the_axis_where_it_is(direction: str):
+    async with dialect_rig(LS_182AP, limit_switches="stop", direction=direction) as drive:
+        rig = Rig(drive.rig.client, await drive.rig.client.daemon())
+        async with gateway(rig, prefix="T:", moves=("x",)) as made:
+            await shows(made, "T:x.LLS", AlarmSeverity.INVALID_ALARM, "severity")  # the power driver is off
+            assert made.variables["T:x.LLS"].value == 0
+            await shows(made, "T:x:control", "epics gateway")
+            await put(made, "T:x.CNEN", "Enable")
+            with pytest.raises(DriveFault, match="limit switch"):
+                await put(made, "T:x", 30.0)
+            await shows(made, "T:x.HLS", 1)
+            await shows(made, "T:x.LLS", 0)
+
+            await shows(made, "T:x.HLS", AlarmSeverity.NO_ALARM, "severity")
+            assert made.variables["T:x.RBV"].value < 21
+            with pytest.raises(DriveFault, match="limit switch"):
+                await put(made, "T:x", -30.0)
+            await shows(made, "T:x.LLS", 1)
+            await shows(made, "T:x.HLS", 0)
+            await shows(made, "T:x.MSTA", made.variables["T:x.MSTA"].value & ~0x4 | 0x2000)
 
 
 async def test_velocity_and_acceleration_are_those_of_the_next_move():
@@ -246,9 +264,6 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
         assert made.variables["T:x.RBV"].severity == AlarmSeverity.INVALID_ALARM
 
 
-VALUES = (0, 1, 2, 3, -1, 1.5, -20.0, 1e9, "Go", "Set", "Enable", "Move", "1")
-
-
 @pytest.mark.parametrize("seed", range(1))
 async def test_no_puts_move_an_axis_of_a_read_only_gateway(seed: int):
     rng = random.Random(seed)
@@ -264,26 +279,3 @@ async def test_no_puts_move_an_axis_of_a_read_only_gateway(seed: int):
         after = await running.client.ask(ReadEvents(count=1))
 
     assert after.end_number == before.end_number  # no command has reached the daemon
-
-
-@pytest.mark.parametrize("seed", range(1))
-async def test_no_puts_move_an_axis_whose_lease_is_elsewhere(seed: int):
-    rng = random.Random(seed)
-    async with running_rig(two_axes()) as running:
-        for name in running.daemon.rig.axes:
-            await running.until(name, lambda state: state.link is LinkState.UP)
-        rig = Rig(running.client, await running.client.daemon())
-        async with rig.control("x", "y", client="ann") as (x, _):
-            await x.power(on=True)
-            async with gateway(rig, prefix="T:", moves=("x",)) as made:
-                await asyncio.sleep(0.5)
-                at = x.position.sample.counts
-                names = [name for name in sorted(made.variables) if not name.endswith(("STOP", "SPMG"))]
-                for name in [*names, *(rng.choice(names) for _ in range(30))]:
-                    with suppress(LdcndError, ValueError, TypeError, CaprotoError, Forbidden):
-                        await put(made, name, rng.choice(VALUES))
-                    assert (await running.client.state("x")).moving is not Moving.YES
-                await asyncio.sleep(0.5)
-
-                assert abs(x.position.sample.counts - at) <= 2
-                assert [holder.client for holder in (await rig.holders()).holders] == ["ann", "ann"]

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
+from typing import Literal
 
 from ldcnd.bus.queue import Lane
 from ldcnd.daemon.axis.axis import AxisService
@@ -32,6 +33,7 @@ COUNTERS_HZ = 10
 """So often the counters of a line's description are brought up to date at most."""
 REMEMBERED = 1024
 """Encoded samples and reports that are kept at most; more keys than a rig has."""
+LEVELS: Mapping[bool | None, Literal["high", "low"] | None] = {True: "high", False: "low", None: None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +215,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         direction=config.direction,
         modulo=config.modulo,
         limits=config.limits,
+        limit_stop=LEVELS[driver.spec.limit_stop],
         group=group,
         capabilities=tuple(sorted(driver.capabilities, key=list(Verb).index)),
         items=tuple(item.value for item in TelemetryItem if _publishes(driver, item)),
