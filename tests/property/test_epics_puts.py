@@ -1,0 +1,155 @@
+"""No sequence of puts moves an axis that the gateway may not move, or does not control."""
+
+import asyncio
+import random
+from contextlib import AsyncExitStack, suppress
+from dataclasses import dataclass, field
+
+import pytest
+from caproto import CaprotoError, Forbidden
+
+from ldcnd.client.axis import Axis
+from ldcnd.client.rig import Rig
+from ldcnd.epics.gateway import RETRY_S, WHO, Gateway, gateway
+from ldcnd.errors import LdcndError
+from ldcnd.model.events import ReadEvents
+from ldcnd.model.samples import LinkState, Moving
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.chain_rig import drive
+from tests.support.epics_records import any_put, put, shows
+from tests.support.rig import RunningRig, running_rig, two_axes
+
+pytestmark = pytest.mark.timeout(3600)
+
+PLACES = {"x": 1, "y": 2}
+STILL_COUNTS = 3
+MOVES = {"move_absolute", "home"}
+
+
+@dataclass
+class Campaign:
+    """A gateway that may move x and not y, another program that takes x now and then, and puts at random."""
+
+    running: RunningRig
+    rig: Rig
+    chain: Chain
+    made: Gateway
+    dice: random.Random
+    taken: AsyncExitStack | None = None
+    ann: Axis | None = None
+    under_way: set["asyncio.Task[None]"] = field(default_factory=set)
+    rests_at: float | None = None
+    """Where x stands, from the moment when nothing may move it."""
+    checks: int = 0
+
+    def counts(self, axis: str) -> float:
+        return drive(self.chain, PLACES[axis]).shaft.position_counts
+
+    def begin(self) -> None:
+        """Put something, without waiting for the end of it."""
+        name, value = any_put(self.made, self.dice)
+
+        async def attempt() -> None:
+            with suppress(LdcndError, ValueError, TypeError, CaprotoError, Forbidden):
+                await put(self.made, name, value)
+
+        task = asyncio.create_task(attempt(), name=f"put {value!r} to {name}")
+        self.under_way.add(task)
+        task.add_done_callback(self.under_way.discard)
+
+    async def take(self) -> None:
+        """Let another program have x, by force; what x was doing ends."""
+        self.taken = AsyncExitStack()
+        control = self.rig.control("x", client="ann", force=True, lease_s=60)
+        self.ann = await self.taken.enter_async_context(control)
+        await self.running.until("x", lambda state: state.moving is Moving.NO)
+        self.rests_at = self.counts("x")
+
+    async def give(self) -> None:
+        """Let it go, and wait until the gateway controls x again: nothing that was put before begins then."""
+        assert self.taken
+        assert self.ann
+        while self.under_way:
+            await asyncio.wait(self.under_way)
+        await self.ann.reset()
+        await self.ann.power(on=True)
+        self.rests_at = self.counts("x")  # a loop that closes may shift it by a little
+        await self.taken.aclose()
+        await shows(self.made, "T:x:control", WHO)
+        await asyncio.sleep(1.0)
+        self.check()
+        self.taken = self.ann = self.rests_at = None
+
+    async def heal(self) -> None:
+        """Undo what keeps x from moving, as far as puts can."""
+        if not self.taken:
+            for field, value in (("SPMG", "Go"), ("SET", "Use"), ("CNEN", "Enable"), ("TWV", 1.0)):
+                with suppress(LdcndError, ValueError):
+                    await put(self.made, f"T:x.{field}", value)
+
+    def check(self) -> None:
+        assert abs(self.counts("y")) <= STILL_COUNTS
+        if self.rests_at is not None:
+            self.checks += 1
+            assert abs(self.counts("x") - self.rests_at) <= STILL_COUNTS
+
+    async def step(self) -> None:
+        match self.dice.choice(["put"] * 7 + ["wait"] * 3 + ["heal", "control"]):
+            case "put":
+                self.begin()
+            case "wait":
+                await asyncio.sleep(self.dice.choice([0.0, 0.05, self.dice.uniform(0.0, RETRY_S)]))
+            case "heal":
+                await self.heal()
+            case _:
+                await (self.give() if self.taken else self.take())
+        self.check()
+
+
+async def campaign(seed: int, steps: int) -> tuple[int, int]:
+    """Return how many motions of x were begun, and how often x was checked while it was another program's."""
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in ("ls182ap", "ls182ap"))))
+    async with running_rig(two_axes(), {"line0": chain}) as running:
+        for axis in PLACES:
+            await running.until(axis, lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        async with rig.control("x", "y", client="setup") as axes:
+            for each in axes:
+                await each.power(on=True)
+        async with gateway(rig, prefix="T:", axes=("x", "y"), moves=("x",)) as made:
+            await shows(made, "T:x:control", WHO)
+            await put(made, "T:x.HVEL", 1.0)
+            going = Campaign(running, rig, chain, made, random.Random(seed))
+            for _ in range(steps):
+                await going.step()
+            if not going.taken:
+                await going.take()
+            await going.give()
+        events = (await running.client.ask(ReadEvents(count=1000))).events
+    begun = [event for event in events if event.verb in MOVES]
+    assert {(event.axis, event.client) for event in begun} <= {("x", WHO)}
+    return len(begun), going.checks
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+async def test_puts_move_only_what_the_gateway_controls(seed: int):
+    begun, checks = await campaign(seed, steps=40)
+
+    assert begun > 0
+    assert checks > 5
+
+
+@pytest.mark.soak
+async def test_no_sequence_of_many_puts_moves_what_the_gateway_does_not_control():
+    first = random.SystemRandom().randrange(1_000_000)
+    print(f"first seed {first}")
+    begun = checks = 0
+    for seed in range(first, first + 100):
+        try:
+            more = await campaign(seed, steps=100)
+        except AssertionError as error:
+            raise AssertionError(f"seed {seed}: {error}") from error
+        begun, checks = begun + more[0], checks + more[1]
+    print(f"{begun} motions, {checks} checks")
+    assert min(begun, checks) > 100
