@@ -7,67 +7,26 @@ without a restart of the daemon.
 import asyncio
 import contextlib
 import random
-from dataclasses import dataclass, field
 
 import pytest
 
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
-from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving
 from tests.support.chain_rig import drive
 from tests.support.plugged_rig import Plugged, X, Y, plugged, slow_config
+from tests.support.position_judge import PositionJudge
 
 AXES = {"x": X, "y": Y}
 BACK_S = 20.0
 REST_S = 2.0
-COUNTS_PER_MM = 1000
-FASTEST_MM_S = 50.0
 SEEN_LATE_S = 0.3
 """A position that is published as good is no older."""
 AGAIN_S = 0.3
 """How long a run of unplugging takes at least: nothing may depend on a line that has come to rest."""
 
 
-@dataclass
-class Judge:
-    """Compares what is published with what the machine does.
-
-    Attributes:
-        zero: the place of each axis, in counts of its shaft, that is its position 0 while it has a reference.
-        wrong: what was published as good and was not true.
-        judged: how many good positions were compared, while the axis had a reference and while it had none.
-    """
-
-    line: Plugged
-    zero: dict[str, float] = field(default_factory=dict)
-    wrong: list[str] = field(default_factory=list)
-    judged: dict[bool, int] = field(default_factory=lambda: {True: 0, False: 0})
-
-    def shaft_mm(self, axis: str) -> float:
-        return (drive(self.line.chain, AXES[axis]).shaft.position_counts - self.zero.get(axis, 0.0)) / COUNTS_PER_MM
-
-    def set_zero(self, axis: str) -> None:
-        self.zero[axis] = 0.0
-        self.zero[axis] = self.shaft_mm(axis) * COUNTS_PER_MM
-
-    async def watch(self) -> None:
-        """Judge every good position until cancelled: by the shaft with a reference, by the drive's counter without."""
-        async with self.line.rig.client.samples("*", TelemetryItem.POSITION) as samples:
-            async for axis, sample in samples:
-                assert isinstance(sample, PositionSample)
-                if sample.quality is not Quality.GOOD or axis not in AXES:
-                    continue
-                referenced = axis in self.zero and self.line.rig.daemon.rig.axis(axis).tracker.referenced
-                counter_mm = drive(self.line.chain, AXES[axis]).loop.position / COUNTS_PER_MM
-                said, true = (
-                    (sample.value, self.shaft_mm(axis)) if referenced else (sample.counts / COUNTS_PER_MM, counter_mm)
-                )
-                self.judged[referenced] += 1
-                if abs(said - true) > FASTEST_MM_S * SEEN_LATE_S:
-                    self.wrong.append(f"{axis}: {said:.3f} is {true:.3f} mm, referenced {referenced}")
-
-
-async def ready(line: Plugged, judge: Judge, axis: str) -> None:
+async def ready(line: Plugged, judge: PositionJudge, axis: str) -> None:
     """Clear what the last round left, and give the axis a reference in the middle of its travel."""
     client = line.rig.client
     await client.stop(axis)
@@ -78,7 +37,7 @@ async def ready(line: Plugged, judge: Judge, axis: str) -> None:
     judge.set_zero(axis)
 
 
-async def act(line: Plugged, judge: Judge, axis: str, dice: random.Random) -> None:
+async def act(line: Plugged, judge: PositionJudge, axis: str, dice: random.Random) -> None:
     """Begin something."""
     client = line.rig.client
     velocity = dice.choice([0.8, 1.5, 5.0, 40.0])
@@ -103,7 +62,7 @@ async def stop(line: Plugged, after_s: float) -> None:
         await line.rig.client.stop()
 
 
-async def round_of(line: Plugged, judge: Judge, dice: random.Random, *, halts: bool) -> None:
+async def round_of(line: Plugged, judge: PositionJudge, dice: random.Random, *, halts: bool) -> None:
     """Let two axes do something, pull the plug meanwhile, stop before, during or after the outage or not at all."""
     loop = asyncio.get_running_loop()
     for axis in AXES:
@@ -151,7 +110,9 @@ async def unplug(times: int, seed: int, policy: str) -> None:
     print(f"seed {seed}, loss.bus = {policy}")
     dice = random.Random(seed)
     async with plugged(settings=slow_config(loss={"bus": policy})) as line, asyncio.TaskGroup() as group:
-        judge = Judge(line)
+        judge = PositionJudge(
+            line.rig, tuple(AXES), lambda axis: drive(line.chain, AXES[axis]), late_s=lambda _sample: SEEN_LATE_S
+        )
         watching = group.create_task(judge.watch(), name="judge")
         for number in range(times):
             try:

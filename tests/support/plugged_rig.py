@@ -9,6 +9,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.model.samples import LinkState
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.plant import MotorPlant
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
 from tests.support.serial_adapter import AT_ONCE, Holding, Plug
 
@@ -16,6 +17,8 @@ MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 RATES = {"rates": {"position": 4, "velocity": 4, "adc": 1, "state": 4}}
 X, Y = 1, 2
 """Addresses."""
+ENDLESS = MotorPlant(reverse_limit_counts=-(10**9), forward_limit_counts=10**9)
+"""What moves round after round must not come to rest because it has reached the end of its travel."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ async def plugged(holding: Holding = AT_ONCE, settings: RigConfig | None = None)
         holding: what the adapter does with replies.
         settings: the rig; `slow_config` if missing.
     """
-    chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS), delivery=Delivery.BYTEWISE))
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(model, ENDLESS) for model in MODELS), delivery=Delivery.BYTEWISE))
     plug = Plug(chain, holding)
     async with rig_on(chain, settings or slow_config(), opener=plug.open) as rig:
         line = Plugged(rig, chain, plug)
