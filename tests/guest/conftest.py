@@ -1,7 +1,7 @@
 """One guest for all tests of this folder, and the report at the end."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -14,9 +14,11 @@ from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.guest.machine import Adapter, Bench, booted_guest, far_end, why_no_guest
 from tests.guest.rigs import FAST, STEPS, USB
 from tests.support.package import package, why_no_package
+from tests.support.plugged_rig import ENDLESS
 
 FOUND: list[str] = []
 """What the tests have measured, for the report."""
+JOURNAL_LINES = 60
 
 
 @pytest.fixture(scope="session")
@@ -33,11 +35,10 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     began_s = time.monotonic()
     deb = package(tmp_path_factory)
     FOUND.append(f"package built in {time.monotonic() - began_s:.0f} s")
-    usb = build_chain(
-        ChainSpec(tuple(ModuleSpec(model) for model in ("ls182ap", "ls182ap", "picservo-v4")), baud_check=True)
+    usb, uart, fast = (
+        build_chain(ChainSpec(tuple(ModuleSpec(model, ENDLESS) for model in models), baud_check=True))
+        for models in (("ls182ap", "ls182ap", "picservo-v4"), ("ls182ap", "picservo-v4"), ("picservo-sc",))
     )
-    uart = build_chain(ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("picservo-v4")), baud_check=True))
-    fast = build_chain(ChainSpec((ModuleSpec("picservo-sc"),), baud_check=True))
     units = simulated_units([SimulatedUnitConfig(number=1), SimulatedUnitConfig(number=2)], 0.0)
     steps = smartstep_chain(units, framing=Framing.SEVEN_EVEN)
     with ExitStack() as stack:
@@ -52,6 +53,19 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         FOUND.append(f"kernel {guest.must('uname -r')}, systemd {guest.must('systemctl --version').split()[1]}")
         guest.must(f"head -c {deb.stat().st_size} /dev/vdb > /tmp/ldcnd.deb && dpkg -i /tmp/ldcnd.deb", timeout_s=240)
         yield Bench(guest, usb, uart)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show what the services have said before a test failed."""
+    report = yield
+    bench = getattr(item, "funcargs", {}).get("bench")
+    if call.when == "call" and report.failed and bench:
+        said = bench.guest.run(f"journalctl -q --no-pager -o short-monotonic -n {JOURNAL_LINES}").stdout
+        report.sections.append(("journal of the guest", said))
+    return report
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -239,7 +239,7 @@ def booted_guest(
         command = [
             *("qemu-system-x86_64", "-name", "ldcnd-test", "-nodefaults", "-no-reboot", "-display", "none"),
             *accelerated(built / "vmlinuz"),
-            *("-smp", "1", "-m", str(MEMORY_MIB)),
+            *("-smp", "2", "-m", str(MEMORY_MIB)),
             *("-kernel", str(built / "vmlinuz"), "-initrd", str(built / "initrd"), "-append", BOOT_ARGUMENTS),
             *("-drive", f"file={built / 'root.ext4'},format=raw,if=virtio,snapshot=on"),
             *("-drive", f"file={disk},format=raw,if=virtio,readonly=on"),
@@ -266,7 +266,8 @@ def booted_guest(
 def accelerated(kernel: Path) -> tuple[str, ...]:
     """Return QEMU's options for the fastest processor on which the kernel boots: not every /dev/kvm runs any kernel."""
     emulated = ("-accel", "tcg,tb-size=512", "-cpu", "Nehalem")
-    if not os.access("/dev/kvm", os.W_OK):
+    by_hardware = any(Path("/sys/module", name).exists() for name in ("kvm_intel", "kvm_amd"))
+    if not (by_hardware and os.access("/dev/kvm", os.W_OK)):
         return emulated
     fast = ("-accel", "kvm", "-cpu", "host")
     command = ["qemu-system-x86_64", "-nodefaults", "-no-reboot", "-display", "none", "-m", "256", *fast]
