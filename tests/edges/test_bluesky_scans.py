@@ -14,7 +14,8 @@ from bluesky import RunEngine
 from bluesky.utils import FailedStatus
 
 import ldcnd.bluesky
-from ldcnd.model.samples import LinkState, Moving, PositionSample, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, TelemetryItem
+from ldcnd.sim.ldcn.power import Condition
 from tests.support.bluesky_engine import Documents, Laboratory, laboratory
 from tests.support.process import ROOT, START_TIME_S, answering, client, daemon, free_port, process, simulated_terminal
 
@@ -90,6 +91,22 @@ def test_a_move_that_is_refused_fails_the_run_with_the_axis_at_rest():
         assert state.moving is Moving.NO
 
 
+def test_a_drive_fault_in_the_middle_fails_the_run_with_the_axis_at_rest():
+    async def short():
+        module = lab.module("x")
+        module.set_condition(Condition.MOTOR_SHORT, present=True, at_s=asyncio.get_running_loop().time())
+
+    with laboratory() as lab, lab.powered("x") as (x,):
+        truth = scan_until(lab, x, short)
+        state = lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.NO))
+
+        assert lab.documents.exit_status == "fail"
+        assert len(lab.documents.data("x")) == MIDDLE
+        assert lab.documents.data("x") == pytest.approx(truth, abs=IN_POSITION)
+        assert (state.state, state.moving) == (AxisState.ERROR_STOP, Moving.NO)
+        assert lab.module("x").shaft.velocity_counts == pytest.approx(0, abs=1e-6)
+
+
 def test_a_drive_that_loses_its_power_fails_the_run():
     async def unplug():
         lab.module("x").power(on=False, at_s=asyncio.get_running_loop().time())
@@ -99,6 +116,7 @@ def test_a_drive_that_loses_its_power_fails_the_run():
 
         assert lab.documents.exit_status == "fail"
         assert len(lab.documents.data("x")) == MIDDLE
+        assert lab.module("x").shaft.velocity_counts == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.real_time
