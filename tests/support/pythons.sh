@@ -1,17 +1,22 @@
-#!/bin/sh
-# pythons.sh PYTHON...: the tests that need no wall clock, on each of these interpreters that is there.
-set -eu
+#!/bin/bash
+# pythons.sh PYTHON...: the tests that need no wall clock, on each of these interpreters that is on this machine: on the
+# PATH, in pyenv or in uv's own folder. PYTEST_ARGS: which tests, and how.
+set -euo pipefail
 tried=0
-for python in "$@"; do
-    if ! "$python" -c '' 2>/dev/null; then
-        echo "$python: not on this machine"
+for name; do
+    for python in "$name" "${PYENV_ROOT:-$HOME/.pyenv}"/versions/*/bin/"$name" "$(uv python dir)"/*/bin/"$name"; do
+        "$python" -c '' 2>/dev/null && break
+        python=
+    done
+    if [ -z "$python" ]; then
+        echo "$name: not on this machine"
         continue
     fi
-    place=build/pythons/$(basename "$python")
+    place=build/pythons/$name
     "$python" -m venv "$place"
     uv pip install --quiet --python "$place/bin/python" -c constraints.txt -e '.[test]'
-    echo "$python: $("$place/bin/python" --version)"
-    "$place/bin/python" -m pytest -q -m "not soak and not edges and not real_time" ${PYTEST_ARGS:-}
+    echo "$name: $("$place/bin/python" --version)"
+    "$place/bin/python" -m pytest -q -m "not soak and not edges and not guest and not real_time" ${PYTEST_ARGS:--n 2}
     tried=$((tried + 1))
 done
 [ "$tried" -gt 0 ]
