@@ -41,7 +41,7 @@ async def _serve(
     rig = Rig(client, await client.daemon())
     named = f"{rig.name}:" if prefix is None else prefix
     async with gateway(rig, prefix=named, axes=axes, moves=(axes or rig.axes) if moves else ()) as records:
-        serving = asyncio.create_task(serve(records.variables, address), name="channel access")
+        serving = asyncio.create_task(serve(records, address), name="channel access")
         on_end(lambda: _cancel(serving))
         click.echo(
             f"{'motor records' if moves else 'read-only motor records'} {named}{{{','.join(axes or rig.axes)}}}"

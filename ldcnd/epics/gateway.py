@@ -31,17 +31,19 @@ class Gateway:
 
     Attributes:
         variables: the process variables by name.
+        circuits: the connections of clients at present.
     """
 
     def __init__(self, rig: Rig, group: asyncio.TaskGroup) -> None:
         self.variables: dict[str, Field] = {}
+        self.circuits: set[object] = set()
         self._rig = rig
         self._group = group
         self._tasks: set[asyncio.Task[None]] = set()
 
     def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
-        record = MotorRecord(info, defaults, self._start_motion, self._stop, moves=moves)
+        record = MotorRecord(info, defaults, self._start_motion, self._stop, self.connected, moves=moves)
         self.variables |= database(prefix, {info.axis: record})
         self._start(self._follow(record), f"values of {info.axis}")
         for monitor in info.monitors:
@@ -53,6 +55,10 @@ class Gateway:
         """End all that runs in the background; motions halt when control is released."""
         for task in self._tasks:
             task.cancel()
+
+    def connected(self) -> frozenset[object]:
+        """Return who is connected now."""
+        return frozenset(self.circuits)
 
     async def _follow(self, record: MotorRecord) -> None:
         axis = record.info.axis
@@ -151,7 +157,7 @@ async def gateway(
         raise errors.exceptions[0] from None
 
 
-async def serve(variables: dict[str, Field], address: ListenAddress) -> None:
+async def serve(records: Gateway, address: ListenAddress) -> None:
     """Answer Channel Access clients until cancelled.
 
     Beacons go to the loopback interface when that is where the gateway listens, and otherwise where EPICS_CAS_* says.
@@ -161,7 +167,9 @@ async def serve(variables: dict[str, Field], address: ListenAddress) -> None:
         os.environ["EPICS_CAS_AUTO_BEACON_ADDR_LIST"] = "NO"
         os.environ["EPICS_CAS_BEACON_ADDR_LIST"] = address.host
     logging.getLogger("caproto").setLevel(logging.CRITICAL)  # it logs every refused put with a traceback
-    await Context(variables, [address.host]).run()
+    context = Context(records.variables, [address.host])
+    records.circuits = context.circuits
+    await context.run()
 
 
 async def _defaults(rig: Rig, name: str) -> tuple[float, float]:

@@ -1,7 +1,6 @@
 """An axis as a motor record: its fields, and what puts to them do.
 
-Fields follow the motor record of the EPICS collaboration. What the gateway cannot do has no field: retries, backlash,
-jogs.
+Fields follow the motor record of the EPICS collaboration. What the gateway cannot do has no field: retries, backlash.
 """
 
 import asyncio
@@ -56,6 +55,7 @@ class MotorRecord:
         defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
         start: keeps a task until its end.
         stop: stops the axis and latches, without control.
+        clients: returns who is connected: a jog ends when one of them is gone.
         moves: whether puts move it at all.
     """
 
@@ -65,6 +65,7 @@ class MotorRecord:
         defaults: tuple[float, float],
         start: Callable[[Coroutine[object, object, None], str], asyncio.Future[None]],
         stop: Callable[[str], Awaitable[object]],
+        clients: Callable[[], frozenset[object]],
         *,
         moves: bool,
     ) -> None:
@@ -73,11 +74,14 @@ class MotorRecord:
         self._axis: Axis | None = None
         self._start = start
         self._stop = stop
+        self._clients = clients
         self._pending = 0
         self._stopping = False
         self._synchronised = False
         self._moving = Moving.UNKNOWN
         self._changed = asyncio.Event()
+        self._released = asyncio.Event()  # the jog under way is to end
+        self._jogging: asyncio.Future[None] | None = None
         self._alarm = SILENT
         self._switches = 0  # bits of MSTA
         velocity, acceleration = defaults
@@ -137,6 +141,9 @@ class MotorRecord:
             "SPMG": choice("Go", "Stop", "Pause", "Move", "Go"),
             "HOMF": integer(),
             "HOMR": integer(),
+            "JOGF": integer(),
+            "JOGR": integer(),
+            "JVEL": number(velocity, f"{unit}/s", precision=precision),
             "TWV": here(1.0),
             "TWF": integer(),
             "TWR": integer(),
@@ -176,6 +183,12 @@ class MotorRecord:
                 "VELO": self._put_velo,
                 "ACCL": self._put_positive,
                 "SET": self._keep,
+            }
+        if Verb.JOG in can:
+            actions |= {
+                "JOGF": lambda asked: self._put_jog(asked, "JOGF", 1),
+                "JOGR": lambda asked: self._put_jog(asked, "JOGR", -1),
+                "JVEL": self._put_velo,
             }
         if Verb.HOME in can:
             actions |= {
@@ -332,6 +345,44 @@ class MotorRecord:
         self._synchronised = False
         return Put(0, put.end)
 
+    async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
+        """Begin a jog, or end the one under way."""
+        await self._end_jog()
+        if not asked:
+            return Put(0)
+        axis, begun = self._movable(), asyncio.get_running_loop().create_future()
+        self._released = asyncio.Event()
+        velocity = sign * float(self["JVEL"].value)
+        self._jogging = self._start(self._jog(axis, velocity, field, begun), f"jog of {self.info.axis}")
+        await begun
+        return Put(1)
+
+    async def _jog(self, axis: Axis, velocity: float, field: str, begun: "asyncio.Future[None]") -> None:
+        """Jog until it is released, halted or at a limit, or until a client is gone: it may be the one that held it."""
+        clients, released = self._clients(), self._released
+        self._pending += 1
+        await self.show_motion()
+        try:
+            async with axis.jogging(velocity) as jog:
+                begun.set_result(None)
+                while not released.is_set() and clients <= self._clients():
+                    await jog.held()
+        except LdcndError as error:
+            if begun.done():
+                await self._show_beside("message", str(error))
+            else:
+                begun.set_exception(error)
+        finally:
+            await self._rest()
+            self._pending -= 1
+            await self[field].show(0)
+            await self.show_motion()
+
+    async def _end_jog(self) -> None:
+        self._released.set()
+        if self._jogging:
+            await asyncio.shield(self._jogging)
+
     async def _put_stop(self, asked: Value) -> Put:
         if asked:
             await self._halt()
@@ -376,6 +427,7 @@ class MotorRecord:
 
     async def _moved(self, starting: Callable[[], Awaitable[Motion]], target: float | None = None) -> Put:
         """Begin a motion; DMOV is 0 from here to its end, however short it is."""
+        await self._end_jog()  # the end of a jog is a halt, which must not come later
         self._pending += 1
         self._stopping = False
         await self.show_motion()
@@ -418,6 +470,7 @@ class MotorRecord:
     async def _halt(self) -> None:
         """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""
         self._stopping = True
+        self._released.set()
         if self._axis is None:
             await self._stop(self.info.axis)
             return

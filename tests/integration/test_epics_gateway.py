@@ -62,6 +62,9 @@ FIELDS = [
     "SPMG",
     "HOMF",
     "HOMR",
+    "JOGF",
+    "JOGR",
+    "JVEL",
     "TWV",
     "TWF",
     "TWR",
@@ -113,6 +116,59 @@ async def test_the_record_has_the_fields_that_clients_use():
 
     assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
     assert beside == {"adc", "control", "faults", "first_fault", "message", "state", "velocity"}
+
+
+async def test_a_jog_runs_until_it_is_released():
+    async with records() as (running, made):
+        await put(made, "T:x.JVEL", 5.0)
+        await put(made, "T:x.JOGR", 1)
+        await shows(made, "T:x.DMOV", 0)
+        await asyncio.sleep(3.0)
+        assert made.variables["T:x.RBV"].value < -10
+        await put(made, "T:x.JOGR", 0)
+
+        assert made.variables["T:x.DMOV"].value == 1
+        assert made.variables["T:x.RBV"].value > -20
+        assert (await running.client.state("x")).moving is Moving.NO
+        with pytest.raises(ValueOutOfRange):
+            await put(made, "T:x.JVEL", 51.0)
+
+
+@pytest.mark.parametrize("ending", ["client gone", "STOP", "SPMG", "JOGR", "stop from elsewhere"])
+async def test_a_jog_ends_with_whatever_may_have_held_it(ending: str):
+    async with records() as (running, made):
+        connected = {"screen", "archiver"}
+        made.circuits = connected
+        await put(made, "T:x.JVEL", 2.0)
+        await put(made, "T:x.JOGF", 1)
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        connected.add("another")
+        match ending:
+            case "client gone":
+                connected.discard("archiver")  # which one holds it, Channel Access does not say
+            case "STOP":
+                await put(made, "T:x.STOP", 1)
+            case "SPMG":
+                await put(made, "T:x.SPMG", "Pause")
+            case "JOGR":
+                await put(made, "T:x.JOGR", 0)
+            case _:
+                await running.client.stop("x")
+        await shows(made, "T:x.DMOV", 1)
+
+        assert made.variables["T:x.JOGF"].value == 0
+        assert made.variables["T:x.RBV"].value < 5
+        assert (await running.client.state("x")).moving is Moving.NO
+
+
+async def test_a_move_that_follows_a_jog_is_not_halted_by_its_end():
+    async with records() as (_, made):
+        await put(made, "T:x.JVEL", 2.0)
+        await put(made, "T:x.JOGF", 1)
+        await put(made, "T:x", 7.0)
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(7, abs=0.02)
+        assert (made.variables["T:x.JOGF"].value, made.variables["T:x.DMOV"].value) == (0, 1)
 
 
 @pytest.mark.parametrize("direction", ["forward", "reverse"])

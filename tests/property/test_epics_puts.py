@@ -24,7 +24,7 @@ pytestmark = pytest.mark.timeout(3600)
 
 PLACES = {"x": 1, "y": 2}
 STILL_COUNTS = 3
-MOVES = {"move_absolute", "home"}
+MOVES = {"move_absolute", "home", "jog"}
 
 
 @dataclass

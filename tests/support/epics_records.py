@@ -13,7 +13,7 @@ VALUES: tuple[float | int | str, ...] = (
     *("Go", "Stop", "Set", "Use", "Enable", "Disable", "Move", "1", ""),
 )
 """What is put at random."""
-STARTS = (".VAL", ".TWF", ".TWR", ".HOMF", ".HOMR")
+STARTS = (".VAL", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR")
 STARTING = 0.5
 
 
