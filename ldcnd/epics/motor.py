@@ -27,6 +27,7 @@ from ldcnd.model.samples import (
     Quality,
     Sample,
     StateSample,
+    TelemetryItem,
     VelocitySample,
 )
 
@@ -41,6 +42,7 @@ QUALITIES = {
     Quality.UNCERTAIN: Alarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
     Quality.BAD: SILENT,
 }
+INPUTS = ("forward_limit", "reverse_limit", "index", "stop_input", "amplifier_enable")
 SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
 MSTA_PLUS, MSTA_DONE, MSTA_POSITION, MSTA_PROBLEM, MSTA_MOVING, MSTA_COMM = 0x1, 0x2, 0x100, 0x200, 0x400, 0x1000
 MSTA_GAIN, MSTA_HOMED, MSTA_HIGH_SWITCH, MSTA_LOW_SWITCH = 0x800, 0x4000, 0x4, 0x2000
@@ -168,7 +170,7 @@ class MotorRecord:
             self.fields[f"{name}:adc"] = number(0.0, "V")
         for monitor in info.monitors:
             self.fields[f"{name}:{monitor}"] = number(0.0, precision=0)
-        if "input_signals" in info.monitors:
+        if "input_signals" in info.monitors or TelemetryItem.INPUTS in info.items:
             self.fields[f"{name}:inputs"] = text()
 
     def _let_move(self) -> None:
@@ -228,7 +230,7 @@ class MotorRecord:
                     await self["TDIR"].show(int(sample.value > 0))
             case AdcSample():
                 await self._show_beside("adc", sample.volts, alarm, at_s)
-            case InputsSample() if self.info.limit_stop:
+            case InputsSample():
                 await self._take_inputs(sample, alarm, at_s)
             case FaultSample():
                 await self._show_beside("faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
@@ -266,7 +268,11 @@ class MotorRecord:
         await self.show_motion()
 
     async def _take_inputs(self, sample: InputsSample, alarm: Alarm, at_s: float) -> None:
-        """Show the switches at the high and the low end of the axis; a drive may not show them for a while."""
+        """Show inputs, and the switches at the high and the low end of the axis; a drive may not show them for a while."""
+        active = ", ".join(name for name in INPUTS if getattr(sample, name))
+        await self._show_beside("inputs", active, alarm, at_s)
+        if self.info.limit_stop is None:
+            return
         ends = [sample.forward_limit, sample.reverse_limit]
         if self.info.direction == "reverse":
             ends.reverse()

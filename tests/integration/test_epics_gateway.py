@@ -115,7 +115,7 @@ async def test_the_record_has_the_fields_that_clients_use():
         beside = {name.partition(":x:")[2] for name in made.variables if ":x:" in name}
 
     assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
-    assert beside == {"adc", "control", "faults", "first_fault", "message", "state", "velocity"}
+    assert beside == {"adc", "control", "faults", "first_fault", "inputs", "message", "state", "velocity"}
 
 
 async def test_a_jog_runs_until_it_is_released():
@@ -186,6 +186,7 @@ async def test_a_limit_switch_shows_at_the_end_of_the_axis_where_it_is(direction
             await shows(made, "T:x.LLS", 0)
 
             await shows(made, "T:x.HLS", AlarmSeverity.NO_ALARM, "severity")
+            assert made.variables["T:x:inputs"].value == f"{direction}_limit, amplifier_enable"
             assert made.variables["T:x.RBV"].value < 21
             with pytest.raises(DriveFault, match="limit switch"):
                 await put(made, "T:x", -30.0)
