@@ -268,7 +268,7 @@ class MotorRecord:
         await self.show_motion()
 
     async def _take_inputs(self, sample: InputsSample, alarm: Alarm, at_s: float) -> None:
-        """Show inputs, and the switches at the high and the low end of the axis; a drive may not show them for a while."""
+        """Show inputs, and the switches at both ends of the axis; a drive may not show them for a while."""
         active = ", ".join(name for name in INPUTS if getattr(sample, name))
         await self._show_beside("inputs", active, alarm, at_s)
         if self.info.limit_stop is None:
