@@ -22,6 +22,8 @@ from tests.support.process import ROOT, START_TIME_S, answering, client, daemon,
 pytestmark = [pytest.mark.edges, pytest.mark.timeout(600)]
 
 IN_POSITION = 0.02
+HUNTING = 0.5
+"""Counts in a servo cycle by which a closed loop moves at rest; a move has 10."""
 POINTS = 200
 MIDDLE = 100
 
@@ -77,7 +79,7 @@ def test_a_stop_in_the_middle_fails_the_run_with_the_axis_at_rest():
         assert len(lab.documents.data("x")) == MIDDLE
         assert lab.documents.data("x") == pytest.approx(truth, abs=IN_POSITION)
         assert (state.stop_latched, state.moving) == (True, Moving.NO)
-        assert lab.module("x").shaft.velocity_counts == pytest.approx(0, abs=1e-6)
+        assert abs(lab.module("x").shaft.velocity_counts) < HUNTING
 
 
 def test_a_move_that_is_refused_fails_the_run_with_the_axis_at_rest():
@@ -104,7 +106,7 @@ def test_a_drive_fault_in_the_middle_fails_the_run_with_the_axis_at_rest():
         assert len(lab.documents.data("x")) == MIDDLE
         assert lab.documents.data("x") == pytest.approx(truth, abs=IN_POSITION)
         assert (state.state, state.moving) == (AxisState.ERROR_STOP, Moving.NO)
-        assert lab.module("x").shaft.velocity_counts == pytest.approx(0, abs=1e-6)
+        assert abs(lab.module("x").shaft.velocity_counts) < HUNTING
 
 
 def test_a_drive_that_loses_its_power_fails_the_run():
@@ -116,7 +118,6 @@ def test_a_drive_that_loses_its_power_fails_the_run():
 
         assert lab.documents.exit_status == "fail"
         assert len(lab.documents.data("x")) == MIDDLE
-        assert lab.module("x").shaft.velocity_counts == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.real_time

@@ -528,15 +528,22 @@ async def test_reload_applies_a_limit_without_a_restart(bench):
     async with usb(bench) as service:
         guest = service.guest
         pid = guest.must(f"systemctl show -P MainPID {UNIT}")
-        guest.write("/etc/ldcnd/ldcnd.toml", adapters().replace("velocity = 50", "velocity = 45"))
-        guest.must(f"systemctl reload {UNIT}")
+        await reload(guest, adapters().replace("velocity = 50", "velocity = 45"))
         await service.ready("x")
         with pytest.raises(LdcndError, match="45"):
             await service.client.command("x", MoveAbsolute(position=1.0, velocity=48.0))
-        guest.write("/etc/ldcnd/ldcnd.toml", adapters())
-        guest.must(f"systemctl reload {UNIT}")
+        await reload(guest, adapters())
 
         assert guest.must(f"systemctl show -P MainPID {UNIT}") == pid
+
+
+async def reload(guest: Guest, config: str) -> None:
+    """Have a changed configuration taken; before systemd 253 the unit is told, and its answer is in the journal."""
+    reloads = f"journalctl -q -u {UNIT} | grep -c 'configuration reloaded'"
+    before = int(guest.run(reloads).stdout)
+    guest.write("/etc/ldcnd/ldcnd.toml", config)
+    await asyncio.to_thread(guest.must, f"systemctl reload {UNIT}", timeout_s=START_S)
+    await asyncio.to_thread(guest.until, reloads, str(before + 1), UP_S)
 
 
 def test_the_doctor_names_the_driver_and_what_makes_it_slow(bench):

@@ -14,7 +14,7 @@ VALUES: tuple[float | int | str, ...] = (
 )
 """What is put at random."""
 STARTS = (".VAL", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR")
-STARTING = 0.5
+STARTING = 0.7
 
 
 async def put(made: Gateway, name: str, value: float | str) -> None:
@@ -32,8 +32,10 @@ async def shows(made: Gateway, name: str, wanted: object, what: str = "value") -
 
 
 def any_put(made: Gateway, dice: Random) -> tuple[str, float | int | str]:
-    """Return a variable and a value for it; each second one would start a motion."""
+    """Return a variable and a value for it; each second one would start a motion where it can be put."""
+    names, values = sorted(made.variables), VALUES
     if dice.random() < STARTING:
-        starts = [name for name in made.variables if name.endswith(STARTS)]
-        return dice.choice(starts), dice.choice((1, 2.5, -3.0, 40.0))
-    return dice.choice(sorted(made.variables)), dice.choice(VALUES)
+        names, values = [name for name in names if name.endswith(STARTS)], (1, 2.5, -3.0, 40.0)
+        if dice.random() < STARTING:
+            names = [name for name in names if made.variables[name].action]
+    return dice.choice(names), dice.choice(values)
