@@ -167,7 +167,7 @@ async def test_a_move_that_follows_a_jog_is_not_halted_by_its_end():
         await put(made, "T:x.JOGF", 1)
         await put(made, "T:x", 7.0)
 
-        assert made.variables["T:x.RBV"].value == pytest.approx(7, abs=0.02)
+        assert made.variables["T:x.RBV"].value == pytest.approx(7, abs=0.2)
         assert (made.variables["T:x.JOGF"].value, made.variables["T:x.DMOV"].value) == (0, 1)
 
 
