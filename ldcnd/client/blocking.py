@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from ldcnd.client import axis as asynchronous
-from ldcnd.client import motion, rig
+from ldcnd.client import jog, motion, rig
 from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.loop_thread import LoopThread, loop_thread
 from ldcnd.client.notebook import table
@@ -70,6 +70,13 @@ class Motion(Facade[motion.Motion]):
         return self._loop.each(aiter(self._wrapped))
 
 
+class Jogging(Facade[jog.Jogging]):
+    """A jog under way; made by `Axis.jogging`."""
+
+    held = _waiting(jog.Jogging.held)
+    renew = _waiting(jog.Jogging.renew)
+
+
 class Axis(Facade[asynchronous.Axis]):
     """An axis that a program controls or watches; a method for each verb, as `ldcnd.Axis` has."""
 
@@ -108,6 +115,13 @@ class Axis(Facade[asynchronous.Axis]):
 
     stop = _waiting(asynchronous.Axis.stop)
     take_trace = _waiting(asynchronous.Axis.take_trace)
+
+    @contextmanager
+    def jogging(self, velocity: float, *, acceleration: float | None = None, hold_s: float = 0.4) -> Iterator[Jogging]:
+        """Jog for as long as `Jogging.held` is called; the end of the context halts the axis, whatever ends it."""
+        jogging = self._wrapped.jogging(velocity, acceleration=acceleration, hold_s=hold_s)
+        with self._loop.inside(jogging) as begun:
+            yield Jogging(self._loop, begun)
 
     @property
     def name(self) -> str:

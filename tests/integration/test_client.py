@@ -217,6 +217,10 @@ async def test_the_first_program_runs(tmp_path: Path):
                 move.done()
                 print(y.position, y)
                 print(next(y.positions()).unit, "<td>x</td>" in rig._repr_html_())
+                with y.jogging(5) as jog:
+                    while y.position.value < 2.5:
+                        jog.held()
+                print("jogged")
         """
         blocked = await run_program(inspect.cleandoc(quietly), endpoint)
 
@@ -227,6 +231,7 @@ async def test_the_first_program_runs(tmp_path: Path):
     assert blocked[0] == "True"
     assert float(blocked[1].split()[0]) == pytest.approx(2.0, abs=0.05)
     assert blocked[2].endswith("True")
+    assert blocked[3] == "jogged"
 
 
 @pytest.mark.real_time
