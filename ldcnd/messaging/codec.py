@@ -80,17 +80,13 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
         MalformedRequest: anything else; names the first field that is wrong and what is allowed there. No text may have
             control or formatting characters: it would reach terminals by way of events and logs.
     """
+    text = as_json(payload, encoding, MAX_PAYLOAD_BYTES)
     try:
-        request = model.model_validate_json(as_json(payload, encoding, MAX_PAYLOAD_BYTES), strict=True)
+        request = model.model_validate_json(text, strict=True)
     except pydantic.ValidationError as error:
         raise explained(error, model) from None
-    for field, text in _texts(request):
-        if not is_printable(text):
-            raise MalformedRequest(
-                f"{field}: control and formatting characters are not accepted, not {_short(repr(text))}",
-                value=_short(repr(text)),
-                remedy="leave them out",
-            )
+    if _SUSPICIOUS.search(text):
+        _refuse_unprintable(request)
     return request
 
 
@@ -189,6 +185,16 @@ def rebuild_error(reply: ReceivedError) -> LdcndError:
         nearest=reply.nearest,
         remedy=remedy_of(reply),
     )
+
+
+def _refuse_unprintable(request: Frozen) -> None:
+    for field, text in _texts(request):
+        if not is_printable(text):
+            raise MalformedRequest(
+                f"{field}: control and formatting characters are not accepted, not {_short(repr(text))}",
+                value=_short(repr(text)),
+                remedy="leave them out",
+            )
 
 
 _SUSPICIOUS = re.compile(

@@ -1,5 +1,6 @@
 """What strangers write cannot reach a terminal as control or formatting characters."""
 
+import json
 import unicodedata
 
 import pytest
@@ -42,6 +43,29 @@ def test_no_control_or_formatting_character_is_left(text: str):
 @pytest.mark.parametrize("text", HARMLESS)
 def test_what_is_harmless_stays_as_it_is(text: str):
     assert printable(text) == text
+
+
+@pytest.mark.parametrize("escaped", [True, False])
+def test_each_such_character_is_found_in_a_request_however_it_is_spelled(*, escaped: bool):
+    unfit = [chr(code) for code in range(0x110000) if not is_printable(chr(code))]
+
+    taken = [
+        hex(ord(character))
+        for character in unfit
+        if escaped or unicodedata.category(character) != "Cs"  # no UTF-8 has a lone surrogate
+        if is_taken(json.dumps({"client": f"a{character}b"}, ensure_ascii=escaped))
+    ]
+
+    assert len(unfit) > 200
+    assert taken == []
+
+
+def is_taken(text: str) -> bool:
+    try:
+        decode(Halt, text.encode(), Encoding.JSON)
+    except MalformedRequest:
+        return False
+    return True
 
 
 @pytest.mark.parametrize("text", ATTACKS)

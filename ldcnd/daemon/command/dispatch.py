@@ -272,6 +272,8 @@ class Dispatcher:
             self._refuse_rival(axis)
             self.authority.check_held(axis, command.lease, self._clock.now_s())
 
+        if command.not_after is None:
+            return Right(holds)
         return Right(holds, lambda: self._refuse_late(axis, command))
 
     def _refuse_late(self, axis: str, command: AxisCommand[CommandReply]) -> None:
