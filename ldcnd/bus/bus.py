@@ -3,7 +3,9 @@
 import asyncio
 from typing import Any, TypeVar
 
-from ldcnd.bus.line import Line, Phase
+from typing_extensions import override
+
+from ldcnd.bus.line import Line, Phase, Users
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.queue import ExchangeQueue, Lane, PhaseOrder
 from ldcnd.bus.resync import Resync
@@ -85,7 +87,7 @@ LONGEST_OPENING_S = 10.0
 """Closing what was lost and opening a port anew are both bounded and together take less."""
 
 
-class Bus:
+class Bus(Users):
     """The owner of one line; every method runs on the event loop that `run` runs on."""
 
     def __init__(self, settings: BusSettings, opener: Opener) -> None:
@@ -243,11 +245,11 @@ class Bus:
 
     def offers(self, baud: int) -> bool:
         """Tell whether the port can be set to a rate; without an open port nothing says that it cannot."""
-        return self._line is None or self._line.wire.offers(baud)
+        return self._line is None or self._line.wire.transport.offers(baud)
 
     def line_errors(self) -> LineErrors | None:
         """Return what the port's driver has counted since it was loaded; None without a port that counts."""
-        return self._line.wire.line_errors() if self._line else None
+        return self._line.wire.transport.line_errors() if self._line else None
 
     async def wait_opened(self) -> None:
         """Return as soon as the line is open."""
@@ -359,8 +361,8 @@ class Bus:
 
     # -- for the line (see `Users`) ----------------------------------------------------------------------------------
 
+    @override
     def take(self, now_s: float) -> Turn | None:
-        """See `Users`."""
         job = self._queue.take_job(now_s)
         while job and not job.may_go():
             job = self._queue.take_job(now_s)
@@ -375,33 +377,34 @@ class Bus:
             self.statistics.stop_wait.add(now_s - job.wanted_at_s)
         return job
 
+    @override
     def sent(self, turn: Turn) -> None:
-        """See `Users`; a poller that was asked has its next turn."""
         if isinstance(turn, PollTurn) and (poller := turn.poller) in self._pollers:
             self._queue.polls.schedule(poller, poller.due_at_s)
 
+    @override
     def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
-        """See `Users`: to choose a poll and what to ask takes longer than all else between two packets."""
+        # to choose a poll and what to ask takes longer than all else between two packets
         exchange = turn.exchange
         reply_s = exchange.reply_bytes * byte_s
         at_s = self._order.free_at_s(exchange.node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s
         if poller := self._queue.polls.look_ahead(at_s):
             poller.prepare(at_s)
 
+    @override
     def next_due_s(self) -> float:
-        """See `Users`."""
         return self._queue.next_due_s()
 
+    @override
     def stop_waits(self) -> bool:
-        """See `Users`."""
         return self._queue.stop_waits()
 
+    @override
     def failing(self) -> set[int]:
-        """See `Users`."""
         return self._mute.failing()
 
+    @override
     def answered(self, turn: Turn) -> None:
-        """See `Users`."""
         exchange, mute = turn.exchange, self._mute
         if not exchange.reply_bytes or exchange.node not in mute.misses:
             return
@@ -410,8 +413,8 @@ class Bus:
                 if poller.node == also:
                     self._queue.schedule(poller, poller.due_at_s)
 
+    @override
     def missed(self, turn: Turn, now_s: float) -> None:
-        """See `Users`."""
         node = turn.exchange.node
         self._mute.missed(node)
         if isinstance(turn, PollTurn):
@@ -423,13 +426,13 @@ class Bus:
         if poller in self._pollers:
             self._queue.schedule(poller, at_s)
 
+    @override
     def again(self, turn: Turn) -> None:
-        """See `Users`."""
         if isinstance(turn, Job):
             self._queue.push_front(turn, turn.lane)
 
+    @override
     def line_lost(self, reason: str) -> None:
-        """See `Users`."""
         self._line = None
         self._tried_at_s = self._loop.time()
         self._loss_reason = reason

@@ -12,6 +12,8 @@ import asyncio
 from enum import Enum
 from typing import Protocol
 
+from typing_extensions import override
+
 from ldcnd.bus.queue import POLL
 from ldcnd.bus.resync import Fence, Probe, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
@@ -19,7 +21,7 @@ from ldcnd.bus.turn import AT_ONCE, LANES, Turn
 from ldcnd.bus.wire import NEVER_S, BusStatistics, Pieces, Watchdog, Whole, Wire
 from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
 from ldcnd.exchange import ReplyVerdict, Timing
-from ldcnd.transport.transport import Transport
+from ldcnd.transport.transport import Receiver, Transport
 from ldcnd.wirelog.recorder import WireEvent, WireLog
 
 
@@ -87,7 +89,7 @@ LATE_S = 1.0
 _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
 
 
-class Line:
+class Line(Receiver):
     """One open transport and what is on it; a `Receiver`, made anew at every opening.
 
     Attributes:
@@ -120,7 +122,7 @@ class Line:
         self._pieces = Pieces()
         self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain turn
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
-        self.wire.attach(self)
+        transport.attach(self)
 
     def turning(self, now_s: float) -> bool:
         """Tell whether the line keeps to its own plan: it always knows when it will act next, and then does."""
@@ -166,16 +168,17 @@ class Line:
 
     # -- receiver ----------------------------------------------------------------------------------------------------
 
+    @override
     def transport_lost(self, reason: str) -> None:
-        """See `Receiver`; a write that failed has told it already when the port tells it again."""
+        # a write that failed has told it already when the port tells it again
         if self.phase is Phase.CLOSED:
             return
         self._statistics.losses += 1
         self.wire.note(WireEvent.LOST, self._loop.time(), remark=reason)
         self.close(reason)
 
+    @override
     def data_received(self, data: bytes) -> None:
-        """See `Receiver`."""
         now_s, turn = self._loop.time(), self._turn
         if turn and len(data) == self._missing and now_s >= self._whole_from_s:
             reply = self._pieces.held + data
@@ -206,7 +209,7 @@ class Line:
                 self.wire.note(WireEvent.PART, now_s, data)
                 if was_plain and not self._pieces.early:
                     self._missing = turn.exchange.reply_bytes - len(self._pieces.held)
-                self.wire.expect(max(ANY, self._missing))
+                self._transport.expect(max(ANY, self._missing))
                 return
             verdict = turn.exchange.check(whole.reply)
             if verdict is not ReplyVerdict.FOREIGN:
@@ -342,7 +345,7 @@ class Line:
         self._statistics.resynchronisations += 1
         self.wire.note(WireEvent.RESYNC, now_s)
         self.phase = Phase.FENCE
-        self.wire.expect(ANY)
+        self._transport.expect(ANY)
         self.wire.forget_echo()
         silent_s = self._fence.raised(now_s)
         self._watchdog.set(now_s if self._users.stop_waits() else silent_s)
@@ -392,7 +395,7 @@ class Line:
         if turn := self._users.take(now_s):
             self._send(turn, now_s, remarks[turn.lane])
         else:
-            self.wire.expect(ANY)
+            self._transport.expect(ANY)
             self._watchdog.set(self._users.next_due_s())
 
     def _send(self, turn: Turn, now_s: float, remark: str) -> None:
@@ -427,7 +430,7 @@ class Line:
         goes_on = exchange.repeatable and not (exchange.total_bytes or turn.then_baud or turn.at_baud or turn.proves)
         plain = exchange.reply_bytes and goes_on and self._fence.in_step and not settings.echo
         self._missing = exchange.reply_bytes if plain else NOT_PLAIN
-        self._transport.expect(ANY if settings.echo else max(ANY, self._missing - early))
+        self._transport.expect(max(ANY, self._missing - early))
         answer_s = reply_s + settings.margin_s + self._transport.lag_s if exchange.reply_bytes else 0.0
         self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
         self._statistics.exchanges += 1
@@ -465,7 +468,7 @@ class Line:
                 self._flushed(now_s)
 
     def _timed_out(self, turn: Turn, now_s: float) -> None:
-        self.wire.collect()
+        self._transport.collect()
         if self._turn is not turn or self.phase is not Phase.REPLY:
             return  # the reply was there after all
         self._statistics.timeouts += 1

@@ -9,8 +9,7 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.bus.turn import Turn
 from ldcnd.errors import TransportLost
 from ldcnd.exchange import Exchange, Timing
-from ldcnd.transport.adapter import LineErrors
-from ldcnd.transport.transport import Receiver, Transport
+from ldcnd.transport.transport import Transport
 from ldcnd.wirelog.recorder import WireEvent, WireLog
 
 BUCKETS = 20
@@ -251,18 +250,6 @@ class Wire:
         """Return how long an exchange can take at the present rate, first bit to last, in seconds."""
         return (len(exchange.request) + exchange.reply_bytes) * self.byte_s + exchange.response_s
 
-    def offers(self, baud: int) -> bool:
-        """See `Transport`."""
-        return self.transport.offers(baud)
-
-    def line_errors(self) -> LineErrors | None:
-        """See `Transport`."""
-        return self.transport.line_errors()
-
-    def attach(self, receiver: Receiver) -> None:
-        """See `Transport`."""
-        self.transport.attach(receiver)
-
     def tune(self, baud: int, *, for_good: bool) -> None:
         """Change the rate.
 
@@ -274,14 +261,6 @@ class Wire:
         self.byte_s = self._bits_per_byte / baud
         if for_good:
             self.baud = baud
-
-    def expect(self, reply_bytes: int) -> None:
-        """See `Transport`; with an echo every byte counts."""
-        self.transport.expect(1 if self.echo is not None else reply_bytes)
-
-    def collect(self) -> None:
-        """See `Transport`."""
-        self.transport.collect()
 
     def discard_input(self) -> None:
         """Forget what has come in and what is still to come back."""
