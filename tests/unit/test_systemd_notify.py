@@ -197,6 +197,17 @@ async def test_port_that_is_not_there_is_told_and_does_not_starve_the_watchdog(m
     assert fed >= 60 / WATCHDOG_S * 2
 
 
+async def test_what_is_true_of_several_axes_is_said_once_and_a_latched_stop_is_told(manager: Manager):
+    async with service_of(manager) as (_, daemon, client):
+        await daemon.wait_up()
+        for axis in ("x", "y"):
+            await client.stop(axis)
+
+        text = describe(daemon.rig)
+
+    assert text == "rig sim: 1/1 buses, 4/4 axes up; x, y: a stop is latched: nothing moves before reset"
+
+
 async def test_end_brings_a_moving_axis_to_rest(manager: Manager):
     async with service_of(manager) as (service, daemon, client):
         await daemon.wait_up()

@@ -25,7 +25,7 @@ from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import FaultEntry, LinkState
-from ldcnd.model.trouble import axis_troubles, line_troubles
+from ldcnd.model.trouble import Kind, axis_troubles, line_troubles
 from ldcnd.planning.plan import require_plan
 
 log = get_logger("service")
@@ -268,7 +268,10 @@ class Service:
 
 
 def describe(rig: Rig) -> str:
-    """Return in one line what of a rig works and what does not; what is true of several axes is said once."""
+    """Return in one line what of a rig works and what does not; what is true of several axes is said once.
+
+    Polls that a drive missed are left out: a status is for what lasts.
+    """
     wrong: dict[str, list[str]] = {}
     for bus in rig.buses:
         name, up = bus.bus.settings.name, bus.report is not None
@@ -277,7 +280,8 @@ def describe(rig: Rig) -> str:
             wrong.setdefault(trouble.text, []).append(name)
         for axis in bus.axes if up else ():
             tracker = axis.tracker
-            for trouble in axis_troubles(tracker, _Faults(tracker.active_faults, tracker.first_fault))[:1]:
+            troubles = axis_troubles(tracker, _Faults(tracker.active_faults, tracker.first_fault))
+            for trouble in [each for each in troubles if each.kind is not Kind.MISSED_POLLS][:1]:
                 wrong.setdefault(trouble.text, []).append(axis.config.name)
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.link is not LinkState.DOWN for axis in rig.axes.values())
