@@ -63,8 +63,8 @@ def rows(samples: int = SAMPLES) -> list[Row]:
     _, many_us = asyncio.run(_published(MANY, samples))
     out_us = (many_us - one_us) / (MANY - 1)
     return [
-        Row("payload of a position sample", asyncio.run(_payload_bytes()), "bytes"),
-        Row("the same on a link, with all that Zenoh adds", asyncio.run(_wire_bytes(samples)), "bytes"),
+        Row("payload of a position sample", asyncio.run(payload_bytes()), "bytes"),
+        Row("the same on a link, with all that Zenoh adds", asyncio.run(wire_bytes(samples)), "bytes"),
         Row("daemon: to build, encode and publish a sample without subscribers", unheard_us, "us"),
         Row("daemon: the same for a sample with a subscriber", heard_us, "us"),
         Row("router: to take a sample in", one_us - out_us, "us"),
@@ -88,7 +88,8 @@ def publish_position(topic: Topic, number: int) -> None:
     )
 
 
-async def _payload_bytes() -> int:
+async def payload_bytes() -> int:
+    """Return how many bytes the payload of a position sample has."""
     async with MemoryBroker().session() as session:
         topic = Publisher(session, KEYS, Encoding.MSGPACK).item("x", TelemetryItem.POSITION)
         publish_position(topic, 0)
@@ -115,7 +116,7 @@ async def _published(subscribers: int, samples: int) -> tuple[float, float]:
     return own_s / samples * 1e6, router_s / samples * 1e6
 
 
-async def _wire_bytes(samples: int) -> float:
+async def wire_bytes(samples: int) -> float:
     """Return how many bytes a sample has on the link to a router, several in a batch."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with program(ROUTER, endpoint), program(SUBSCRIBER, endpoint, "1"), _Relay(endpoint).running() as relay:
