@@ -202,8 +202,9 @@ async def test_what_is_true_of_several_axes_is_said_once_and_a_latched_stop_is_t
         await daemon.wait_up()
         for axis in ("x", "y"):
             await client.stop(axis)
-
-        text = describe(daemon.rig)
+        async with asyncio.timeout(30):
+            while "4/4 axes up" not in (text := describe(daemon.rig)):
+                await asyncio.sleep(0.1)
 
     assert text == "rig sim: 1/1 buses, 4/4 axes up; x, y: a stop is latched: nothing moves before reset"
 
