@@ -3,6 +3,7 @@
 import math
 
 from ldcnd.model.commands import CommandReply, Verb
+from ldcnd.model.events import CommandOutcome
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import (
     AdcSample,
@@ -60,12 +61,20 @@ def rounded(value: float) -> str:
     return f"{value:.4g}"
 
 
-def outcome(axis: str, verb: str, state: StateSample) -> str:
-    """Return how a command that was waited for has ended."""
+def outcome(info: AxisInfo, ended: CommandOutcome, state: StateSample) -> str:
+    """Return how a command that was waited for has ended, and where."""
+    axis = info.axis
     if state.last_error is not None:
         return f"{axis}: {state_word(state)}: {state.last_error}"
-    done = "homed" if verb == Verb.HOME else "done"
-    return f"{axis}: {done}, {state_word(state)}"
+    done = "homed" if ended.verb == Verb.HOME else "done"
+    where = ""
+    if ended.position is not None:
+        where = f" at {number(ended.position, info)}"
+    if ended.following_error is not None and ended.settled is not None:
+        where += f", {number(abs(ended.following_error), info)} off its target"
+    if ended.settled is False:
+        where += ", NOT SETTLED"
+    return f"{axis}: {done}, {state_word(state)}{where}"
 
 
 STATE_WORDS = {

@@ -17,6 +17,7 @@ from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LeaseExpired
 from ldcnd.model.commands import Power, Reset, StopReply
+from ldcnd.model.events import ReadOutcome
 from ldcnd.model.rig_commands import AxisMove, ListHolders, MoveTogether, MoveTogetherReply
 
 GROUP_TIME_S = 10.0
@@ -99,8 +100,9 @@ def group_move(
         async def follow(reply: MoveTogetherReply) -> list[str]:
             states = [await client.wait_for_end(each.axis, each.command_id) for each in reply.replies]
             failed = [each.axis for each, state in zip(reply.replies, states, strict=True) if state.last_error]
-            for each, state in zip(reply.replies, states, strict=True):
-                sender.target.show(state, outcome(each.axis, each.verb, state))
+            for each, info, state in zip(reply.replies, infos, states, strict=True):
+                ended = await client.ask(ReadOutcome(command_id=each.command_id))
+                sender.target.show(state, outcome(info, ended, state))
             return failed
 
         reply = await client.ask(request, timeout_s=GROUP_TIME_S)

@@ -17,6 +17,7 @@ from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import AxisCommand, CommandReply, Halt, Verb
+from ldcnd.model.events import ReadOutcome
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
 
@@ -59,18 +60,22 @@ class Sender:
         if wait:
             end_as_interrupted()
 
-        async def work(client: RigClient) -> StateSample | None:
+        async def work(client: RigClient) -> tuple[StateSample, str] | None:
             info = await axis_of(client, axis)
             async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
                 reply = await self.command(client, axis, command)
                 words = command.verb.replace("_", " ")
                 self.target.show(reply, f"{axis}: {words} accepted{values_of(reply, info)}")
-                return await _follow(client, info, reply) if wait else None
+                if not wait:
+                    return None
+                state = await _follow(client, info, reply)
+                return state, outcome(info, await client.ask(ReadOutcome(command_id=reply.command_id)), state)
 
-        state = self.target.run(work)
-        if state is None:
+        ended = self.target.run(work)
+        if ended is None:
             return
-        self.target.show(state, outcome(axis, command.verb, state))
+        state, said = ended
+        self.target.show(state, said)
         if state.last_error is not None:
             sys.exit(FAILED)
 

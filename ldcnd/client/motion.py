@@ -3,7 +3,7 @@
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ldcnd.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
 from ldcnd.model.commands import CommandReply
@@ -58,10 +58,16 @@ class State:
     Attributes:
         sample: as it was published.
         age_s: for how long it is known here, in seconds.
+        position: behind a motion where it has ended, in axis units; otherwise None.
+        following_error: target minus that position, in axis units.
+        settled: whether the axis came to rest within its window in time; None without a target.
     """
 
     sample: StateSample
     age_s: float
+    position: float | None = None
+    following_error: float | None = None
+    settled: bool | None = None
 
     @property
     def state(self) -> AxisState:
@@ -165,7 +171,9 @@ class Motion:
         return self.reply.command_id
 
     async def done(self) -> State:
-        """Wait until the motion has ended as it was asked, and return the state after it.
+        """Wait until the motion has ended as it was asked and has settled; return the state after it, and where.
+
+        A motion that does not settle in time ends with `settled` false, or as a fault: see `settle` of the axis.
 
         A wait that is cancelled, by Ctrl-C or a time-out for example, halts the axis.
 
@@ -183,7 +191,12 @@ class Motion:
         if outcome.status is not CommandStatus.DONE:
             raise _error(outcome)
         await self._arrival()
-        self.ended = self._axis.state
+        self.ended = replace(
+            self._axis.state,
+            position=outcome.position,
+            following_error=outcome.following_error,
+            settled=outcome.settled,
+        )
         return self.ended
 
     async def __aiter__(self) -> AsyncIterator[Progress]:

@@ -65,6 +65,27 @@ class HomeConfig(Frozen):
     """Level of a limit switch input while the switch is actuated."""
 
 
+class SettleConfig(Frozen):
+    """When a motion to a target is done: its profile has ended and the axis has stayed near the target."""
+
+    window: float | None = Field(default=None, gt=0)
+    """How far from the target it may be, in axis units; without it 1/400 of the position error limit `el`, at least 5 \
+counts."""
+    time_s: float = Field(default=0.05, ge=0, le=10)
+    """For how long it must have stayed within the window, in seconds."""
+    timeout_s: float = Field(default=1.0, gt=0, le=60)
+    """Longest time for that, from the end of the profile, in seconds."""
+    unsettled: Literal["report", "fault"] = "report"
+    """What follows when it takes longer: report ends the motion as done with `settled` false, and an event; fault \
+ends it as failed with the fault `not_settled`."""
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Self:
+        if self.timeout_s <= self.time_s:
+            raise ValueError(f"settle.timeout_s {self.timeout_s:g} is not above settle.time_s {self.time_s:g}")
+        return self
+
+
 class PwmConfig(Frozen):
     """Bounds of `set_pwm`; without this table the axis refuses it."""
 
@@ -180,6 +201,8 @@ counts as 0. The latter only for a line that no host has used since: after a res
     """Bounds of `move_analog`."""
     tracking: TrackingConfig | None = None
     """Bounds of `track`; without them the axis follows no set-points."""
+    settle: SettleConfig = SettleConfig()
+    """When a motion to a target is done."""
     rates: RatesConfig = RatesConfig()
     """How often each item is published."""
     priority: PollPriority = "normal"
@@ -246,7 +269,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
 class MovedAxisConfig(AxisConfig):
     """A drive that takes motion over its line."""
 
-    reloadable: ClassVar[tuple[str, ...]] = ("limits", "velocity", "acceleration", "rates", "priority")
+    reloadable: ClassVar[tuple[str, ...]] = ("limits", "velocity", "acceleration", "settle", "rates", "priority")
     """Looked up anew by every command, or by the poller that is made when they change."""
 
     velocity: float = Field(gt=0)

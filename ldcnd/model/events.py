@@ -9,6 +9,8 @@ from ldcnd.model.frozen import Frozen
 
 ALARM_HISTORY = "alarm_history"
 """The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
+UNSETTLED = "unsettled"
+"""The verb of an event beside that of a motion that did not settle in its time."""
 
 
 class CommandStatus(StrEnum):
@@ -57,8 +59,8 @@ class CommandEvent(Frozen):
     command_id: str
     """Which command."""
     verb: str
-    """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, which nobody asked
-    for."""
+    """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, and `unsettled` for a
+    motion that did not settle, which nobody asked for."""
     client: str | None
     """The client, as it calls itself; not authenticated."""
     login: str | None = None
@@ -70,6 +72,12 @@ class CommandEvent(Frozen):
     """Why, when it did not end as asked."""
     code: str | None = None
     """The error code, when there is one."""
+    position: float | None = None
+    """Where the axis was at the end of a motion, in axis units, measured after it; null where none was measured."""
+    following_error: float | None = None
+    """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
+    settled: bool | None = None
+    """Whether the axis came to rest within its window around the target in time; null for what has no target."""
 
 
 class CommandOutcome(Frozen):
@@ -85,6 +93,12 @@ class CommandOutcome(Frozen):
     """How far it has got."""
     reason: str | None
     """Why, when it did not end as asked."""
+    position: float | None = None
+    """As in the event of its end."""
+    following_error: float | None = None
+    """As in the event of its end."""
+    settled: bool | None = None
+    """As in the event of its end."""
 
 
 class EventList(Frozen):

@@ -17,6 +17,7 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Right
 from ldcnd.daemon.axis.state import ActiveCommand
+from ldcnd.daemon.axis.telemetry import Arrival
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import (
@@ -215,7 +216,9 @@ class AxisBench:
         self.tracker = self.axis.tracker
         self.axis.connected(referenced=True)
 
-    def _ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None) -> None:
+    def _ended(
+        self, command: ActiveCommand, status: CommandStatus, reason: str | None, _arrival: Arrival | None
+    ) -> None:
         self.ended.append((command.command_id, status, reason))
 
     def published(self, item: TelemetryItem) -> Sample | None:
@@ -283,6 +286,7 @@ async def axis_bench(*, powered: bool = True, **axis: object) -> AsyncIterator[A
         "name": "x", "address": 1, "model": "pic-servo-v4", "unit": "mm", "counts_per_unit": COUNTS_PER_MM,
         "velocity": 20, "acceleration": 200,
         "gains": {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000},
+        "settle": {"window": 1e6, "time_s": 0},  # the end of a profile is the end, wherever the test shows the axis
     }  # fmt: skip
     config = AxisConfig.model_validate(document | axis)
     async with MemoryBroker().session() as session, asyncio.TaskGroup() as group:

@@ -159,3 +159,26 @@ def test_a_poll_that_was_prepared_too_early_is_made_anew():
     axis.prepare(0.2)
     assert axis.next_exchange(0.4) == {POSITION, ADC}
     assert axis.due_at_s == pytest.approx(0.5)
+
+
+def test_a_look_in_between_goes_at_its_instant_and_shifts_no_poll():
+    axis = poller({POSITION: 10.0, STATE: 10.0})
+    axis.next_exchange(0.0)
+
+    axis.ask_at(0.03)
+    assert (axis.due_at_s, axis.deadline_at_s) == (0.03, pytest.approx(0.03 + AGAIN_S))
+    assert axis.next_exchange(0.031) == {POSITION}
+    assert (axis.due_at_s, axis.deadline_at_s) == (pytest.approx(0.1), pytest.approx(0.2))
+    assert axis.next_exchange(0.1) == {POSITION, STATE}
+
+
+def test_a_look_behind_the_next_poll_waits_for_it_and_is_taken_with_a_later_one():
+    axis = poller({POSITION: 10.0, STATE: 10.0})
+    axis.next_exchange(0.0)
+
+    axis.ask_at(0.15)
+    assert axis.due_at_s == pytest.approx(0.1)
+    axis.next_exchange(0.1)
+    assert axis.due_at_s == 0.15
+    assert axis.next_exchange(0.205) == {POSITION, STATE}  # late: one exchange serves both
+    assert axis.due_at_s == pytest.approx(0.3)

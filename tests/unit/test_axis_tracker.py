@@ -303,7 +303,7 @@ def test_a_drive_that_was_away_is_not_degraded_by_a_further_miss(moving):
 
 def test_what_brings_an_axis_to_rest_early_is_the_reason_of_its_end():
     ended = []
-    tracker = AxisTracker("x", "mm", lambda _command, status, reason: ended.append((status, reason)))
+    tracker = AxisTracker("x", "mm", lambda _command, status, reason, _settled: ended.append((status, reason)))
     tracker.observed(ON, at(1.0), 0)
     tracker.begin(command(), float("inf"))
     tracker.started(2.0)

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from ldcnd import errors
 from ldcnd.cli.main import cli, main
-from ldcnd.daemon.axis.state import JUMPED, LINK_LOST, LOOP_OPENED, STOP_UNCONFIRMED, AxisTracker
+from ldcnd.daemon.axis.state import OF_DAEMON, AxisTracker
 from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
 from ldcnd.drivers.smartstep.monitors import ALARMS, AlarmKind
 from ldcnd.errors import DriveFault, ErrorCode, LdcndError
@@ -15,7 +15,7 @@ from ldcnd.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
 from ldcnd.messaging.codec import error_reply
 from tests.support.pages import command_lines, require_command_line
 
-DAEMON_FAULTS = {LINK_LOST.code, LOOP_OPENED.code, JUMPED.code, STOP_UNCONFIRMED.code}
+DAEMON_FAULTS = {fault.code for fault in OF_DAEMON}
 ALARM_CODES = {f"alarm_{known.code:04x}" for known in ALARMS if known.kind is not AlarmKind.NONE} | {UNLISTED_ALARM}
 FAULTS = DAEMON_FAULTS | ALARM_CODES | set(FaultCode)
 HEADINGS = [

@@ -22,8 +22,8 @@ from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.procedures.jog import Hold
-from ldcnd.daemon.axis.state import REST_COUNTS, AxisTracker, Ended, ObservedTracker
-from ldcnd.daemon.axis.telemetry import AxisTelemetry
+from ldcnd.daemon.axis.state import REST_COUNTS, AxisTracker, ObservedTracker
+from ldcnd.daemon.axis.telemetry import Arrivals, AxisTelemetry, EndTold, Note
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
@@ -148,14 +148,16 @@ class AxisTurns:
                 await self._woken.wait()
 
 
-Note = Callable[[str, str, CommandStatus, str, str | None], None]
-"""Takes what happened to an axis outside any command, for the events: axis, verb, status, reason, error code."""
+END_ITEMS = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
+"""Published with the reading that ends a command, whatever it was asked for."""
 
 
 def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str, _code: str | None) -> None:
     pass
 
 
+LOOK_LATER_S = 0.005
+"""So much behind the start of a motion its line is told when to look for the end."""
 SETTLES_WITHIN_S = 0.25
 """A shaft whose profile is done follows it by then."""
 STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
@@ -169,6 +171,7 @@ class AxisService:
         stop_wanted: set when a stop waits to be sent again; its line sees to that.
         line_up: its line is ready for stops; while it is not, they wait for it.
         returned: called when the drive answers again after it was out of reach, with what it does known.
+        ask_at: has the drive read at an instant of the loop's clock, besides its ordinary polls.
     """
 
     def __init__(
@@ -179,7 +182,7 @@ class AxisService:
         publisher: Publisher,
         clock: Clock,
         next_command_id: Callable[[], str],
-        ended: Ended,
+        ended: EndTold,
         note: Note = _no_note,
     ) -> None:
         self.config = config
@@ -187,7 +190,8 @@ class AxisService:
         self.scale = Scale(config.counts_per_unit or 1.0, reverse=config.direction == "reverse")
         self.stoppable = Verb.STOP in driver.capabilities
         tracker = AxisTracker if self.stoppable else ObservedTracker
-        self.tracker = tracker(config.name, config.unit, ended)
+        self._arrivals = Arrivals(config, self.scale, self._shown_at, ended, note)
+        self.tracker = tracker(config.name, config.unit, self._arrivals.ended)
         self.telemetry = AxisTelemetry(
             publisher,
             self.tracker,
@@ -212,6 +216,7 @@ class AxisService:
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
         self.stop_wanted = asyncio.Event()
         self.returned: Callable[[], None] | None = None
+        self.ask_at: Callable[[float], None] | None = None
         self._pending: StopMode | None = None
         self.line_up = False
         self._inherited = False
@@ -290,15 +295,18 @@ class AxisService:
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Digest a reading that is believed."""
-        was_away = self._seen and self.tracker.link is LinkState.DOWN
+        tracker, arrivals = self.tracker, self._arrivals
+        was_away = self._seen and tracker.link is LinkState.DOWN
         self._seen = True
-        if self._pending is not None and self.tracker.stop_pending:
+        if self._pending is not None and tracker.stop_pending:
             self.stop_wanted.set()  # it answers again
-        was_referenced = self.tracker.referenced
-        self.tracker.observed(reading, timing, self._clock.now_ns())
+        was_referenced = tracker.referenced
+        if tracker.command:
+            arrivals.reading = reading
+        tracker.observed(reading, timing, self._clock.now_ns())
         if was_away and self.returned:
             self.returned()
-        if was_referenced and not self.tracker.referenced:
+        if was_referenced and not tracker.referenced:
             log.warning("reference lost", axis=self.config.name, faults=[fault.code for fault in reading.faults])
         self._changed.set()
         self._motion.reading = reading
@@ -309,7 +317,24 @@ class AxisService:
         if self._inherited:
             self._end_what_has_no_end(reading, timing.sent_at_s)
         t, t_error_ns = self._clock.stamp(timing)
+        if arrivals.over:
+            asked |= END_ITEMS
         self.telemetry.reading(reading, asked, t, t_error_ns)
+        if arrivals.reading:
+            arrivals.tell()
+            self._ask_in_time(timing.sent_at_s)
+
+    def _ask_soon(self) -> None:
+        self._ask_in_time(self._clock.now_s())
+
+    def _shown_at(self, counts: int) -> float:
+        return self.telemetry.within_turn(self.telemetry.position(counts))[0]
+
+    def _ask_in_time(self, at_s: float) -> None:
+        """Have the drive read when the motion under way should end, and while it settles, whatever the rates."""
+        look_s = self.tracker.look_at_s(at_s)
+        if look_s is not None and self.ask_at:
+            self.ask_at(look_s)
 
     def missed(self, _error: BusError) -> None:
         """Take note that a poll brought nothing."""
@@ -335,7 +360,7 @@ class AxisService:
         """Return a position that was frozen in the drive, as the reply to a snapshot has it."""
         return FrozenPosition(
             axis=self.config.name,
-            position=self.telemetry.within_turn(self.telemetry.position(counts))[0],
+            position=self._shown_at(counts),
             counts=counts,
             unit=self.config.unit,
             referenced=self.tracker.referenced,
@@ -580,7 +605,11 @@ class AxisService:
             return await self.traces.carry_out(turn.command_id, command)
         if self._parameters and command.capability is Capability.PARAMETERS:
             return await self._parameters.carry_out(turn.command_id, command)
-        return await self._commands.carry_out(turn, command)
+        try:
+            return await self._commands.carry_out(turn, command)
+        finally:
+            if self.tracker.settle:  # whoever waits for the reply goes first
+                asyncio.get_running_loop().call_later(LOOK_LATER_S, self._ask_soon)
 
     def _require_reachable(self) -> None:
         guards.check_reachable(self.tracker.view())
@@ -613,3 +642,4 @@ class AxisService:
             await self._commands.step()
         except LdcndError as error:
             log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
+        self._ask_in_time(self._clock.now_s())

@@ -14,7 +14,7 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.guards import AxisView, check_acceleration, check_position, check_velocity
 from ldcnd.daemon.axis.permit import QuietDrive
 from ldcnd.daemon.axis.procedure import Turn
-from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion
+from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Motion
@@ -182,6 +182,7 @@ class AxisMotion:
             read: reads the drive's state at once.
         """
         self.config = config
+        self._window_counts = window_counts(config)
         self.driver = driver
         self.scale = scale
         self.tracker = tracker
@@ -196,6 +197,7 @@ class AxisMotion:
     def reconfigure(self, config: AxisConfig) -> None:
         """Plan with other limits and speeds from now on."""
         self.config = config
+        self._window_counts = window_counts(config)
         self.planner = MotionPlanner(config, self.driver, self.scale)
 
     def latest(self) -> AxisReading:
@@ -300,9 +302,18 @@ class AxisMotion:
         self.target_counts = None
         target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
         now_ns = self.clock.now_ns()
-        command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s)
+        settling = self._settling(plan) if plan and completion is Completion.PROFILE else None
+        command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling)
         self.tracker.begin(command, float("inf"))
         self.publish_state()
+
+    def _settling(self, plan: MotionPlan) -> Settling | None:
+        target, settle = plan.motion.target_counts, self.config.settle
+        if target is None:
+            return None
+        return Settling(
+            target, self._window_counts, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault"
+        )
 
     def stopping(
         self,

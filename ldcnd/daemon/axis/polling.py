@@ -17,7 +17,10 @@ Missed = Callable[[BusError], None]
 
 
 AGAIN_S = 0.001
-"""What is asked again goes before polls whose deadline is later than this."""
+"""What is asked again, or at an instant, goes before polls whose deadline is later than this."""
+NEVER_S = float("inf")
+LOOK_ITEMS = frozenset({TelemetryItem.POSITION})
+"""Read at an instant in between: where the axis is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +37,7 @@ class AxisPoller(Poller[AxisReading]):
 
     Slower items ride along with the poll that is nearest to their own due time, so they are never more than half a poll
     period early or late, and the line carries one periodic exchange an axis. Deadlines are absolute: a late poll does
-    not shift the next one, and missed periods are skipped, not made up for.
+    not shift the next one, and missed periods are skipped, not made up for. A single look in between can be asked for.
 
     Attributes:
         rates_hz: how often each item is asked for.
@@ -52,7 +55,7 @@ class AxisPoller(Poller[AxisReading]):
         reschedule: Callable[["AxisPoller"], None],
     ) -> None:
         self._reschedule = reschedule
-        self._again: _Turn | None = None
+        self._again: Exchange[AxisReading] | None = None
         self.node = driver.spec.address
         self.rates_hz = rates_hz
         self._driver = driver
@@ -61,7 +64,8 @@ class AxisPoller(Poller[AxisReading]):
         self._deliver = deliver
         self._missed = missed
         self._prepared: _Turn | None = None
-        self.due_at_s = start_at_s
+        self._grid_s = self.due_at_s = start_at_s  # of the poll that is next, whatever is asked in between
+        self._look_s = NEVER_S
         self.deadline_at_s = start_at_s + self._period_s
 
     def _take_rates(self, rates_hz: Mapping[TelemetryItem, float]) -> None:
@@ -69,6 +73,18 @@ class AxisPoller(Poller[AxisReading]):
         self._period_s = 1.0 / max(rates_hz.values())
         self._slower_s = {item: 1.0 / rate for item, rate in rates_hz.items() if 1.0 / rate > self._period_s}
         self._fastest = frozenset(rates_hz) - frozenset(self._slower_s)
+
+    def ask_at(self, at_s: float) -> None:
+        """Have the drive read at this instant as well; replaces an earlier wish that was not met yet."""
+        self._look_s = at_s
+        if self._again is None and min(self._grid_s, at_s) != self.due_at_s:
+            self._plan()
+            self._reschedule(self)
+
+    def _plan(self) -> None:
+        """Take the next slot: of the poll, or of the look if that comes first."""
+        self.due_at_s = min(self._grid_s, self._look_s)
+        self.deadline_at_s = self.due_at_s + (self._period_s if self._grid_s <= self._look_s else AGAIN_S)
 
     @override
     def prepare(self, at_s: float) -> None:
@@ -78,13 +94,22 @@ class AxisPoller(Poller[AxisReading]):
         """Return what is due, or what has to be asked again."""
         turn, self._prepared = self._prepared, None
         if self._again:
-            turn, self._again = self._again, None
-            self.due_at_s, self.deadline_at_s = turn.due_at_s, turn.due_at_s + self._period_s
-            return turn.exchange
+            exchange, self._again = self._again, None
+            self._plan()
+            return exchange
+        looks = self._look_s <= now_s
+        if looks:
+            self._look_s = NEVER_S
+        if looks and now_s < self._grid_s:
+            self._plan()
+            return self._driver.reading(LOOK_ITEMS)
         if turn is None or turn.due_at_s <= now_s:
             turn = self._turn_at(now_s)
-        self.due_at_s, self._slower_due_s = turn.due_at_s, turn.slower_due_s
+        self._grid_s = self.due_at_s = turn.due_at_s
+        self._slower_due_s = turn.slower_due_s
         self.deadline_at_s = turn.due_at_s + self._period_s
+        if self._look_s < self.due_at_s:
+            self._plan()
         return turn.exchange
 
     def _turn_at(self, now_s: float) -> _Turn:
@@ -96,8 +121,8 @@ class AxisPoller(Poller[AxisReading]):
                 item: next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
             }
             asked = asked.union(due)
-        behind = max(0, int((now_s - self.due_at_s) / self._period_s))
-        due_at_s = self.due_at_s + (behind + 1) * self._period_s
+        behind = max(0, int((now_s - self._grid_s) / self._period_s))
+        due_at_s = self._grid_s + (behind + 1) * self._period_s
         return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
@@ -105,13 +130,13 @@ class AxisPoller(Poller[AxisReading]):
         again = self._deliver(reply, reply.asked, timing)
         if not again and self._again is None:
             return
-        if self._again:
-            self.due_at_s, self._again = self._again.due_at_s, None
-            self.deadline_at_s = self.due_at_s + self._period_s
         if again:
-            self._again = _Turn(self._driver.reading(reply.asked), self.due_at_s, self._slower_due_s)
+            self._again = self._driver.reading(reply.asked)
             self.due_at_s = timing.received_at_s
             self.deadline_at_s = timing.received_at_s + AGAIN_S
+        else:
+            self._again = None
+            self._plan()
         self._reschedule(self)
 
     @override

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
+from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.guards import MOTION_STATES, AxisView
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
@@ -22,6 +23,12 @@ REST_COUNTS = 5
 for rest."""
 MOST_REST_S = 2.0
 """A shaft that crept out of that band must stay in it for twice as long as it took, at most this."""
+LEAST_WINDOW_COUNTS = 5.0
+"""A closed loop hunts by some counts."""
+WINDOW_OF_EL = 1 / 400
+"""Of the position error limit: what trips a drive is some hundred times what it should come to rest with."""
+LEAST_LOOK_S = 0.005
+"""Shortest time between two readings of an axis that settles."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
 STOP_UNCONFIRMED = Fault(
     "stop_unconfirmed",
@@ -30,12 +37,19 @@ STOP_UNCONFIRMED = Fault(
 )
 LOOP_OPENED = Fault("loop_opened", "the drive opened its position loop by itself; find out why, then send reset")
 
+NOT_SETTLED = Fault(
+    "not_settled",
+    "the axis did not stay within its window around the target in time; check for a jam, the load and the gains,"
+    " then send reset",
+)
 JUMPED = Fault(
     "position_jump",
     "the position has changed by more than the axis can have moved; check the encoder, its cable and the coupling,"
     " then send reset and home",
     loses_position=True,
 )
+OF_DAEMON = (LINK_LOST, LOOP_OPENED, JUMPED, NOT_SETTLED, STOP_UNCONFIRMED)
+"""Faults that the daemon finds; the drive tells all others."""
 
 
 class Completion(Enum):
@@ -47,6 +61,60 @@ class Completion(Enum):
     """The profile has ended and nothing moves."""
     PROCEDURE = "procedure"
     """The procedure that follows it says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settling:
+    """When a motion to a target has settled.
+
+    Attributes:
+        target_counts: where it ends.
+        window_counts: how far from there the axis may be, in either direction.
+        time_s: for how long it must have stayed within the window.
+        timeout_s: longest time for that, from the end of the profile.
+        faults: an axis that does not settle has a fault.
+    """
+
+    target_counts: int
+    window_counts: float
+    time_s: float
+    timeout_s: float
+    faults: bool = False
+
+
+def window_counts(config: AxisConfig) -> float:
+    """Return how far from its target an axis may be that has settled, in counts."""
+    if config.settle.window is not None:
+        return config.settle.window * (config.counts_per_unit or 1.0)
+    return max(LEAST_WINDOW_COUNTS, WINDOW_OF_EL * config.gains.el if config.gains else 0.0)
+
+
+class SettleJudge:
+    """Decides from readings behind the end of a profile whether an axis has settled.
+
+    Attributes:
+        settling: by which numbers.
+        begun: the profile was seen to have ended.
+    """
+
+    def __init__(self, settling: Settling) -> None:
+        self.settling = settling
+        self.begun = False
+        self._until_s = 0.0
+        self._inside_since_s: float | None = None
+
+    def observed(self, reading: AxisReading, at_s: float) -> bool | None:
+        """Take a reading whose profile has ended; return whether it has settled, None while that is open."""
+        settling = self.settling
+        if not self.begun:
+            self.begun, self._until_s = True, at_s + settling.timeout_s
+        if abs(settling.target_counts - reading.position_counts) > settling.window_counts:
+            self._inside_since_s = None
+        elif self._inside_since_s is None:
+            self._inside_since_s = at_s
+        if self._inside_since_s is not None and at_s - self._inside_since_s >= settling.time_s:
+            return True
+        return False if at_s >= self._until_s else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +130,7 @@ class ActiveCommand:
         opens_loop: it runs or ends with the position loop open, so an open loop is no failure.
         target: where it ends, in axis units; None when it has no end of its own.
         duration_s: of its profile, without settling; None when it has no end of its own.
+        settling: when it counts as settled; None when the end of its profile is its end.
     """
 
     command_id: str
@@ -72,13 +141,15 @@ class ActiveCommand:
     opens_loop: bool = False
     target: float | None = None
     duration_s: float | None = None
+    settling: Settling | None = None
 
 
-Ended = Callable[[ActiveCommand, CommandStatus, str | None], None]
-"""Takes a command that is over, how it ended, and why when it was not done."""
+Ended = Callable[[ActiveCommand, CommandStatus, str | None, bool | None], None]
+"""Takes a command that is over, how it ended, why when it was not done, and whether it has settled, None where that
+means nothing."""
 
 
-def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None) -> None:
+def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None, _settled: bool | None) -> None:  # noqa: FBT001
     pass
 
 
@@ -135,7 +206,11 @@ class RestJudge:
 
 
 class AxisTracker:
-    """The state of one axis, changed only by what was observed or commanded."""
+    """The state of one axis, changed only by what was observed or commanded.
+
+    Attributes:
+        settle: judges the end of the motion under way; None where the end of its profile is its end.
+    """
 
     def __init__(self, name: str, unit: str, ended: Ended = _nobody) -> None:
         """Begin in ignorance.
@@ -160,7 +235,9 @@ class AxisTracker:
         self.active_faults: tuple[FaultEntry, ...] = ()
         self.first_fault: FaultEntry | None = None
         self._failure: str | None = None
-        self._jumped = False
+        self._own: tuple[Fault, ...] = ()  # faults that this daemon has found, until reset
+        self.settle: SettleJudge | None = None
+        self._ends_at_s: float | None = None  # when the profile under way should end
         self._misses = 0
         self._effective_from_s = 0.0
         self._rest = RestJudge()
@@ -229,7 +306,7 @@ class AxisTracker:
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
         """Digest a reading; `now_ns` stamps the faults that it brings up."""
-        faults = (*reading.faults, JUMPED) if self._jumped else reading.faults
+        faults = (*reading.faults, *self._own) if self._own else reading.faults
         self._misses = 0
         self.link = LinkState.UP
         if faults or self.active_faults:
@@ -246,14 +323,14 @@ class AxisTracker:
         if faults and any(fault.stops for fault in faults):
             self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")
         elif self.enabled:
-            self._enabled_reading(reading)
+            self._enabled_reading(reading, timing.sent_at_s, now_ns)
         elif self.command and self.command.opens_loop:
             pass
         elif self.state not in (AxisState.DISABLED, AxisState.ERROR_STOP):
             self._faults((*faults, LOOP_OPENED), now_ns)
             self._fail(LOOP_OPENED.text)
 
-    def _enabled_reading(self, reading: AxisReading) -> None:
+    def _enabled_reading(self, reading: AxisReading, at_s: float, now_ns: int) -> None:
         command = self.command
         if command is None:
             if self.state is not AxisState.ERROR_STOP and (
@@ -263,15 +340,47 @@ class AxisTracker:
             return
         match command.completion:
             case Completion.PROFILE if reading.profile_done:
-                self.finished()
+                self._profile_ended(command, reading, at_s, now_ns)
             case Completion.REST if reading.profile_done and self.at_rest:
                 self.finished()
             case _:
                 pass
 
+    def _profile_ended(self, command: ActiveCommand, reading: AxisReading, at_s: float, now_ns: int) -> None:
+        judge = self.settle
+        if judge is None or self._failure:
+            self.finished()
+            return
+        settled = judge.observed(reading, at_s)
+        if settled is None:
+            return
+        if settled or not judge.settling.faults:
+            self.finished(settled=settled)
+            return
+        self._own = (*self._own, NOT_SETTLED)
+        self._faults((*reading.faults, *self._own), now_ns)
+        off = judge.settling.target_counts - reading.position_counts
+        self._fail(f"{command.verb} did not settle: {off} counts off", settled=False)
+
+    def look_at_s(self, at_s: float) -> float | None:
+        """Return when to read the axis so that the end of its motion is seen in time; None when there is none soon.
+
+        Args:
+            at_s: when it was read last, or is.
+        """
+        judge, ends_at_s = self.settle, self._ends_at_s
+        if judge is None or ends_at_s is None:
+            return None
+        if at_s < ends_at_s:
+            return ends_at_s
+        if not judge.begun and at_s > ends_at_s + judge.settling.timeout_s:
+            return None  # not as planned: the ordinary polls tell
+        return at_s + max(judge.settling.time_s / 2, LEAST_LOOK_S)
+
     def jumped(self) -> None:
         """The next reading shows a position that no motion has led to: a fault until reset."""
-        self._jumped = True
+        if JUMPED not in self._own:
+            self._own = (*self._own, JUMPED)
 
     def missed(self, now_ns: int) -> None:
         """Count a poll that brought nothing."""
@@ -300,20 +409,20 @@ class AxisTracker:
         if self.first_fault is None and self.active_faults:
             self.first_fault = self.active_faults[0]
 
-    def _fail(self, reason: str) -> None:
+    def _fail(self, reason: str, *, settled: bool | None = None) -> None:
         self.state = AxisState.ERROR_STOP
-        self._end(CommandStatus.FAILED, reason)
+        self._end(CommandStatus.FAILED, reason, settled=settled)
 
-    def _end(self, status: CommandStatus, reason: str | None = None) -> None:
+    def _end(self, status: CommandStatus, reason: str | None = None, *, settled: bool | None = None) -> None:
         command, self.command = self.command, None
-        self._failure = None
+        self._failure = self.settle = self._ends_at_s = None
         if math.isinf(self._effective_from_s):
             self._effective_from_s = 0.0  # the drive never took it, so there is nothing to wait for: readings count
         if command is None:
             return
         if reason:
             self.last_error = f"{command.verb}: {reason}"
-        self._ended(command, status, reason)
+        self._ended(command, status, reason, settled)
 
     # -- what was commanded ------------------------------------------------------------------------------------------
 
@@ -327,22 +436,26 @@ class AxisTracker:
                 self.last_error = None  # the motion goes on as another command's
         self.command = command
         self.state = command.state
+        self.settle = SettleJudge(command.settling) if command.settling else None
+        self._ends_at_s = None
         self._effective_from_s = now_s
         self._rest.forget(rests=False, commanded=self._rest.commanded)
 
     def started(self, now_s: float) -> None:
         """The drive acknowledged: only readings asked for from now on tell how the command goes."""
         self._effective_from_s = now_s
+        if self.command and self.command.duration_s is not None:
+            self._ends_at_s = now_s + self.command.duration_s
         self._rest.forget(rests=False, commanded=True)
 
     def failing(self, reason: str) -> None:
         """The active command will not end as it was asked, for this reason, once the axis has come to rest."""
         self._failure = reason
 
-    def finished(self, error: str | None = None) -> None:
-        """The active command is over: done, or ended as `error` says."""
+    def finished(self, error: str | None = None, *, settled: bool | None = None) -> None:
+        """The active command is over: done, settled or not, or ended as `error` says."""
         error = error or self._failure
-        self._end(CommandStatus.FAILED if error else CommandStatus.DONE, error)
+        self._end(CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
         self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
 
     def latch_stop(self) -> None:
@@ -379,7 +492,8 @@ class AxisTracker:
         """Reset of an axis that stands: latch and first cause are forgotten; the next readings tell what holds."""
         self._effective_from_s = now_s
         self.stop_latched = False
-        self.position_lost = self._jumped = False
+        self.position_lost = False
+        self._own = ()
         self.active_faults = ()
         self.first_fault = None
         self.last_error = None
@@ -391,7 +505,7 @@ def _entry(fault: Fault, now_ns: int) -> FaultEntry:
         code=fault.code,
         text=fault.text,
         since=now_ns,
-        source="daemon" if fault in (LINK_LOST, LOOP_OPENED, JUMPED, STOP_UNCONFIRMED) else "drive",
+        source="daemon" if fault in OF_DAEMON else "drive",
         stops=fault.stops,
         page=page_of(fault.code),
     )

@@ -1,11 +1,19 @@
-"""Readings and states of one axis as samples, in axis units."""
+"""Readings and states of one axis as samples, in axis units, and where its motions have ended."""
 
-from ldcnd.daemon.axis.state import QUALITIES, ActiveCommand, AxisTracker, StateShown
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ldcnd.config.axis import AxisConfig
+from ldcnd.daemon.axis.state import NOT_SETTLED, QUALITIES, ActiveCommand, AxisTracker, StateShown
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.scaling import Scale
+from ldcnd.log import get_logger
+from ldcnd.model.events import UNSETTLED, CommandStatus
 from ldcnd.model.samples import CurrentCommand, FaultEntry, LatchSample, Quality, TelemetryItem
+
+log = get_logger("axis")
 
 Inputs = tuple[bool | None, bool | None, bool | None, bool | None, bool | None]
 """Reverse limit, forward limit, index, stop input, amplifier enable."""
@@ -185,3 +193,75 @@ def _current(command: ActiveCommand) -> CurrentCommand:
         target=command.target,
         expected_end=None if duration_s is None else command.since_ns + round(duration_s * 1e9),
     )
+
+
+Note = Callable[[str, str, CommandStatus, str, str | None], None]
+"""Takes what happened to an axis outside any command, for the events: axis, verb, status, reason, error code."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """Where a command has ended, in axis units.
+
+    Attributes:
+        position: as clients see it.
+        following_error: target minus position; without a target what the drive reports, None where it does not.
+        settled: whether the axis came to rest within its window in time; None for what has no target.
+    """
+
+    position: float | None
+    following_error: float | None
+    settled: bool | None
+
+
+EndTold = Callable[[ActiveCommand, CommandStatus, str | None, Arrival | None], None]
+"""Takes a command that is over, how it ended, why when it was not done, and where; None where no reading shows it."""
+
+
+class Arrivals:
+    """The commands of one axis that a reading has ended, until that reading is published.
+
+    Attributes:
+        reading: the one that is being digested; None while none is.
+        over: what it has ended.
+    """
+
+    def __init__(
+        self, config: AxisConfig, scale: Scale, shown: Callable[[int], float], told: EndTold, note: Note
+    ) -> None:
+        self.reading: AxisReading | None = None
+        self._config = config
+        self._scale = scale
+        self._shown = shown
+        self._told = told
+        self._note = note
+        self.over: list[tuple[ActiveCommand, CommandStatus, str | None, Arrival]] = []
+
+    def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, settled: bool | None) -> None:  # noqa: FBT001 - as the tracker tells it
+        """Take from the tracker that a command is over; without a reading nothing shows where."""
+        reading = self.reading
+        if reading is None:
+            self._told(command, status, reason, None)
+            return
+        lag = reading.following_error_counts
+        if command.settling:
+            lag = command.settling.target_counts - reading.position_counts
+        following_error = None if lag is None else self._scale.to_units(lag)
+        arrival = Arrival(self._shown(reading.position_counts), following_error, settled)
+        self.over.append((command, status, reason, arrival))
+
+    def tell(self) -> None:
+        """Tell of what has ended: the reading is published."""
+        self.reading = None
+        while self.over:
+            command, status, reason, arrival = self.over.pop(0)
+            self._told(command, status, reason, arrival)
+            if arrival.settled is False and command.settling:
+                settling, unit = command.settling, self._config.unit
+                window = abs(self._scale.to_units(settling.window_counts))
+                said = (
+                    f"{command.verb} did not stay within {window:.6g} {unit} of its target for {settling.time_s:g} s"
+                    f" in {settling.timeout_s:g} s; it is {arrival.following_error:.6g} {unit} off"
+                )
+                log.warning("not settled", axis=self._config.name, reason=said)
+                self._note(self._config.name, UNSETTLED, CommandStatus.FAILED, said, NOT_SETTLED.code)

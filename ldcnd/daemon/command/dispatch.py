@@ -337,12 +337,16 @@ class Dispatcher:
 
     def _outcome(self, request: ReadOutcome) -> CommandOutcome:
         entry = self._ledger.get(request.command_id)
+        arrival = entry.arrival
         return CommandOutcome(
             command_id=entry.command_id,
             axis=entry.axis,
             verb=entry.verb.value,
             status=entry.status,
             reason=entry.reason,
+            position=arrival.position if arrival else None,
+            following_error=arrival.following_error if arrival else None,
+            settled=arrival.settled if arrival else None,
         )
 
 

@@ -97,7 +97,18 @@ class SmartStepTraceConfig(Frozen):
 MODEL = "smartstep"
 EARLIER = 1.0
 """Velocity and acceleration that captures of earlier versions have."""
-MOTION_KEYS = ("velocity", "acceleration", "limits", "gains", "reference", "home", "pwm", "tracking", "identity")
+MOTION_KEYS = (
+    "velocity",
+    "acceleration",
+    "limits",
+    "gains",
+    "reference",
+    "home",
+    "pwm",
+    "tracking",
+    "settle",
+    "identity",
+)
 """Keys of an axis that only a drive with commands for motion has."""
 
 

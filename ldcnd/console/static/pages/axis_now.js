@@ -27,6 +27,7 @@ export function NowPanel({ axis }) {
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
       ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command)}` : "none"],
+      ["last motion", lastMotion(axis)],
       ["last error", state?.last_error ?? "none"],
     ]} />
     <h3>Status</h3>
@@ -35,6 +36,15 @@ export function NowPanel({ axis }) {
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
   <//>`;
+}
+
+function lastMotion(axis) {
+  const ended = axis.rig.events.findLast((event) => event.axis === axis.name && event.position != null);
+  if (!ended) return "none";
+  const { position, following_error: off, settled, verb } = ended;
+  const decimals = decimalsOf(axis.info);
+  const rest = settled == null ? "" : `, ${number(off, decimals)} off, ${settled ? "settled" : "NOT settled"}`;
+  return html`${words(verb)} to ${number(position, decimals)} <span class="unit">${axis.info.unit}</span>${rest}`;
 }
 
 function remaining(command) {

@@ -57,7 +57,13 @@ function Row({ rig, event }) {
     <td><a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a></td>
     <td>${words(event.verb)}</td><td><${Mark}
       level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
-    <td>${event.reason ?? ""}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
+    <td>${event.reason ?? arrival(event)}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
+}
+
+function arrival({ position, following_error: off, settled }) {
+  if (position == null) return "";
+  const rest = settled == null || off == null ? "" : `, ${Number(off.toPrecision(3))} off its target`;
+  return `at ${Number(position.toPrecision(7))}${rest}${settled === false ? ", not settled" : ""}`;
 }
 
 function matches({ rig, event }, { axis, status, text }) {

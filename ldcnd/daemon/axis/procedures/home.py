@@ -270,7 +270,7 @@ class HomeSequence(Procedure):
             return await self._give_up(turn, f"not at rest within {self._search.timeout_s:g} s")
         plan = motion.plan_to(motion.unwrapped(move_to), None, None)
         await turn.permit.load(plan.motion)
-        await motion.start(turn, AxisState.HOMING, Completion.PROFILE)
+        await motion.start(turn, AxisState.HOMING, Completion.PROFILE, plan=plan)
         motion.target_counts = plan.motion.target_counts
         return False
 
