@@ -99,8 +99,9 @@ class Node(Destination[Status]):
         asked = self.items if items is None else items
         if self.profile.support is Support.IDENTIFY and asked & ~StatusItem.IDENTITY:
             raise NotSupported(f"{self.profile.title}: only status byte and identity can be decoded, not {asked!r}")
-        reply_bytes = status_bytes(self.profile, asked)
-        rejected_bytes = status_bytes(self.profile, self.items)
+        reply_bytes, total_bytes = status_bytes(self.profile, asked), None
+        if asked != self.items:
+            total_bytes = partial(_total_bytes, status_bytes(self.profile, self.items), reply_bytes)
         return Exchange(
             node=self.address,
             request=request,
@@ -109,7 +110,7 @@ class Node(Destination[Status]):
             decode=status_decoder(self.profile, asked),
             response_s=CYCLE_CLOCKS / self.profile.clock_hz,
             repeatable=repeatable,
-            total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),
+            total_bytes=total_bytes,
             moves=moves,
         )
 
