@@ -8,8 +8,8 @@ Source: manual 3, monitors 8000H to 8008H; 4, settings 3 and 7, "Unit conversion
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
 from ldcnd.drivers.smartstep.monitors import (
@@ -304,51 +304,53 @@ def _varied(some: Sequence[Reading]) -> frozenset[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """A trace, to be read in any way."""
+    """A trace, to be read in any way; `decoded` keeps the words that were decoded in a way before."""
 
     profile: SmartStepProfile
     constants: TraceConstants
     assignment: Assignment
     samples: Samples
+    decoded: dict[tuple[str, TraceWordLayout, bool], list[int]] = field(default_factory=dict)
 
     def columns(self, reading: Reading) -> list[list[float]]:
         """Return the values of each channel."""
-        columns = []
-        for name in self.assignment.channels:
-            decode = self._decoder(reading, name)
-            columns.append([decode(word) for word in self.samples.words[self.assignment.memory(name)]])
-        return columns
+        return [
+            [point * factor for point in self._points(reading, channel)]
+            for channel in self.assignment.channels
+            for factor in [self._scale(reading, channel)]
+        ]
 
     def contradiction(self, reading: Reading, windows: Sequence[tuple[Shown, range]]) -> str | None:
         """Return how a reading of the words cannot be, by what monitors have shown; None when it can."""
         texts = (self._against(reading, shown, window) for shown, window in windows)
         return next((text for text in texts if text), None)
 
-    def _decoder(self, reading: Reading, channel: str) -> Callable[[int], float]:
-        """Return what a word, split in the byte order of the profile, means for a channel."""
+    def _points(self, reading: Reading, channel: str) -> list[int]:
+        """Return the numbers of a channel before they are scaled; a signal is 0 or 1."""
         swapped = reading.trace_byte_order is not self.profile.trace_byte_order
-        factor = self._scale(reading, channel) if channel in DATA else None
-
-        def decode(word: int) -> float:
-            point = decode_word((word >> 8 | word << 8) & 0xFFFF if swapped else word, reading.trace_word_layout)
-            return float(bool(point.io)) if factor is None else point.value * factor
-
-        return decode
+        key = (channel, reading.trace_word_layout, swapped)
+        if key not in self.decoded:
+            words = self.samples.words[self.assignment.memory(channel)]
+            if swapped:
+                words = tuple((word >> 8 | word << 8) & 0xFFFF for word in words)
+            points = (decode_word(word, reading.trace_word_layout) for word in words)
+            self.decoded[key] = [point.value if channel in DATA else int(bool(point.io)) for point in points]
+        return self.decoded[key]
 
     def _scale(self, reading: Reading, channel: str) -> float:
-        return scale(reading.applied_to(self.profile), self.constants, DATA[channel])
+        return scale(reading.applied_to(self.profile), self.constants, DATA[channel]) if channel in DATA else 1.0
 
     def _against(self, reading: Reading, shown: Shown, window: range) -> str | None:
         comparison = shown.comparison
-        decode = self._decoder(reading, comparison.channel)
-        words = self.samples.words[self.assignment.memory(comparison.channel)]
-        values = [decode(words[place]) for place in window]
+        factor = self._scale(reading, comparison.channel)
+        points = self._points(reading, comparison.channel)
+        values = [points[place] * factor for place in window]
         where = f"monitor {comparison.monitor.address:04X}H shows {comparison.channel} at {shown.value:g}"
         taken = f"while the words, taken as {reading.trace_word_layout.value}, say"
         if comparison.bit is not None:
             return None if shown.value in values else f"{where} {taken} {values[0]:g}"
         # A monitor has whole units; a value may have passed between two samples, and one layout loses its lowest bit.
-        slack = 1.0 + 2 * self._scale(reading, comparison.channel)
+        slack = 1.0 + 2 * factor
         slack += max((abs(after - before) for before, after in pairwise(values)), default=0.0)
         if min(values) - slack <= shown.value <= max(values) + slack:
             return None
