@@ -57,12 +57,14 @@ class Module(ABC):
     Attributes:
         baud: the rate at which it listens and answers.
         address_out: whether it lets the next module hear the host.
+        latched: whether it hears the host whatever the module before it does.
         yields_to_host: whether its transmission ends as soon as the host sends.
         next_event_s: when `advance` must be called next; `NEVER_S` when the module only waits for the host.
     """
 
     baud: float = 19_200.0
     address_out: bool = True
+    latched: bool = False
     yields_to_host: bool = True
     next_event_s: float = NEVER_S
 
@@ -276,7 +278,7 @@ class Chain:
         slowest, fastest = self._understood_bauds()
         hears = True
         for module in self.modules:
-            if hears:
+            if hears or module.latched:
                 module.hear(value if slowest <= module.baud <= fastest else None, at_s)
             hears = module.address_out
 
@@ -296,7 +298,7 @@ class Chain:
         self._interrupt(request.next_at_s)
         hears = True
         for module in self.modules:
-            if hears:
+            if hears or module.latched:
                 module.hear_all(data, request.starts_at_s, request.byte_s)
             hears = module.address_out
         return True

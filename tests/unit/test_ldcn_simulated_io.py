@@ -190,6 +190,27 @@ def test_synch_output_before_anything_was_stored_sets_zeros():
     assert host.module.pwm == (0, 0)
 
 
+@pytest.mark.parametrize("once", [True, False])
+def test_whether_stored_outputs_are_applied_again_is_a_switch(once):
+    host = IoHost(synch_output_once=once)
+    host.do(SetSynchOutput(0, 200, 7))
+    host.do(SynchOutput())
+    host.do(SetPwm(9, 9))
+
+    host.do(SynchOutput())
+
+    assert host.module.pwm == ((9, 9) if once else (200, 7))
+
+
+def test_the_unused_half_of_the_inputs_may_be_anything():
+    host = IoHost(undefined_level_bits=0xF)
+
+    reply = host.send(1, Command.READ_STATUS, 0x01)
+
+    assert reply[2] >> 4 == 0xF
+    assert host.look(1).levels == ALL
+
+
 # -- counter and timer (2.2, 3.1) -------------------------------------------------------------------------------------
 
 

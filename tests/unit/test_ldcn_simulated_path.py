@@ -15,7 +15,7 @@ from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import Condition
-from ldcnd.sim.ldcn.quirks import LimitInPath, PathOverflow
+from ldcnd.sim.ldcn.quirks import HalfPoint, LimitInPath, PathOverflow, PathWithoutServo
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS
 from tests.support.simulated_host import SimulatedHost
@@ -274,38 +274,84 @@ def test_what_happens_to_points_too_many_is_a_switch(name, capacity, overflow, l
     assert axis.drive.loop.trajectory.path.velocity * 64 in {first * ONE, (first + 1) * ONE}
 
 
-def test_half_a_point_is_ignored():
-    axis = PathAxis()
+@pytest.mark.parametrize(
+    ("variant", "left"), [(HalfPoint.IGNORED, 1), (HalfPoint.COMPLETED, 2), (HalfPoint.PACKET_DROPPED, 0)]
+)
+def test_what_becomes_of_half_a_point_is_a_switch(variant, left):
+    axis = PathAxis(half_point=variant)
 
     axis.send(1, Command.ADD_PATH_POINTS, 0x92, 0x01, 0x00)
 
-    assert points_left(axis) == 1
-
-
-def test_a_start_with_an_empty_buffer_or_with_the_servo_off_does_nothing():
-    axis = PathAxis()
-    axis.start()
-    empty = axis.walks()
-
-    axis.stop(ON | StopControl.MOTOR_OFF)
-    axis.add(50)
-    axis.start()
-
-    assert not empty
+    assert points_left(axis) == left
     assert not axis.walks()
-    assert points_left(axis) == 1
 
 
-def test_a_second_start_while_the_path_runs_does_nothing():
+def test_half_a_point_alone_starts_nothing():
     axis = PathAxis()
+    axis.add(50)
+
+    axis.send(1, Command.ADD_PATH_POINTS, 0x92)
+
+    assert not axis.walks()
+
+
+@pytest.mark.parametrize(("begins", "moved"), [(False, 0), (True, 50)])
+def test_whether_a_start_with_an_empty_buffer_waits_for_points_is_a_switch(begins, moved):
+    axis = PathAxis(path_starts_empty=begins)
+    axis.start()
+    walks = axis.walks()
+
+    axis.add(50)
+    axis.wait(0.2)
+
+    assert walks is begins
+    assert axis.commanded == moved
+
+
+@pytest.mark.parametrize(
+    ("variant", "left", "walks"),
+    [
+        (PathWithoutServo.WAITS, {20}, False),
+        (PathWithoutServo.POINTS_REFUSED, {0}, False),
+        (PathWithoutServo.RUNS, set(range(1, 20)), True),
+    ],
+)
+def test_what_path_mode_does_with_the_servo_off_is_a_switch(variant, left, walks):
+    axis = PathAxis(path_without_servo=variant)
+    axis.stop(ON | StopControl.MOTOR_OFF)
+
+    axis.add(*[50] * 20)
+    axis.start()
+
+    assert axis.walks() is walks
+    assert points_left(axis) in left
+    axis.wait(1.0)
+    assert not axis.walks()
+    assert axis.commanded == 0
+
+
+@pytest.mark.parametrize(("restarts", "moved"), [(False, 500), (True, pytest.approx(475, abs=20))])
+def test_whether_another_start_goes_on_to_the_next_point_is_a_switch(restarts, moved):
+    axis = PathAxis(path_restarts=restarts)
     axis.add(*[50] * 10)
     axis.start()
 
-    axis.cycles(64 * 3)
+    axis.cycles(64 * 3 + 32)
     axis.start()
     axis.wait(1.0)
 
-    assert axis.commanded == 500
+    assert axis.commanded == moved
+    assert not axis.walks()
+
+
+@pytest.mark.parametrize(("taken", "left"), [(True, 1), (False, 0)])
+def test_whether_points_are_taken_during_another_motion_is_a_switch(taken, left):
+    axis = PathAxis(path_takes_points_in_motion=taken)
+    axis.move(5000)
+
+    axis.add(50)
+
+    assert points_left(axis) == left
 
 
 def test_a_damaged_packet_adds_nothing():

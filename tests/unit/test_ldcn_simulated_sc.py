@@ -6,15 +6,15 @@ import pytest
 
 from ldcnd.drivers.ldcn.controls import IoOption, StartUp, StopControl
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S
+from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, encode_gains
 from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.families.ldcn.simulation import SimulatedChainConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.power import Condition
-from ldcnd.sim.ldcn.quirks import RelativeTo
+from ldcnd.sim.ldcn.quirks import ExcludedOptions, RelativeTo, ResetInMotion, UnknownBaud
 from ldcnd.sim.plant import MotorPlant
-from tests.support.simulated_axis import ON, ONE, SimulatedAxis
+from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS, SimulatedAxis
 from tests.support.simulated_host import SimulatedHost, little
 
 PHASES = AuxFlag.ACCEL_DONE | AuxFlag.SLEW_DONE
@@ -72,14 +72,14 @@ def test_a_host_talks_to_sc_at_230400():
     assert [len(host.send(address, Command.NO_OPERATION)) for address in (1, 2)] == [2, 2]
 
 
-def test_sc_keeps_its_rate_at_a_code_it_does_not_know():
-    host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),))))
-    host.address_all()
+@pytest.mark.parametrize(("variant", "baud"), [(UnknownBaud.KEPT, 19_200), (UnknownBaud.DIVIDED, 178_571)])
+def test_what_sc_makes_of_a_rate_that_it_does_not_know_is_a_switch(variant, baud):
+    axis = sc(unknown_baud=variant)
 
-    host.send(1, Command.SET_BAUD_RATE, 6)
+    axis.send(1, Command.SET_BAUD_RATE, 6)
 
-    assert len(host.send(1, Command.NO_OPERATION)) == 2
-    assert host.chain.modules[0].unknown_bauds == 1
+    assert axis.drive.baud == pytest.approx(baud, rel=0.01)
+    assert axis.drive.unknown_bauds == 1
 
 
 # -- relative moves (5.2) ---------------------------------------------------------------------------------------------
@@ -354,6 +354,98 @@ def test_whether_the_home_register_moves_with_the_position_is_a_switch(shifts):
 
     assert status.position == 5000
     assert status.home == (5000 if shifts else home)
+
+
+@pytest.mark.parametrize(
+    ("rule", "position", "goal"),
+    [(ResetInMotion.GOAL_KEPT, 0, 2000), (ResetInMotion.GOAL_SHIFTED, 0, 1000), (ResetInMotion.IGNORED, 1000, 2000)],
+)
+def test_what_reset_position_does_to_a_move_under_way_is_a_switch(rule, position, goal):
+    axis = sc(reset_in_motion=rule)
+    axis.move(2000, velocity=ONE // 2)
+    while axis.status().position < 1000:
+        axis.wait(0.001)
+
+    axis.send(1, Command.RESET_POSITION)
+    after = axis.status().position
+    axis.finish()
+
+    assert after == pytest.approx(position, abs=100)
+    assert commanded(axis) == pytest.approx(goal, abs=100)
+
+
+# -- I/O Control, step and direction inputs (4.4.6, 5.2) --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("variant", "protection"),
+    [
+        (ExcludedOptions.OBEYED, IoOption.LIMIT_OFF | IoOption.LIMIT_STOP),
+        (ExcludedOptions.CLEARED, IoOption(0)),
+        (ExcludedOptions.IGNORED, IoOption.LIMIT_STOP),
+    ],
+)
+def test_what_options_do_that_exclude_each_other_is_a_switch(variant, protection):
+    axis = sc(excluded_options=variant)
+    axis.send(1, Command.IO_CONTROL, IoOption.LIMIT_STOP)
+
+    axis.send(1, Command.IO_CONTROL, 0x0C)
+
+    assert axis.drive.loop.protection == protection
+
+
+@pytest.mark.parametrize("steps_hz", [2000.0, -2000.0])
+def test_pulses_at_the_step_input_move_the_command_position_by_the_multiplier(steps_hz):
+    axis = sc(steps_hz=steps_hz)
+    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, replace(UTILITY_GAINS, step_multiplier=3)))
+    axis.wait(0.5)
+    before = commanded(axis)
+
+    axis.send(1, Command.IO_CONTROL, IoOption.STEP_DIRECTION)
+    axis.wait(0.5)
+
+    assert before == 0
+    assert commanded(axis) == pytest.approx(3 * steps_hz * 0.5, rel=0.08)
+    assert not axis.status().aux & AuxFlag.SERVO_OVERRUN
+
+
+def test_steps_that_come_too_fast_make_the_servo_late():
+    axis = sc(steps_hz=200_000.0)
+
+    axis.send(1, Command.IO_CONTROL, IoOption.STEP_DIRECTION)
+    axis.wait(0.01)
+
+    assert axis.status().aux & AuxFlag.SERVO_OVERRUN
+
+
+@pytest.mark.parametrize(("kept", "multiplier"), [(False, 1), (True, 5)])
+def test_whether_set_gain_without_a_multiplier_restores_it_is_a_switch(kept, multiplier):
+    axis = sc(gains_keep_multiplier=kept)
+    whole = encode_gains(axis.profile, replace(UTILITY_GAINS, step_multiplier=5))
+    axis.send(1, Command.SET_GAIN, *whole)
+
+    axis.send(1, Command.SET_GAIN, *whole[:14])
+
+    assert axis.drive.loop.gains.step_multiplier == multiplier
+
+
+@pytest.mark.parametrize("latched", [True, False])
+def test_whether_a_module_behind_a_fault_with_step_inputs_still_hears_is_a_switch(latched):
+    settings = replace(model("pic-servo-sc")[1], steps_hz=100_000.0, address_in_latched=latched)
+    host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc", settings=settings),) * 2)))
+    host.address_all()
+    host.send(1, Command.SET_GAIN, *encode_gains(host.chain.modules[0].profile, replace(UTILITY_GAINS, el=100)))
+    host.send(1, Command.STOP_MOTOR, 0x05)
+    host.send(1, Command.IO_CONTROL, IoOption.STEP_DIRECTION)
+    host.wait(0.5)  # the motor cannot follow
+    host.send(1, Command.NO_OPERATION)
+
+    assert not host.chain.modules[0].loop.servo_on
+    assert bool(host.send(2, Command.NO_OPERATION)) is latched
+
+    host.send(1, Command.IO_CONTROL, 0)
+    host.send(1, Command.NO_OPERATION)
+    assert host.send(2, Command.NO_OPERATION)
 
 
 # -- EEPROM (4.6, 5.2) ------------------------------------------------------------------------------------------------

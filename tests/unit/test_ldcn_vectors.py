@@ -308,7 +308,7 @@ def test_a_wrong_frame_is_taken_as_the_firmware_would(row):
         assert not interpretation.checksum_ok
         assert any("follow" in oddity for oddity in interpretation.oddities)
     elif "odd count" in row["note"]:
-        assert interpretation.command == AddPathPoints((402,))
+        assert interpretation.command == AddPathPoints((402,), half=0)
     elif "not executed" in row["note"]:
         assert not interpretation.checksum_ok
     elif row["note"].startswith("checksum"):

@@ -10,6 +10,10 @@ hear are taken down to 19200 baud, which is allowed while motors move, the newco
 another, and all go back to the working rate. In between every exchange is an ordinary one: stops overtake, healthy
 drives are polled at the lower rate. Some may have missed a change of rate, or have taken part in one before they had an
 address: while a module is missing afterwards, it is looked for, too.
+
+A PIC-SERVO SC may have saved its addresses: then it comes back with them, and never answers at address 0. One that
+answers at 19200 baud with its own address, and cannot have missed a change of rate, has restarted. It is reset while it
+stands, before it gets its address, because saved settings may have energised its motor, or would with the address.
 """
 
 import asyncio
@@ -220,6 +224,7 @@ class Rejoin:
         self._addressing = addressing
         self._expected = expected
         self._strays: deque[tuple[int, int]] = deque()  # rates and addresses at which somebody may be
+        self._kept_addresses: set[int] = set()  # of those that have restarted with them
         self._foreign: Identity | None = None  # complained about already
 
     async def look(self, mute: tuple[Expected, ...], addressing: Callable[[int], None]) -> frozenset[int]:
@@ -234,7 +239,7 @@ class Rejoin:
         """
         if self._bus.baud != self._rate.at_reset and not self._rate.changeable:
             return frozenset()  # a newcomer could not hear this port
-        if not mute or not await self._anybody_there(mute):
+        if not mute or not (await self._anybody_there(mute) or await self._anybody_with_saved_address(mute)):
             return frozenset()
         lost = [each for each in mute if await self._rate.who_is(each.address) is None]
         if lost:
@@ -281,6 +286,23 @@ class Rejoin:
             return awaited and await self._rate.who_is_at(baud, address) is not None
         return False
 
+    async def _anybody_with_saved_address(self, mute: tuple[Expected, ...]) -> bool:
+        """Ask whether a mute module has come back at 19200 baud with an address that it has saved."""
+        at_reset = self._rate.at_reset
+        if self._bus.baud == at_reset:
+            return False
+        for each in mute:
+            astray = (at_reset, each.address) in self._strays
+            if each.profile.sc_extensions and not astray and await self._rate.who_is_at(at_reset, each.address):
+                self._kept_addresses.add(each.address)
+        return bool(self._kept_addresses)
+
+    async def _stands(self, each: Expected) -> bool:
+        exchange = commands.read_status(Node(each.address, each.profile), MOTION_ITEMS)
+        before = await self._bus.execute(exchange)
+        await asyncio.sleep(WATCH_S)
+        return not _moves(before, await self._bus.execute(exchange))
+
     def _suspect(self, missing: Iterable[int]) -> None:
         strays = [(self._rate.at_reset, address) for address in missing]
         self._strays = deque([(self._rate.working, UNADDRESSED), *strays] * LOOKS_FOR_STRAYS if strays else [])
@@ -305,7 +327,12 @@ class Rejoin:
     async def _address_newcomers(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
         """Give the module at address 0 the first address that is missing, as long as there is one."""
         for each in lost:
-            if await self._rate.who_is(each.address):
+            if each.address in self._kept_addresses:
+                self._kept_addresses.discard(each.address)
+                if not await self._stands(each):
+                    continue
+                await self._bus.execute(commands.hard_reset(Node(each.address, each.profile)))
+            elif await self._rate.who_is(each.address):
                 continue  # it has its address, and had only missed a change of rate
             found = await self._rate.who_is(UNADDRESSED)
             if found is None:

@@ -5,7 +5,7 @@ ignored, missing ones count as 0. `interpret` does the same and says what was od
 Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ldcnd.drivers.ldcn.commands import COMMON_COMMANDS
 from ldcnd.drivers.ldcn.controls import HomingControl, PositionReset, StopControl
@@ -98,9 +98,14 @@ class LoadTrajectory:
 
 @dataclass(frozen=True, slots=True)
 class SetGain:
-    """Load the position loop's registers; in range or not."""
+    """Load the position loop's registers; in range or not.
+
+    Attributes:
+        without_multiplier: the step multiplier that the device has was not sent.
+    """
 
     gains: Gains
+    without_multiplier: bool = field(default=False, repr=False, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +139,14 @@ class SetBaudRate:
 
 @dataclass(frozen=True, slots=True)
 class AddPathPoints:
-    """Append to the path buffer; without points, start the path. Points are raw 16-bit words."""
+    """Append to the path buffer; without any data, start the path. Points are raw 16-bit words.
+
+    Attributes:
+        half: a byte that was left behind the last point.
+    """
 
     points: tuple[int, ...]
+    half: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +274,8 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
         case Command.LOAD_TRAJECTORY:
             return LoadTrajectory(decode_trajectory(profile, data)), trajectory_bytes(profile, TrajectoryControl(first))
         case Command.SET_GAIN:
-            return SetGain(decode_gains(profile, data)), _gain_bytes(profile, len(data))
+            short = profile.sc_extensions and len(data) < profile.gain_bytes
+            return SetGain(decode_gains(profile, data), short), _gain_bytes(profile, len(data))
         case Command.STOP_MOTOR:
             if first & StopControl.HERE:
                 return StopMotor(StopControl(first), POSITION.decode(data[1:])), 1 + POSITION_BYTES
@@ -303,7 +314,7 @@ def _decode_by_dialect(profile: Profile, packet: Packet, first: int) -> tuple[Re
             return IoControl(first), 1
         case Command.ADD_PATH_POINTS if profile.path_points:
             points = tuple(int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2))
-            return AddPathPoints(points), 2 * len(points)
+            return AddPathPoints(points, data[-1] if len(data) % 2 else None), 2 * len(points)
         case Command.HARD_RESET if data and profile.sc_extensions:
             return HardReset(first), 1
         case Command.HARD_RESET:

@@ -22,11 +22,16 @@ from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import (
     AnalogEnd,
     CommandBuffer,
+    ExcludedOptions,
+    HalfPoint,
     LimitInPath,
     ModuleSettings,
     PathOverflow,
+    PathWithoutServo,
     PositionErrorClearing,
     RelativeTo,
+    ResetInMotion,
+    UnknownBaud,
 )
 from ldcnd.sim.plant import MotorPlant
 
@@ -105,8 +110,16 @@ class Quirks(Frozen):
     """Whether it drops its reply as soon as the host sends."""
     command_buffer: CommandBuffer | None = None
     """What becomes of a command that has not been executed yet when another packet begins."""
+    address_in_latched: bool | None = None
+    """Whether it hears the host once it has an address, whatever the level of its address input."""
+    unknown_baud: UnknownBaud | None = None
+    """What PIC-SERVO SC does with a code of Set Baud Rate that it does not know."""
     undefined_status_bits: int | None = Field(default=None, ge=0, le=255)
     """Set in a PIC-I/O's status byte, of which only bit 1 is defined."""
+    undefined_level_bits: int | None = Field(default=None, ge=0, le=15)
+    """The upper half of a PIC-I/O's second input byte."""
+    synch_output_once: bool | None = None
+    """Whether a PIC-I/O applies stored outputs once, or with each Synch Output."""
     counter_cleared_by_mode: bool | None = None
     """Whether Set Timer Mode sets a PIC-I/O's counter to 0."""
     stop_clears_velocity: bool | None = None
@@ -131,12 +144,24 @@ class Quirks(Frozen):
     """Sign of the velocity item while the motor runs forward; the model's when left out."""
     relative_to: RelativeTo | None = None
     """Which command position a relative goal is added to, PIC-SERVO SC: that of the load or of the start."""
+    reset_in_motion: ResetInMotion | None = None
+    """What Reset Position does to the goal of a move that is under way."""
     home_shifts: bool | None = None
     """Whether Reset Position also shifts the captured home position."""
     aux_after_reset: bool | None = None
     """Whether auxiliary bit 4 is set after a reset, PIC-SERVO SC."""
     path_overflow: PathOverflow | None = None
     """What happens to path points that the buffer has no room for."""
+    half_point: HalfPoint | None = None
+    """What becomes of an odd byte behind path points."""
+    path_without_servo: PathWithoutServo | None = None
+    """What path mode does while the servo is off."""
+    path_takes_points_in_motion: bool | None = None
+    """Whether path points are taken during another motion, too."""
+    path_starts_empty: bool | None = None
+    """Whether a start with an empty buffer begins a path with the first point that comes."""
+    path_restarts: bool | None = None
+    """Whether another start goes on to the next point at once."""
     path_cleared_by_stop: bool | None = None
     """Whether Stop Motor clears the path points that are left."""
     path_cleared_by_fault: bool | None = None
@@ -155,6 +180,12 @@ class Quirks(Frozen):
     """Whether the servo rate divisor of a CMC leaves its path as it is."""
     path_ended_by_enable: bool | None = None
     """Whether Stop Motor with the enable bit alone ends a path."""
+    excluded_options: ExcludedOptions | None = None
+    """What PIC-SERVO SC does with options that exclude each other."""
+    gains_keep_multiplier: bool | None = None
+    """Whether Set Gain without a step multiplier leaves that as it is, PIC-SERVO SC."""
+    steps_hz: float | None = Field(default=None, ge=-1_000_000, le=1_000_000)
+    """A pulse train at the step input of PIC-SERVO SC, negative in reverse."""
     limit_in_path: LimitInPath | None = None
     """What limit protection does to a path, PIC-SERVO SC."""
     advanced_sticky: bool | None = None

@@ -9,15 +9,22 @@ Decisions where the manuals leave room:
   latched too, as the footnote of the diagnostics table demands.
 * The motion lock of LS-182AP from version 22 on: homing on a limit switch locks; then nothing starts until Stop Motor
   with bit 7, which also keeps further homing from locking until the next reset.
-* Path points are taken with the servo off and during other motions; a path starts with the servo on only. A start with
-  an empty buffer, or while a path runs, does nothing.
+* The address output of a PIC-SERVO SC with step and direction inputs, which rises on a servo fault, is seen to rise with
+  the next packet for the drive, and falls when the loop is closed again.
 
 Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3; PIC-SERVO SC data sheet, 4.6, 4.7, 5.
 """
 
 from dataclasses import dataclass, replace
 
-from ldcnd.drivers.ldcn.controls import HomingControl, IoOption, LimitPins, StartUp, StopControl
+from ldcnd.drivers.ldcn.controls import (
+    EXCLUSIVE_OPTIONS,
+    HomingControl,
+    IoOption,
+    LimitPins,
+    StartUp,
+    StopControl,
+)
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
 from ldcnd.drivers.ldcn.received import (
@@ -36,11 +43,21 @@ from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, e
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage, ScPower
-from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing, RelativeTo
+from ldcnd.sim.ldcn.quirks import (
+    ExcludedOptions,
+    HalfPoint,
+    ModuleSettings,
+    PathWithoutServo,
+    PositionErrorClearing,
+    RelativeTo,
+    ResetInMotion,
+)
 from ldcnd.sim.ldcn.servo import COUNTER_SPAN, HomeSearch, ServoLoop
 from ldcnd.sim.plant import MotorPlant, Shaft
 
 SHORTS = range(-0x8000, 0x8000)
+MOST_STEPS_HZ = 100_000
+"""Pulses that come faster make PIC-SERVO SC late for its servo cycle (data sheet, 4.4.6)."""
 _NO_TRAJECTORY = Trajectory(servo=False)
 _ALL_INPUTS = LimitPins.LIMIT1_INPUT | LimitPins.LIMIT2_INPUT
 _WAYS_TO_STOP = StopControl.MOTOR_OFF | StopControl.ABRUPT | StopControl.SMOOTH | StopControl.HERE
@@ -138,6 +155,10 @@ class SimulatedDrive(SimulatedModule):
     def run(self, cycles: int) -> None:
         """Let servo cycles pass; a home search that ends on a limit may lock motion."""
         self.loop.run(cycles)
+        if self.profile.sc_extensions:
+            self.address_out = self.address != 0 and not (self.loop.step_mode and self.loop.faulted)
+        if self.loop.step_mode:
+            self._overrun = self._overrun or abs(self.settings.steps_hz) > MOST_STEPS_HZ
         if self.loop.homed_on_limit:
             self.loop.homed_on_limit = False
             self._locked = self._may_lock
@@ -152,7 +173,9 @@ class SimulatedDrive(SimulatedModule):
                 self._load(trajectory)
             case PlainCommand(Command.START_MOTION):
                 self._start()
-            case SetGain(gains):
+            case SetGain(gains, without_multiplier):
+                if without_multiplier and self.settings.gains_keep_multiplier:
+                    gains = replace(gains, step_multiplier=loop.gains.step_multiplier)
                 loop.set_gains(gains)
             case StopMotor(control, position):
                 self._stop(control, position)
@@ -160,11 +183,11 @@ class SimulatedDrive(SimulatedModule):
                 self._set_options(control)
             case SetHomingMode(control):
                 self._arm_homing(control)
-            case AddPathPoints(()):
-                if loop.servo_on:
+            case AddPathPoints((), None):
+                if loop.servo_on or self.settings.path_without_servo is PathWithoutServo.RUNS:
                     loop.trajectory.start_path()
-            case AddPathPoints(points):
-                loop.trajectory.path.add(points)
+            case AddPathPoints(points, half):
+                self._add_points(points, half)
             case PlainCommand(Command.CLEAR_STICKY_BITS):
                 self._clear_sticky_bits()
             case PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME):
@@ -257,6 +280,7 @@ class SimulatedDrive(SimulatedModule):
             return
         self._speed, self._acceleration = saved.speed, saved.acceleration
         self.loop.set_gains(saved.gains)
+        self.loop.step_mode = bool(saved.start_up & StartUp.STEP_DIRECTION)
         if saved.start_up & StartUp.LIMIT_PROTECTION:
             self.loop.protection = saved.protection
         self._energised_by_address = saved.start_up & (StartUp.AMPLIFIER_ON | StartUp.SERVO_ON)
@@ -277,18 +301,40 @@ class SimulatedDrive(SimulatedModule):
 
     def _renumber(self, position: int) -> None:
         """Name the present position anew: 0; on PIC-SERVO SC also relative to home, or any number."""
-        loop = self.loop
+        loop, rule = self.loop, self.settings.reset_in_motion
+        profiler = loop.trajectory
+        moving = loop.servo_on and profiler.mode is ProfileMode.TRAPEZOIDAL and not profiler.done
+        if moving and rule is ResetInMotion.IGNORED:
+            return
         if self.settings.home_shifts:
             loop.home += position - loop.position
-        loop.renumber(position)
+        loop.renumber(position, goal_too=moving and rule is ResetInMotion.GOAL_SHIFTED)
 
     def _set_options(self, control: int) -> None:
         loop = self.loop
         if self.profile.limit_outputs:
             self._pins = LimitPins(control & 0x0F)
         else:
+            for pair in EXCLUSIVE_OPTIONS:
+                if control & pair == pair and self.settings.excluded_options is ExcludedOptions.IGNORED:
+                    return
+                if control & pair == pair and self.settings.excluded_options is ExcludedOptions.CLEARED:
+                    control &= ~pair
             loop.protection = IoOption(control) & _LIMIT_PROTECTION
+            loop.step_mode = bool(control & IoOption.STEP_DIRECTION)
         loop.trajectory.path.fast = bool(control & IoOption.FAST_PATH)
+
+    def _add_points(self, points: tuple[int, ...], half: int | None) -> None:
+        loop, settings = self.loop, self.settings
+        if not loop.servo_on and settings.path_without_servo is PathWithoutServo.POINTS_REFUSED:
+            return
+        if not (loop.trajectory.done or loop.trajectory.path.running or settings.path_takes_points_in_motion):
+            return
+        if half is not None and settings.half_point is HalfPoint.PACKET_DROPPED:
+            return
+        if half is not None and settings.half_point is HalfPoint.COMPLETED:
+            points += (half,)
+        loop.trajectory.path.add(points)
 
     def _load(self, trajectory: Trajectory) -> None:
         if trajectory.relative and self.settings.relative_to is RelativeTo.LOAD and trajectory.position is not None:

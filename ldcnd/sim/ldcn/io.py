@@ -4,7 +4,6 @@ A line of a PIC-I/O that is an output has the level of its latch. An input has t
 it, or the one that it is driven to from outside, or is pulled up. Where the data sheet leaves room:
 
 * Output latches, stored outputs and PWM values are 0 after a reset; a line that becomes an output shows its latch.
-* Synch Output may be repeated, and applies the stored values again.
 * Counter and timer are 0 and off after a reset, and keep their count while they are off.
 
 Source: PIC-I/O data sheet, 2.2, 3.1.
@@ -17,6 +16,7 @@ from ldcnd.drivers.ldcn.pic_io import (
     ALL_LINES,
     CHECKSUM_ERROR,
     COUNTER_LINE,
+    LINES,
     TIMER_HZ,
     IoItem,
     IoStatus,
@@ -108,6 +108,7 @@ class SimulatedIo(SimulatedModule):
         self.latch = 0
         self.pwm = (0, 0)
         self._stored = SetSynchOutput(0, 0, 0)
+        self._spent = False
         self._mode = SetTimerMode(enabled=False)
         self._counted = 0  # under earlier modes
         self._raw = 0.0  # edges or clocks under this mode, before the prescaler
@@ -133,10 +134,9 @@ class SimulatedIo(SimulatedModule):
             case SetOutput(levels):
                 self._set_latch(levels)
             case SetSynchOutput():
-                self._stored = command
+                self._stored, self._spent = command, False
             case SynchOutput():
-                self._set_latch(self._stored.levels)
-                self.pwm = (self._stored.pwm1, self._stored.pwm2)
+                self._apply_stored()
             case SetTimerMode():
                 self._counted = 0 if self.settings.counter_cleared_by_mode else self._count
                 self._raw = 0.0
@@ -149,19 +149,27 @@ class SimulatedIo(SimulatedModule):
         """Return a status packet."""
         adc1, adc2, adc3 = self._adc
         levels, counter = self._captured
+        undefined = self.settings.undefined_level_bits << LINES
         status = IoStatus(
             rejected=checksum_error,
-            levels=self.levels,
+            levels=self.levels | undefined,
             adc1=adc1,
             adc2=adc2,
             adc3=adc3,
             counter=self._count,
             device_id=self.profile.device_id,
             version=self.settings.version,
-            captured_levels=levels,
+            captured_levels=levels | undefined,
             captured_counter=counter,
         )
         return encode_io_status(IoItem(items), status, undefined_bits=self.settings.undefined_status_bits)
+
+    def _apply_stored(self) -> None:
+        if self._spent:
+            return
+        self._set_latch(self._stored.levels)
+        self.pwm = (self._stored.pwm1, self._stored.pwm2)
+        self._spent = self.settings.synch_output_once
 
     @property
     def _count(self) -> int:

@@ -6,8 +6,8 @@ every module has its own phase and drift of that grid. Decisions where the manua
 * A byte of the host that arrives before the status packet has been sent makes a module drop that packet. The command
   itself waits in the buffer into which the next packet is received, and is overwritten by the address byte of any.
 * A framing error in the middle of a packet counts as a wrong checksum; outside of packets it is nothing.
-* Nothing is heard while the address input is high. It is a level, not a latch: a module behind one that was reset is
-  deaf until that one has an address again.
+* Nothing is heard while the address input is high. It is a level, not a latch, unless a switch says otherwise: a module
+  behind one that was reset is deaf until that one has an address again.
 
 Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface", "Addressing".
 """
@@ -27,10 +27,10 @@ from ldcnd.drivers.ldcn.received import (
     SetBaudRate,
     received_command,
 )
-from ldcnd.drivers.ldcn.registers import RESET_BAUD_CODE, module_baud
+from ldcnd.drivers.ldcn.registers import RESET_BAUD_CODE, actual_baud, module_baud
 from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
-from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings
+from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings, UnknownBaud
 
 EVERYBODY = 0xFF
 _ROUNDING = 1e-6
@@ -209,6 +209,7 @@ class SimulatedModule(Module):
             case SetAddress() as addresses:
                 self.address, self.group, self.leader = addresses.address, addresses.group, addresses.leader
                 self.address_out = True
+                self.latched = self.settings.address_in_latched
                 self.addressed()
             case DefineStatus(items):
                 self.items = items
@@ -218,6 +219,8 @@ class SimulatedModule(Module):
                 baud = module_baud(self.profile, code)
                 if baud is None:
                     self.unknown_bauds += 1
+                    if self.settings.unknown_baud is UnknownBaud.DIVIDED:
+                        self.baud = actual_baud(code, self.profile.clock_hz)
                 else:
                     self.baud = baud
             case HardReset(start_up):
@@ -241,7 +244,7 @@ class SimulatedModule(Module):
         self.leader = False
         self.items = StatusItem(0)
         self.baud = module_baud(self.profile, RESET_BAUD_CODE) or self.baud
-        self.address_out = False
+        self.address_out = self.latched = False
         self.next_event_s = NEVER_S
         self._reader.reset()
         self._packet = None

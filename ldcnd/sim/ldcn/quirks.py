@@ -36,6 +36,57 @@ class AnalogEnd(StrEnum):
     REACHED_OR_PASSED = "reached_or_passed"
 
 
+class UnknownBaud(StrEnum):
+    """What PIC-SERVO SC does with a code of Set Baud Rate that its data sheet does not list."""
+
+    KEPT = "kept"
+    """It stays at its rate."""
+    DIVIDED = "divided"
+    """It takes the code for a divisor, as older parts do."""
+
+
+class ResetInMotion(StrEnum):
+    """What Reset Position does to the goal of a trapezoidal move that is under way."""
+
+    GOAL_KEPT = "goal_kept"
+    """The goal keeps its number, and so becomes another place."""
+    GOAL_SHIFTED = "goal_shifted"
+    """The goal stays the same place."""
+    IGNORED = "ignored"
+    """Reset Position does nothing then."""
+
+
+class ExcludedOptions(StrEnum):
+    """What PIC-SERVO SC does with options of I/O Control that its data sheet does not allow together."""
+
+    OBEYED = "obeyed"
+    """Each does what it does alone; of both kinds of limit protection, turning the motor off wins."""
+    CLEARED = "cleared"
+    """Neither takes effect."""
+    IGNORED = "ignored"
+    """The whole command has no effect."""
+
+
+class HalfPoint(StrEnum):
+    """What becomes of an odd byte at the end of Add Path Points."""
+
+    IGNORED = "ignored"
+    COMPLETED = "completed"
+    """The missing byte counts as 0."""
+    PACKET_DROPPED = "packet_dropped"
+
+
+class PathWithoutServo(StrEnum):
+    """What path mode does while the servo is off."""
+
+    WAITS = "waits"
+    """Points are taken, a start does nothing."""
+    POINTS_REFUSED = "points_refused"
+    """Neither points nor a start are taken."""
+    RUNS = "runs"
+    """A path uses its points up, and nothing moves."""
+
+
 class RelativeTo(StrEnum):
     """Which command position a relative goal of PIC-SERVO SC is added to, when it is loaded first and started later."""
 
@@ -76,7 +127,11 @@ class ModuleSettings:
             in group FF.
         yields_to_host: drops its reply as soon as the host sends, also one that is due.
         command_buffer: what becomes of a command that has not been executed yet when another packet begins.
+        address_in_latched: once it has an address it hears the host, whatever the level of its address input.
+        unknown_baud: what PIC-SERVO SC does with a code of Set Baud Rate that it does not know.
         undefined_status_bits: of a PIC-I/O's status byte, of which only bit 1 is defined.
+        undefined_level_bits: of the upper half of a PIC-I/O's second input byte.
+        synch_output_once: a PIC-I/O applies stored outputs once, not with each Synch Output.
         counter_cleared_by_mode: Set Timer Mode sets a PIC-I/O's counter to 0.
         stop_clears_velocity: stopping smoothly or abruptly sets the velocity register to 0.
         position_error_clearing: what clears pos_error.
@@ -89,9 +144,15 @@ class ModuleSettings:
         il_times_256: the integral sum is bounded by 256 times IL instead of by IL.
         velocity_sign: of the velocity item while the motor runs forward, 1 or -1; None for the model's.
         relative_to: what a relative goal is added to.
+        reset_in_motion: what Reset Position does to the goal of a move that is under way.
         home_shifts: Reset Position also shifts the captured home position.
         aux_after_reset: auxiliary bit 4 is set after a reset as at any standstill, before the loop is closed first.
         path_overflow: what happens to points that the buffer has no room for.
+        half_point: what becomes of an odd byte behind the points.
+        path_without_servo: what path mode does while the servo is off.
+        path_takes_points_in_motion: points are taken during another motion, too.
+        path_starts_empty: a start with an empty buffer begins a path with the first point that comes.
+        path_restarts: another start goes on to the next point at once.
         path_cleared_by_stop: Stop Motor, or another motion, clears the points that are left.
         path_cleared_by_fault: the servo being switched off by an error does.
         path_counts_point_under_way: the number of points left includes the one that is walked through.
@@ -101,6 +162,9 @@ class ModuleSettings:
         path_slew: and auxiliary bit 4 is.
         path_ignores_divisor: the servo rate divisor of a CMC does not slow its path.
         path_ended_by_enable: Stop Motor with the enable bit alone ends a path.
+        excluded_options: what PIC-SERVO SC does with options that exclude each other.
+        gains_keep_multiplier: Set Gain without a step multiplier leaves that as it is instead of setting it to 1.
+        steps_hz: of a pulse train at the step input of PIC-SERVO SC; negative in reverse.
         limit_in_path: what limit protection does to a path.
         advanced_sticky: a CMC keeps its advanced features when a later Stop Motor lacks their bit.
         items_before_advanced: a CMC sends status items 6 and 7 before its advanced features are on.
@@ -115,7 +179,11 @@ class ModuleSettings:
     always_obeys_global_reset: bool = False
     yields_to_host: bool = True
     command_buffer: CommandBuffer = CommandBuffer.OVERWRITTEN
+    address_in_latched: bool = False
+    unknown_baud: UnknownBaud = UnknownBaud.KEPT
     undefined_status_bits: int = 0
+    undefined_level_bits: int = 0
+    synch_output_once: bool = False
     counter_cleared_by_mode: bool = False
     stop_clears_velocity: bool = True
     position_error_clearing: PositionErrorClearing = PositionErrorClearing.BY_COMMAND
@@ -128,9 +196,15 @@ class ModuleSettings:
     il_times_256: bool = True
     velocity_sign: int | None = None
     relative_to: RelativeTo = RelativeTo.START
+    reset_in_motion: ResetInMotion = ResetInMotion.GOAL_KEPT
     home_shifts: bool = False
     aux_after_reset: bool = False
     path_overflow: PathOverflow = PathOverflow.DROP_EXCESS
+    half_point: HalfPoint = HalfPoint.IGNORED
+    path_without_servo: PathWithoutServo = PathWithoutServo.WAITS
+    path_takes_points_in_motion: bool = True
+    path_starts_empty: bool = False
+    path_restarts: bool = False
     path_cleared_by_stop: bool = True
     path_cleared_by_fault: bool = False
     path_counts_point_under_way: bool = False
@@ -140,6 +214,9 @@ class ModuleSettings:
     path_slew: bool = True
     path_ignores_divisor: bool = False
     path_ended_by_enable: bool = False
+    excluded_options: ExcludedOptions = ExcludedOptions.OBEYED
+    gains_keep_multiplier: bool = False
+    steps_hz: float = 0.0
     limit_in_path: LimitInPath = LimitInPath.ENDS_PATH
     advanced_sticky: bool = True
     items_before_advanced: bool = False

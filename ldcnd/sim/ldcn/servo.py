@@ -11,7 +11,6 @@ Where the manuals leave room:
 
 * A servo rate divisor of 0, which no manual allows, counts as 256.
 * Encoder transitions faster than the model counts are lost for good; so are those of a stuck encoder.
-* Limit protection of PIC-SERVO SC with both of its options set turns the motor off.
 """
 
 import math
@@ -92,6 +91,8 @@ class ServoLoop:
         analog_target: the A/D value that an absolute positioning motion goes to; the mode lasts beyond the arrival,
             and with it the check of the sensor.
         protection: limit protection as selected by I/O Control.
+        step_mode: pulses at the step input move the command position.
+        faulted: an error has opened the loop, and nothing has closed it since.
         search: the armed search for home.
         homed_on_limit: the last search ended on a limit switch.
         position_error: the sticky bits: error limit exceeded or loop opened,
@@ -111,6 +112,9 @@ class ServoLoop:
         self.pwm = 0
         self.analog_target: int | None = None
         self.protection = IoOption(0)
+        self.step_mode = False
+        self.faulted = False
+        self._steps = 0.0  # a part of a pulse is left
         self.search: HomeSearch | None = None
         self.homed_on_limit = False
         self.position_error = True
@@ -177,12 +181,16 @@ class ServoLoop:
         self._tick_cycles = self._divisor if self._profile.divisor_slows_profile else 1
         self._cycles_left = min(self._cycles_left, self._tick_cycles)
 
-    def renumber(self, position: int) -> None:
-        """Call the present position by another number, for encoder and command alike."""
+    def renumber(self, position: int, *, goal_too: bool = False) -> None:
+        """Call the present position by another number, for encoder and command alike, and with them the goal."""
+        moved = position - self.position
         self._zero += self.position - position
         self._ticked_position += position - self.position
         self.position = position
-        self.trajectory.renumber(position)
+        if goal_too:
+            self.trajectory.shift(moved)
+        else:
+            self.trajectory.renumber(position)
 
     # -- the loop ----------------------------------------------------------------------------------------------------
 
@@ -194,6 +202,7 @@ class ServoLoop:
         self._previous_error = self._derivative = self._error_sum = 0
         self.pwm = 0
         self.servo_on = True
+        self.faulted = False
 
     def open(self) -> None:
         """Open the position loop; the PWM value falls to 0 and pos_error is set."""
@@ -236,6 +245,8 @@ class ServoLoop:
             self._zero = math.floor(shaft.position_counts) - before
         if self._path_every_cycle and self.trajectory.path.running:
             self.trajectory.step()
+        if self.step_mode and self.servo_on:
+            self._take_steps()
         self._cycles_left -= 1
         if self._cycles_left <= 0:
             self._cycles_left = self._tick_cycles
@@ -255,7 +266,15 @@ class ServoLoop:
             and self._error_sum == error_sum
             and self.trajectory.at_rest
             and not self._overloaded
+            and not (self.step_mode and self._quirks.steps_hz)
         )
+
+    def _take_steps(self) -> None:
+        """Add the pulses of a cycle, times the step multiplier, to the command position (SC data sheet, 4.4.6)."""
+        self._steps += self._quirks.steps_hz * self._profile.servo_cycle_s
+        whole = int(self._steps)
+        self._steps -= whole
+        self.trajectory.position += whole * self.gains.step_multiplier * FRACTION
 
     def _lose_counts(self, position: int, before: int) -> int:
         """Return what the counter shows after transitions that came too fast; the rest is lost."""
@@ -277,6 +296,8 @@ class ServoLoop:
         self._ticked_position = position
         trajectory = self.trajectory
         if not self.servo_on:
+            if trajectory.path.running:
+                trajectory.path.step()
             trajectory.follow(position, self.velocity)
             self.position_error = True
             return
@@ -316,6 +337,7 @@ class ServoLoop:
 
     def _give_up(self, cause: Trip) -> None:
         self.open()
+        self.faulted = True
         self.stage.trip(cause)
 
     # -- absolute positioning, current limit, home -------------------------------------------------------------------

@@ -72,8 +72,12 @@ class PathBuffer:
         self._points.extend(points)
 
     def start(self) -> bool:
-        """Begin with the first point; tell whether there is one."""
-        if self._points and not self.running:
+        """Begin with the first point, or with the next one where that is a switch; tell whether a path runs."""
+        if self.running:
+            if self._quirks.path_restarts:
+                self._cycles_left = 0
+                self.running = bool(self._points)
+        elif self._points or self._quirks.path_starts_empty:
             self.running = True
             self.blocked = False
             self._cycles_left = 0
@@ -93,6 +97,8 @@ class PathBuffer:
 
     def step(self) -> int:
         """Let one cycle pass; return its velocity, 16.16. With the last cycle of the last point the path ends."""
+        if self._cycles_left == 0 and not self._points:
+            return 0  # started with an empty buffer
         if self._cycles_left == 0:
             word, fast_at_load = self._points.popleft()
             fast = fast_at_load if self._quirks.path_rate_at_load else self.fast

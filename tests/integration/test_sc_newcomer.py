@@ -1,0 +1,72 @@
+"""A PIC-SERVO SC that restarts in a running line: whatever its EEPROM holds, it energises nothing and hurts no other."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.config.rig import RigConfig
+from ldcnd.drivers.ldcn.controls import StartUp
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on
+from tests.support.dialect_rig import COUNTS_PER_MM, GAINS
+
+ENERGISED = StartUp.SAVE | StartUp.AMPLIFIER_ON | StartUp.SERVO_ON
+EEPROMS = {
+    "erased": None,
+    "servo on": ENERGISED,
+    "address kept": StartUp.SAVE | StartUp.ADDRESSES,
+    "address kept, servo on": ENERGISED | StartUp.ADDRESSES,
+}
+
+
+def config(baud: int) -> RigConfig:
+    axis = {
+        "model": "pic-servo-sc",
+        "unit": "mm",
+        "counts_per_unit": COUNTS_PER_MM,
+        "velocity": 20,
+        "acceleration": 200,
+        "reference": "at_reset",
+        "gains": GAINS,
+    } | UNSEEN_MOTIONS_END
+    axes = [axis | {"name": name, "address": address} for address, name in enumerate("xyz", 1)]
+    bus = {"name": "line", "port": "sim:line", "baud": baud, "margin_ms": 5, "axis": axes}
+    sim = {"name": "line", "module": [{"model": "pic-servo-sc"}] * 3}
+    return RigConfig.model_validate({"rig": "sim", "sim": [sim], "bus": [bus]})
+
+
+@pytest.mark.parametrize("baud", [115_200, 230_400])
+@pytest.mark.parametrize("eeprom", EEPROMS)
+async def test_an_sc_that_restarts_is_reset_before_it_is_addressed_and_the_others_go_on(eeprom, baud):
+    chain = build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),) * 3))
+    async with rig_on(chain, config(baud)) as rig:
+        for name in "xyz":
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=8.0))
+        await rig.client.command("z", MoveAbsolute(position=-60.0, velocity=5.0))
+        newcomer = drive(chain, 2)
+        if EEPROMS[eeprom] is not None:
+            newcomer.save(EEPROMS[eeprom])
+        seen = len(rig.sent)
+
+        newcomer.power(on=False, at_s=asyncio.get_running_loop().time())
+        await asyncio.sleep(2)
+        newcomer.power(on=True, at_s=asyncio.get_running_loop().time())
+        back = await rig.until("y", lambda state: state.link is LinkState.UP and state.state is AxisState.DISABLED)
+        await asyncio.sleep(0.5)
+        energised = (newcomer.stage.drives, newcomer.loop.servo_on)
+        await asyncio.sleep(14)  # the others arrive
+        sent = rig.sent[seen:]
+
+    resets = [packet.address for packet in sent if packet.command is Command.HARD_RESET]
+    assert resets
+    assert set(resets) <= {0, 2}  # who hears by a group or has another address works on
+    assert not back.referenced
+    assert energised == (False, False)
+    assert [module.address for module in chain.modules] == [1, 2, 3]
+    assert [module.baud for module in chain.modules] == pytest.approx([baud] * 3, rel=0.02)
+    assert [round(drive(chain, place).loop.position / COUNTS_PER_MM) for place in (1, 2, 3)] == [90, 0, -60]
