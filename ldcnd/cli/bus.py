@@ -89,21 +89,28 @@ def set_io_timer(target: Target, module: str, mode: str, prescale: str, lease: s
 
 
 def _shown(reply: IoReply) -> tuple[IoReply, str]:
-    levels = " ".join(f"{line}={'high' if level else 'low'}" for line, level in enumerate(reply.levels, 1))
     outputs = "not known" if reply.outputs is None else ", ".join(map(str, reply.outputs)) or "none"
-    return reply, f"{reply.module}: {levels}; outputs: {outputs}"
+    return reply, f"{reply.module}: {_levels(reply.levels)}; outputs: {outputs}"
+
+
+def _levels(levels: tuple[bool, ...]) -> str:
+    return " ".join(f"{line}={'high' if level else 'low'}" for line, level in enumerate(levels, 1))
 
 
 @command.command()
 @click.argument("bus")
 @with_target
 def snapshot(target: Target, bus: str) -> None:
-    """Show the positions of all axes of the line BUS at one instant; nothing moves."""
+    """Show the positions of all axes of the line BUS, and inputs of its I/O modules, at one instant; nothing moves."""
     reply = target.run(lambda client: client.ask(Snapshot(bus=bus)))
     lines = [
         f"{each.axis:8} {each.position:14.6f} {each.unit:8} {each.counts:12d} counts"
         f"{'' if each.referenced else '  not referenced'}"
         for each in reply.positions
+    ]
+    lines += [
+        f"{each.module:8} {_levels(each.levels)}; count {each.counter}{'' if each.proven else '  not proven'}"
+        for each in reply.io
     ]
     target.show(reply, *lines, f"all within {reply.t_error_ns / 1e6:.2f} ms of {reply.t / 1e9:.6f} s UTC")
 

@@ -38,18 +38,37 @@ class BringUpReport:
 
 
 @dataclass(frozen=True, slots=True)
+class CapturedIo:
+    """What an I/O module has captured together with positions.
+
+    Attributes:
+        name: of the module.
+        levels: of its lines, the first is line 1; true is high.
+        counter: raw count.
+        proven: the count has changed since the capture before; at rest it cannot tell.
+    """
+
+    name: str
+    levels: tuple[bool, ...]
+    counter: int
+    proven: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Instant:
-    """Positions of several drives, frozen together.
+    """Positions of several drives, frozen together, and what I/O modules have captured then.
 
     Attributes:
         counts: by axis name.
         from_s: the earliest instant at which any of them can have been frozen, on the bus's clock.
         until_s: the latest.
+        io: of each I/O module with a name.
     """
 
     counts: Mapping[str, int]
     from_s: float
     until_s: float
+    io: tuple[CapturedIo, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,10 +22,10 @@ class ItemPlan(Frozen):
 
 
 class PollPlan(Frozen):
-    """The periodic exchange of one axis, in which all its items travel."""
+    """The periodic exchange of one axis, in which all its items travel, or of another module on the line."""
 
     axis: str
-    """Whose."""
+    """Whose: an axis, an I/O module by its name, or the address of a module without one in words."""
     address: int
     """Its node address."""
     request_bytes: int

@@ -140,6 +140,19 @@ class FrozenPosition(Frozen):
     """The position means something; see the state of the axis."""
 
 
+class CapturedInputs(Frozen):
+    """What an I/O module had at its inputs at the instant of a snapshot."""
+
+    module: str
+    """The module."""
+    levels: tuple[bool, ...]
+    """Levels of the lines, the first is line 1."""
+    counter: int = Field(ge=0)
+    """Raw count of its counter or timer."""
+    proven: bool
+    """The count shows that this was captured now; while nothing is counted the module cannot prove it."""
+
+
 class SnapshotReply(Frozen):
     """Positions of all axes of a line, frozen by one packet: the reply to `@cmd/_/snapshot`."""
 
@@ -151,10 +164,12 @@ class SnapshotReply(Frozen):
     """Every one of the true instants lies within this many ns of `t`."""
     positions: tuple[FrozenPosition, ...]
     """One for each axis."""
+    io: tuple[CapturedInputs, ...] = ()
+    """One for each I/O module with a name."""
 
 
 class Snapshot(Command[SnapshotReply]):
-    """Freeze the positions of all axes of a line at one instant; the line must be configured for it.
+    """Freeze the positions of all axes of a line, and its I/O modules' inputs, at one instant.
 
     Nothing moves or stops. The drives' home registers are overwritten, so no axis may be homing.
     """

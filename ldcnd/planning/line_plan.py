@@ -22,7 +22,7 @@ class Poll:
     """What is asked for periodically, in one exchange or a few.
 
     Attributes:
-        axis: whose.
+        axis: whose; the name of an I/O module, or words for a module that has none.
         items: what it asks for in the worst case.
         rate_hz: how often at most.
         cost: with all these items.
@@ -30,6 +30,7 @@ class Poll:
         request_bytes: what is sent.
         reply_bytes: what comes back at most.
         exchanges: that it takes.
+        address: of a module that is no axis.
     """
 
     axis: str
@@ -40,6 +41,7 @@ class Poll:
     request_bytes: int = 0
     reply_bytes: int = 0
     exchanges: int = 1
+    address: int | None = None
 
     @property
     def mean_cost(self) -> Cost:

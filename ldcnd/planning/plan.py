@@ -116,26 +116,30 @@ def _fits_at(bus: BusConfig, baud: int) -> bool:
 
 def _described(bus: BusConfig, plan: LinePlan) -> list[PollPlan]:
     axes = {axis.name: axis for axis in bus.axis}
+
+    def address(poll: Poll) -> int:
+        return axes[poll.axis].address if poll.address is None else poll.address
+
     return [
         PollPlan(
             axis=poll.axis,
-            address=axes[poll.axis].address,
+            address=address(poll),
             request_bytes=poll.request_bytes,
             reply_bytes=poll.reply_bytes,
             rate_hz=poll.rate_hz,
             longest_s=poll.cost.longest_s,
             response_s=_bounded(response_s),
             holds=response_s <= poll.task.period_s,
-            items=tuple(_items(axes[poll.axis], poll, response_s)),
-            priority=axes[poll.axis].priority,
+            items=tuple(_items(axes.get(poll.axis), poll, response_s)),
+            priority=axes[poll.axis].priority if poll.axis in axes else "normal",
         )
         for poll, response_s in zip(plan.polls, plan.responses_s, strict=True)
     ]
 
 
-def _items(axis: AxisConfig, poll: Poll, response_s: float) -> list[ItemPlan]:
+def _items(axis: AxisConfig | None, poll: Poll, response_s: float) -> list[ItemPlan]:
     """Slower items ride along with the nearest poll, so they may be due half a poll period before it."""
-    if len(poll.items) == 1:
+    if axis is None or len(poll.items) == 1:
         return [ItemPlan(item=poll.items[0], rate_hz=poll.rate_hz, response_s=_bounded(response_s))]
     riding_s = poll.task.period_s / 2
     return [

@@ -9,9 +9,10 @@ from pydantic import ValidationError
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.errors import LeaseHeld, StopLatched, ValueOutOfRange, WrongState
-from ldcnd.model.commands import Power, Stop
-from ldcnd.model.rig_commands import Acquire, IoReply, SetIo, SetIoTimer
+from ldcnd.model.commands import MoveVelocity, Power, Stop
+from ldcnd.model.rig_commands import Acquire, IoReply, SetIo, SetIoTimer, Snapshot
 from ldcnd.model.samples import IoSample, LinkState, TelemetryItem
+from ldcnd.planning.plan import plan_bus
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo
 from tests.support.dialect_rig import GAINS
@@ -20,14 +21,14 @@ from tests.support.rig import RunningRig, running_rig
 MODULE = {"name": "cabinet", "address": 2, "model": "pic-io", "outputs": [4, 9], "rate": 50}
 
 
-def config(start: str = "reset", **module: object) -> RigConfig:
+def config(start: str = "reset", line: dict[str, object] | None = None, **module: object) -> RigConfig:
     axis = {"name": "x", "address": 1, "model": "pic-servo-v4", "velocity": 1000, "acceleration": 1000, "gains": GAINS}
     bus = {"name": "line", "port": "sim:line", "baud": 115_200, "start": start, "axis": [axis]}
     return RigConfig.model_validate(
         {
             "rig": "io",
             "sim": [{"name": "line", "module": [{"model": "picservo-v4"}, {"model": "picio"}]}],
-            "bus": [bus | {"module": [MODULE | module]}],
+            "bus": [bus | {"module": [MODULE | module]} | (line or {})],
         }
     )
 
@@ -127,6 +128,56 @@ async def test_after_a_take_over_all_outputs_are_named_at_once():
         reply = await set_io(rig, high=[4], inputs=[9], pwm1=0.0, pwm2=0.0)
 
         assert (reply.outputs, io.outputs, io.latch, io.pwm) == ((4,), 0b1000, 0b1000, (0, 0))
+
+
+async def test_lines_and_pwm_that_are_asked_for_at_once_change_in_the_same_cycle():
+    async with cabinet() as (rig, io):
+        await set_io(rig, low=[4], pwm1=0.0)
+        seen = {(io.levels >> 3 & 1, io.pwm[0])}
+        execute = io.execute
+
+        def watched(command):
+            execute(command)
+            seen.add((io.levels >> 3 & 1, io.pwm[0]))
+
+        io.execute = watched
+        await set_io(rig, high=[4], pwm1=1.0)
+
+        assert seen == {(0, 0), (1, 255)}
+
+
+async def test_a_snapshot_captures_inputs_and_count_with_the_positions():
+    async with cabinet(line={"snapshot": True}) as (rig, io):
+        await rig.client.command("x", Power(on=True))
+        still = await rig.client.ask(Snapshot(bus="line"))
+        await rig.client.ask(SetIoTimer(module="cabinet", mode="timer"))
+        await rig.client.command("x", MoveVelocity(velocity=500.0))
+        await asyncio.sleep(0.5)
+        first = await rig.client.ask(Snapshot(bus="line"))
+        io.drive_line(1, high=True, at_s=asyncio.get_running_loop().time())
+        await asyncio.sleep(0.5)
+        last = await rig.client.ask(Snapshot(bus="line"))
+
+    assert (still.io[0].levels[0], still.io[0].proven) == (False, False)
+    assert (first.io[0].levels[0], first.io[0].proven) == (False, True)
+    assert (last.io[0].levels[0], last.io[0].proven) == (True, True)
+    elapsed_s = (last.io[0].counter - first.io[0].counter) / 5_000_000
+    assert elapsed_s == pytest.approx((last.t - first.t) / 1e9, abs=0.003)
+    moved = last.positions[0].position - first.positions[0].position
+    assert moved == pytest.approx(500.0 * elapsed_s, abs=5.0)
+
+
+def test_the_polls_of_modules_are_part_of_the_plan():
+    alone = plan_bus(config().bus[0].model_copy(update={"module": ()}))
+    with_io = plan_bus(config().bus[0])
+    (poll,) = [poll for poll in with_io.polls if poll.axis == "cabinet"]
+    silent = plan_bus(config(name=None, outputs=[]).bus[0])
+
+    assert (poll.address, poll.rate_hz, poll.request_bytes, poll.reply_bytes) == (2, 50, 5, 11)
+    assert [item.item for item in poll.items] == ["io"]
+    assert with_io.load == pytest.approx(alone.load + 50 * poll.longest_s)
+    assert alone.load < silent.load < with_io.load
+    assert [each.axis for each in silent.polls] == ["x", "address 2"]
 
 
 async def test_outputs_need_the_lease_of_the_line_and_no_latched_stop():

@@ -87,6 +87,7 @@ async def works(rig, name: str) -> dict[str, object]:
     await client.command(name, MoveVelocity(velocity=4.0))
     await asyncio.sleep(0.3)
     seen["stop"] = (await client.stop(name)).confirmed == (name,)
+    await rig.until(name, lambda state: state.state is AxisState.STANDSTILL)
     await client.command(name, Reset())
     await client.command(name, Power(on=True))
     await done("probe", Probe(sources=("forward_limit",), position=9.0, velocity=4.0))
@@ -122,7 +123,9 @@ async def compared(model: str, settings: list[ModuleSettings]) -> None:
         for module in chain.modules[1 : len(settings)]:
             module.power(on=True, at_s=asyncio.get_running_loop().time())
         for name in names[1:]:
-            state = await rig.until(name, lambda state: state.link is LinkState.UP and state.state is AxisState.DISABLED)
+            state = await rig.until(
+                name, lambda state: state.link is LinkState.UP and state.state is AxisState.DISABLED
+            )
             assert not state.referenced
         if model == "pic-servo-cmc":
             replies = [await rig.client.ask(SetIo(module=f"io{place}", low=[4], pwm1=0.5)) for place in (1, 2)]

@@ -15,7 +15,7 @@ from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.errors import BusDown, BusError, LdcndError, WrongState
 from ldcnd.log import get_logger
 from ldcnd.model.commands import Verb
-from ldcnd.model.rig_commands import SnapshotReply
+from ldcnd.model.rig_commands import CapturedInputs, SnapshotReply
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.wirelog.recorder import WireEvent
 
@@ -112,7 +112,11 @@ class BusService:
         instant = await self.network.snapshot(self._check_registers)
         t, t_error_ns = clock.stamp_between(instant.from_s, instant.until_s)
         positions = tuple(axis.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
-        return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions)
+        io = tuple(
+            CapturedInputs(module=each.name, levels=each.levels, counter=each.counter, proven=each.proven)
+            for each in instant.io
+        )
+        return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions, io=io)
 
     def _check_registers(self) -> None:
         """Refuse to overwrite a register in which a command waits for a capture.

@@ -14,9 +14,11 @@ from ldcnd.drivers.driver import Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
 from ldcnd.drivers.ldcn.commands import Node, unanswered
+from ldcnd.drivers.ldcn.io_module import IoModule
+from ldcnd.drivers.ldcn.pic_io import LINES, IoStatus
 from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
-from ldcnd.drivers.network import Instant
+from ldcnd.drivers.network import CapturedIo, Instant
 from ldcnd.errors import (
     BusError,
     DriveFault,
@@ -41,13 +43,24 @@ class Groups:
     Attributes:
         proven: the modules are known to be in the groups of the plan: after addressing, not after an adoption.
         servos_only: nothing but configured axes is in the group of everybody.
+        all_capture: nothing is in it but what captures positions or inputs by Save Current Position as Home, which is
+            Synch Input for a PIC-I/O.
     """
 
     def __init__(
-        self, bus: Bus, plan: GroupPlan, addressing: Addressing, drives: Mapping[str, LdcnAxis], *, snapshots: bool
+        self,
+        bus: Bus,
+        plan: GroupPlan,
+        addressing: Addressing,
+        drives: Mapping[str, LdcnAxis],
+        io: tuple[IoModule, ...],
+        *,
+        snapshots: bool,
     ) -> None:
         self.proven = False
         self.servos_only = False
+        self.all_capture = False
+        self._io = io
         self._bus = bus
         self._plan = plan
         self._addressing = addressing
@@ -124,7 +137,7 @@ class Groups:
         Raises:
             NotSupported, WrongState, BusError: as there; ReplyTimeout when a drive missed the packet.
         """
-        groups = [group for group in self._plan.groups if self._usable(group)]
+        groups = [group for group in self._plan.groups if group.address != EVERYBODY or self.all_capture]
         if not self._snapshots or sum(len(group.members) for group in groups) < len(self._drives):
             raise NotSupported(
                 "positions cannot be frozen on this line: it is not configured, or other modules share the group",
@@ -136,7 +149,9 @@ class Groups:
         still_free()
         await self._prove()
         before = {name: await self._frozen(name) for name in self._drives}
-        packets = [commands.save_home(commands.Group(group.address)).request for group in groups]
+        io_before = {module.name: await module.captured() for module in self._io} if self.all_capture else {}
+        addresses = dict.fromkeys(group.address for group in groups) | ({EVERYBODY: None} if io_before else {})
+        packets = [commands.save_home(commands.Group(address)).request for address in addresses]
         save = unanswered(EVERYBODY, self._rate.spaced(packets), self._quiet_s(groups), repeatable=False)
         still_free()
         _, timing = await self._bus.execute_timed(save)
@@ -148,7 +163,8 @@ class Groups:
             if captured or (home == before[name].home and position != home):
                 raise ReplyTimeout(f"axis {name}: the drive missed the instant", axis=name)
             positions[name] = home + self._drives[name].state.offset_counts
-        return Instant(positions, timing.sent_at_s, timing.received_at_s)
+        io = [await self._captured(module, io_before[module.name]) for module in self._io if module.name in io_before]
+        return Instant(positions, timing.sent_at_s, timing.received_at_s, tuple(io))
 
     # -- steps -------------------------------------------------------------------------------------------------------
 
@@ -221,6 +237,13 @@ class Groups:
     def _counts(self, name: str, status: Status) -> int:
         """Return a position in counts since the reset of the drive."""
         return (status.position or 0) + self._drives[name].state.offset_counts
+
+    async def _captured(self, module: IoModule, before: IoStatus) -> CapturedIo:
+        """Read what a PIC-I/O has captured; only a count that runs proves that it was this time."""
+        status = await module.captured()
+        levels, counter = status.captured_levels or 0, status.captured_counter or 0
+        proven = counter != before.captured_counter
+        return CapturedIo(module.name, tuple(bool(levels & 1 << bit) for bit in range(LINES)), counter, proven)
 
     async def _frozen(self, name: str) -> Status:
         return await self._read(name, FROZEN_ITEMS)

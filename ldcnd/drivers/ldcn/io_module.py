@@ -21,7 +21,9 @@ from ldcnd.drivers.ldcn.pic_io import (
     SetDirection,
     SetOutput,
     SetPwm,
+    SetSynchOutput,
     SetTimerMode,
+    SynchOutput,
     read_io_status,
     send_io_command,
 )
@@ -30,7 +32,13 @@ from ldcnd.drivers.network import IoDriver, IoReading
 from ldcnd.errors import BusError, ValueOutOfRange, WrongState
 from ldcnd.exchange import Exchange, Timing
 
+CAPTURED = IoItem.CAPTURED_LEVELS | IoItem.CAPTURED_COUNTER
 ITEMS = IoItem.LEVELS | IoItem.ADC1 | IoItem.ADC2 | IoItem.ADC3 | IoItem.COUNTER
+
+
+def poll_io(address: int) -> Exchange[IoStatus]:
+    """Return the question for all inputs of a PIC-I/O."""
+    return read_io_status(IoNode(address), ITEMS)
 
 
 class IoModule(Poller[IoStatus], IoDriver):
@@ -52,7 +60,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         self._node = IoNode(entry.address)
         self._period_s = 1.0 / entry.rate_hz
         self._allowed = _mask(entry.outputs)
-        self._exchange = read_io_status(self._node, ITEMS)
+        self._exchange = poll_io(entry.address)
         self._outputs: int | None = 0
         self._latch = 0
         self._pwm: tuple[int, int] | None = (0, 0)
@@ -109,6 +117,7 @@ class IoModule(Poller[IoStatus], IoDriver):
                 value=self.name,
                 remedy=f"name its lines {', '.join(map(str, _lines(self._allowed)))} and both PWM outputs at once",
             )
+        pwm_after = self._pwm_after(pwm)
         if levels or inputs:
             outputs = ((before or 0) | _mask(levels)) & ~_mask(inputs)
             high = _mask(line for line, level in levels.items() if level)
@@ -117,15 +126,37 @@ class IoModule(Poller[IoStatus], IoDriver):
                 self._outputs = None  # not known until the module has acknowledged it
                 await self._bus.execute(send_io_command(self._node, SetDirection(~outputs & ALL_LINES)))
                 self._outputs = outputs
-            await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
+            if pwm_after:
+                await self._switch_together(latch, *pwm_after)
+            else:
+                await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
             self._latch = latch
-        if pwm != (None, None):
-            known = self._pwm or (0, 0)
-            pwm1, pwm2 = (old if new is None else round(new * MOST_PWM) for new, old in zip(pwm, known, strict=True))
+        elif pwm_after:
             self._pwm = None
-            await self._bus.execute(send_io_command(self._node, SetPwm(pwm1, pwm2)))
-            self._pwm = (pwm1, pwm2)
+            await self._bus.execute(send_io_command(self._node, SetPwm(*pwm_after)))
+        self._pwm = pwm_after or self._pwm
         return self._reading(await self._bus.execute(self._exchange))
+
+    def _pwm_after(self, pwm: tuple[float | None, float | None]) -> tuple[int, int] | None:
+        """Return what both PWM outputs shall be; None when nothing was asked of them."""
+        if pwm == (None, None):
+            return None
+        known = self._pwm or (0, 0)
+        pwm1, pwm2 = (old if new is None else round(new * MOST_PWM) for new, old in zip(pwm, known, strict=True))
+        return pwm1, pwm2
+
+    async def _switch_together(self, latch: int, pwm1: int, pwm2: int) -> None:
+        """Let lines and PWM outputs change in the same cycle of the module.
+
+        Only this module is told: in a group with servos Synch Output is Start Motion.
+        """
+        self._pwm = None
+        await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, pwm1, pwm2)))
+        await self._bus.execute(send_io_command(self._node, SynchOutput()))
+
+    async def captured(self) -> IoStatus:
+        """Return the levels and the count that the latest Synch Input has captured."""
+        return await self._bus.execute(read_io_status(self._node, CAPTURED))
 
     @override
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:

@@ -33,7 +33,7 @@ from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adop
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.io_module import IoModule
-from ldcnd.drivers.ldcn.profiles import PROFILES, at_clock
+from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Support, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
@@ -44,6 +44,12 @@ from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
 
 PERIOD_S = 1.0
+"""From one question for the status byte of a module that is no axis to the next."""
+
+
+def watch_module(address: int) -> Exchange[Status]:
+    """Return the question for a module's status byte."""
+    return commands.read_status(Node(address, ANY_DIALECT), STATUS_BYTE_ONLY)
 
 
 class ModuleWatch(Poller[Status]):
@@ -58,7 +64,7 @@ class ModuleWatch(Poller[Status]):
         self.status: int | None = None
         self.due_at_s = asyncio.get_running_loop().time()
         self.deadline_at_s = self.due_at_s + PERIOD_S
-        self._exchange = commands.read_status(Node(address, ANY_DIALECT), STATUS_BYTE_ONLY)
+        self._exchange = watch_module(address)
 
     def next_exchange(self, now_s: float) -> Exchange[Status]:
         """See `Poller`; a late turn does not shift the next one."""
@@ -115,9 +121,9 @@ class LdcnNetwork(Network):
         self._adoption = Adoption(bus, self._rate, self._expected)
         self._rejoin = Rejoin(bus, self._rate, self._addressing, self._expected)
         drives = {drive.spec.name: drive for drive in self._drives.values()}
-        self._groups = Groups(bus, plan, self._addressing, drives, snapshots=line.snapshot)
         self.axes: Mapping[str, Drive] = drives
         self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
+        self._groups = Groups(bus, plan, self._addressing, drives, tuple(self._io.values()), snapshots=line.snapshot)
         self.io: Mapping[str, IoDriver] = {module.name: module for module in self._io.values()}
         self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)
 
@@ -187,6 +193,10 @@ class LdcnNetwork(Network):
         }
         self._groups.proven = reset
         self._groups.servos_only = reset and not self._watches  # an adoption asks only for what it expects
+        known = (identity.profile for identity in modules.values())
+        self._groups.all_capture = reset and all(
+            each is PIC_IO or (each is not None and each.support is Support.FULL) for each in known
+        )
         for address, drive in self._drives.items():
             drive.identity = str(modules[address])
         self._was_up = True

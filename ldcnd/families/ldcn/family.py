@@ -14,7 +14,8 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.settings import ServoCycle
 from ldcnd.config.toml import read_toml
 from ldcnd.drivers.ldcn.costs import price_list
-from ldcnd.drivers.ldcn.network import LdcnNetwork
+from ldcnd.drivers.ldcn.io_module import poll_io
+from ldcnd.drivers.ldcn.network import PERIOD_S, LdcnNetwork, watch_module
 from ldcnd.drivers.ldcn.packet import PacketReader
 from ldcnd.drivers.ldcn.profiles import CYCLE_CLOCKS, PROFILES
 from ldcnd.drivers.ldcn.registers import RESET_BAUD, BaudCodes, actual_baud, baud_at_reset, baud_divisor
@@ -22,6 +23,7 @@ from ldcnd.drivers.ldcn.transcript import LdcnTranscript
 from ldcnd.drivers.price_list import PriceList
 from ldcnd.drivers.transcript import Describe
 from ldcnd.errors import ConfigError
+from ldcnd.exchange import Exchange
 from ldcnd.families.family import (
     Demand,
     Examines,
@@ -81,7 +83,10 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
             adapter_latency_s=settings.adapter_latency_ms / 1000,
         )
         return Demand(
-            timing, _polls(settings, timing, prices), _urgent(settings, timing, prices), cycle=servo_cycle(settings)
+            timing,
+            _polls(settings, timing, prices) + _module_polls(settings, timing),
+            _urgent(settings, timing, prices),
+            cycle=servo_cycle(settings),
         )
 
     @override
@@ -227,6 +232,22 @@ def _polls(bus: LdcnBusConfig, timing: LineTiming, prices: Mapping[str, PriceLis
         longest = price.reading(frozenset(TelemetryItem))
         size = len(longest.request), longest.reply_bytes
         polls.append(Poll(axis.name, items, rate_hz, cost_of(longest, timing), mean_s, *size))
+    return polls
+
+
+def _module_polls(bus: LdcnBusConfig, timing: LineTiming) -> list[Poll]:
+    """Return what is asked of modules that are no axes: a PIC-I/O with a name for all its inputs, others for a byte."""
+    polls = []
+    for module in bus.module:
+        exchange: Exchange[Any]
+        if module.name:
+            exchange, item, rate_hz = poll_io(module.address), TelemetryItem.IO.value, module.rate
+        else:
+            exchange, item, rate_hz = watch_module(module.address), "status byte", 1.0 / PERIOD_S
+        cost = cost_of(exchange, timing)
+        name = module.name or f"address {module.address}"
+        size = len(exchange.request), exchange.reply_bytes
+        polls.append(Poll(name, (item,), rate_hz, cost, cost.mean_s, *size, address=module.address))
     return polls
 
 
