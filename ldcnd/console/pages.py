@@ -217,6 +217,10 @@ class PageControl:
         hold = self._held.get((rig, axis))
         return hold.control.lease.lease if hold else None
 
+    def leases(self, rig: str) -> tuple[str, ...]:
+        """Return all leases on axes of a rig, for what concerns a whole line."""
+        return tuple(hold.control.lease.lease for (name, _), hold in self._held.items() if name == rig)
+
     async def leave(self) -> None:
         """Give up everything: halt what may move, then release it. Nothing more is sent for this page."""
         self._gone = True

@@ -219,6 +219,8 @@ class SetIo(Command[IoReply]):
     """Likewise output 2."""
     lease: str | None = None
     """The sender's lease: it must cover all axes on the module's line, where a motion of them would need one."""
+    leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
+    """Further leases of the sender, where the axes of the line are under several."""
 
 
 class IoTimer(StrEnum):
@@ -245,7 +247,9 @@ class SetIoTimer(Command[IoReply]):
     prescale: Literal[1, 2, 4, 8] = 1
     """Edges or clocks for each count."""
     lease: str | None = None
-    """As for `set_io`."""
+    """As for `set_io`,"""
+    leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
+    """and these, too."""
 
 
 class Rehearsal(StrEnum):

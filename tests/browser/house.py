@@ -36,6 +36,12 @@ GROUP = """
 [[bus.group]]
 name = "gantry"
 axes = ["x", "y"]
+
+[[bus.module]]
+name = "cabinet"
+address = 5
+model = "pic-io"
+outputs = [4]
 """
 
 
@@ -227,7 +233,11 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
     mixed_config.write_text(text.replace('state_dir = "state"', f'state_dir = "{folder}"'), encoding="utf-8")
     text = (ROOT / "config" / "simulated.toml").read_text(encoding="utf-8")
     sim_config = folder / "simulated.toml"
-    sim_config.write_text(text.replace("\n[[sim]]", f"{GROUP}\n[[sim]]", 1), encoding="utf-8")
+    text = text.replace("\n[[sim]]", f"{GROUP}\n[[sim]]", 1).replace(
+        "baud = 115200", "baud = 115200\nsnapshot = true", 1
+    )
+    text = text.replace('{ model = "pic-servo-v4" },\n]', '{ model = "pic-servo-v4" },\n    { model = "pic-io" },\n]')
+    sim_config.write_text(text, encoding="utf-8")
     sim, mixed = DaemonUnderTest(sim_config), DaemonUnderTest(mixed_config)
     async with AsyncExitStack() as stack:
         browser = await stack.enter_async_context(open_browser())

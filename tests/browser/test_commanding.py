@@ -183,3 +183,27 @@ async def test_an_operator_without_a_mouse_does_everything_that_a_day_asks_for(h
         await press(desk, desk.page.get_by_role("link", name="Rig", exact=True))
         await press(desk, desk.page.get_by_role("group", name="Commands for x").get_by_role("button", name="Disable x"))
         await house.sim.until("x", lambda state: not state.enabled)
+
+
+async def test_an_output_is_set_and_an_instant_taken_from_the_network_page(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        every = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        await every.get_by_role("button", name="Take control of all").click()
+        await expect(every.get_by_role("button", name="Enable all")).to_be_enabled()
+        await desk.open("network")
+        module = desk.panel("Module cabinet")
+        await module.get_by_label("Line").select_option("4")
+        await module.get_by_label("Becomes").select_option("output, low")
+        await module.get_by_role("button", name="Set line 4").click()
+        await expect(module.get_by_role("status")).to_contain_text("4 low")
+        await expect(module.get_by_role("status")).to_contain_text("Outputs: 4.")
+
+        await desk.button("Take a snapshot of line0").click()
+        taken = desk.page.get_by_role("table", name="Snapshot of sim on line0")
+        await expect(taken).to_contain_text("cabinet")
+        await expect(taken.get_by_role("row")).to_have_count(6)
+        await module.get_by_label("Becomes").select_option("input")
+        await module.get_by_role("button", name="Set line 4").click()
+        await expect(module.get_by_role("status")).to_contain_text("Outputs: none.")

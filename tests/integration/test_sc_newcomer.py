@@ -1,4 +1,4 @@
-"""A PIC-SERVO SC that restarts in a running line: whatever its EEPROM holds, it energises nothing and hurts no other."""
+"""A PIC-SERVO SC that restarts in a running line: whatever its EEPROM holds, it energises nothing and hurts nobody."""
 
 import asyncio
 

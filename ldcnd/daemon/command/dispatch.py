@@ -121,10 +121,10 @@ class Dispatcher:
                 return await self._rig.line(command.bus).snapshot(self._clock)
             case SetIo():
                 module = self._rig.module(command.module)
-                return await module.set_io(command, lambda: self._admit_module(module, command.lease))
+                return await module.set_io(command, lambda: self._admit_module(module, command))
             case SetIoTimer():
                 module = self._rig.module(command.module)
-                self._admit_module(module, command.lease)
+                self._admit_module(module, command)
                 return await module.set_timer(command)
             case Rehearse():
                 self._admit_rehearsal(command)
@@ -229,14 +229,16 @@ class Dispatcher:
             self._refuse_rival(axis)
             self.authority.admit(axis, command.lease, None, self._clock.now_s())
 
-    def _admit_module(self, module: ModuleService, lease: str | None) -> None:
+    def _admit_module(self, module: ModuleService, command: SetIo | SetIoTimer) -> None:
         """Refuse outputs to who may not move the axes of the module's line, and while one of them is stopped.
 
         What an output switches is not known: it may move something.
         """
         for name in module.axes:
             self._refuse_rival(name)
-            self.authority.admit(name, lease, None, self._clock.now_s())
+            holder = self.authority.holder(name)
+            own = holder.token if holder and holder.token in command.leases else command.lease
+            self.authority.admit(name, own, None, self._clock.now_s())
             guards.check_not_latched(self._rig.axis(name).tracker.view())
 
     async def _answer_again(self, entry: Entry) -> CommandReply:

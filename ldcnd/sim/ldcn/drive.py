@@ -9,8 +9,8 @@ Decisions where the manuals leave room:
   latched too, as the footnote of the diagnostics table demands.
 * The motion lock of LS-182AP from version 22 on: homing on a limit switch locks; then nothing starts until Stop Motor
   with bit 7, which also keeps further homing from locking until the next reset.
-* The address output of a PIC-SERVO SC with step and direction inputs, which rises on a servo fault, is seen to rise with
-  the next packet for the drive, and falls when the loop is closed again.
+* The address output of a PIC-SERVO SC with step and direction inputs, which rises on a servo fault, is seen to rise
+  with the next packet for the drive, and falls when the loop is closed again.
 
 Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3; PIC-SERVO SC data sheet, 4.6, 4.7, 5.
 """
@@ -163,7 +163,7 @@ class SimulatedDrive(SimulatedModule):
             self.loop.homed_on_limit = False
             self._locked = self._may_lock
 
-    def execute(self, command: ReceivedCommand) -> None:  # noqa: C901 - one branch per command
+    def execute(self, command: ReceivedCommand) -> None:
         """Execute a command of servo drives."""
         loop = self.loop
         match command:
@@ -183,9 +183,6 @@ class SimulatedDrive(SimulatedModule):
                 self._set_options(control)
             case SetHomingMode(control):
                 self._arm_homing(control)
-            case AddPathPoints((), None):
-                if loop.servo_on or self.settings.path_without_servo is PathWithoutServo.RUNS:
-                    loop.trajectory.start_path()
             case AddPathPoints(points, half):
                 self._add_points(points, half)
             case PlainCommand(Command.CLEAR_STICKY_BITS):
@@ -326,6 +323,10 @@ class SimulatedDrive(SimulatedModule):
 
     def _add_points(self, points: tuple[int, ...], half: int | None) -> None:
         loop, settings = self.loop, self.settings
+        if not points and half is None:
+            if loop.servo_on or settings.path_without_servo is PathWithoutServo.RUNS:
+                loop.trajectory.start_path()
+            return
         if not loop.servo_on and settings.path_without_servo is PathWithoutServo.POINTS_REFUSED:
             return
         if not (loop.trajectory.done or loop.trajectory.path.running or settings.path_takes_points_in_motion):

@@ -86,6 +86,11 @@ export function moveTogether(axes, targets, velocity) {
   return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves });
 }
 
+/** Ask a rig for what concerns a whole line; the console adds this page's leases. */
+export function ofRig(rig, verb, body = {}) {
+  return ask(`${rigPath(rig.name)}/rig/${verb}`, given(body));
+}
+
 /** Ask about an axis: `why` and `plan`, which have no effect. */
 export function question(axis, verb, body = {}) {
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, given(body));

@@ -1,0 +1,70 @@
+/** What one packet does to a whole line: a snapshot of all positions and inputs; and its PIC-I/O modules. */
+
+import { html, useState } from "../html.js";
+import { Action, Choice, Field, Panel, Table } from "../parts/controls.js";
+import { number } from "../parts/format.js";
+import { ofRig } from "../session/control.js";
+
+const BECOMES = [
+  ["high", "output, high"],
+  ["low", "output, low"],
+  ["inputs", "input"],
+];
+const LINES = Array.from({ length: 12 }, (_, index) => [`${index + 1}`, `${index + 1}`]);
+const TIMER = [
+  ["off", "nothing"],
+  ["timer", "time, at 5 MHz"],
+  ["counter", "edges of line 10"],
+];
+
+const levelsOf = (levels) => levels.map((level, index) => `${index + 1} ${level ? "high" : "low"}`).join(", ");
+
+export function Snapshot({ rig, bus }) {
+  const [taken, setTaken] = useState(null);
+  const rows = taken && [
+    ...taken.positions.map(
+      (each) => html`<tr><th scope="row">${each.axis}</th>
+      <td class="number">${number(each.position, 4)} ${each.unit}</td><td class="number">${each.counts}</td>
+      <td>${each.referenced ? "" : "not referenced"}</td></tr>`,
+    ),
+    ...taken.io.map(
+      (each) => html`<tr><th scope="row">${each.module}</th><td>${levelsOf(each.levels)}</td>
+      <td class="number">${each.counter}</td><td>${each.proven ? "" : "not proven: nothing is counted"}</td></tr>`,
+    ),
+  ];
+  return html`<h3>One instant</h3>
+    <p class="row"><${Action} act=${() => ofRig(rig, "snapshot", { bus })} onDone=${setTaken}>Take a snapshot of ${bus}<//></p>
+    ${taken && html`<${Table} label=${`Snapshot of ${rig.name} on ${bus}`} head=${["Of", "Value", "#Counts", "Remark"]} rows=${rows} />
+    <p class="quiet">All within ${number(taken.t_error_ns / 1e6, 2)} ms.</p>`}`;
+}
+
+/** A panel for each module that has a name. */
+export function Modules({ rig, bus }) {
+  const named = bus.info.modules.filter((module) => module.name);
+  return named.map((module) => html`<${Module} key=${module.name} rig=${rig} name=${module.name} />`);
+}
+
+function Module({ rig, name }) {
+  const [line, setLine] = useState("1");
+  const [becomes, setBecomes] = useState("high");
+  const [pwm, setPwm] = useState({});
+  const [counts, setCounts] = useState("off");
+  const [shown, setShown] = useState(null);
+  const told = (verb, body) => ofRig(rig, verb, { module: name, ...body });
+  return html`<${Panel} title=${`Module ${name}`} note="An output may move something; it keeps its level when this page is gone.">
+    <div class="fields">
+      <${Choice} label="Line" options=${LINES} value=${line} onChange=${setLine} />
+      <${Choice} label="Becomes" options=${BECOMES} value=${becomes} onChange=${setBecomes} />
+      <${Field} label="PWM 1" value=${pwm.pwm1} onChange=${(pwm1) => setPwm({ ...pwm, pwm1 })} hint="0 to 1; empty: as it is" />
+      <${Field} label="PWM 2" value=${pwm.pwm2} onChange=${(pwm2) => setPwm({ ...pwm, pwm2 })} hint="0 to 1; empty: as it is" />
+      <${Choice} label="Counts" options=${TIMER} value=${counts} onChange=${setCounts} />
+    </div>
+    <p class="row">
+      <${Action} act=${() => told("set_io")} onDone=${setShown}>Read ${name}<//>
+      <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line)] })} onDone=${setShown}>Set line ${line}<//>
+      <${Action} act=${() => told("set_io", pwm)} onDone=${setShown}>Set PWM<//>
+      <${Action} act=${() => told("set_io_timer", { mode: counts })} onDone=${setShown}>Count<//>
+    </p>
+    ${shown && html`<p role="status">Lines: ${levelsOf(shown.levels)}. Outputs: ${shown.outputs ? shown.outputs.join(", ") || "none" : "not known"}.</p>`}
+  <//>`;
+}

@@ -1,0 +1,88 @@
+"""`ldcnd bus snapshot`, `bus set-io`, `bus set-io-timer` and `axis probe`, typed in front of a daemon."""
+
+import json
+
+import pytest
+
+from ldcnd.config.rig import RigConfig
+from ldcnd.model.samples import LinkState
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.io import IoWiring
+from ldcnd.sim.plant import MotorPlant
+from tests.support.command_line import VirtualRig, virtual_rig
+from tests.support.dialect_rig import GAINS
+
+AXIS = {
+    "name": "x",
+    "address": 1,
+    "model": "pic-servo-v4",
+    "unit": "mm",
+    "counts_per_unit": 1000,
+    "velocity": 10,
+    "acceleration": 100,
+    "reference": "at_reset",
+    "gains": GAINS,
+}
+CABINET = {"name": "cabinet", "address": 2, "model": "pic-io", "outputs": [4, 9], "rate": 20}
+LINE = {"name": "line0", "port": "sim:line", "baud": 115_200, "snapshot": True, "axis": [AXIS], "module": [CABINET]}
+CONFIG = RigConfig.model_validate(
+    {
+        "rig": "bench",
+        "sim": [{"name": "line", "module": [{"model": "pic-servo-v4"}, {"model": "pic-io"}]}],
+        "bus": [LINE],
+    }
+)
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """A servo whose forward switch is at 5 mm, and a PIC-I/O whose line 1 is low."""
+    plant = MotorPlant(reverse_limit_counts=-20_000, forward_limit_counts=5_000, index_spacing_counts=100_000)
+    servo = ModuleSpec("pic-servo-v4", plant)
+    chain = build_chain(ChainSpec((servo, ModuleSpec("pic-io", wiring=IoWiring(low=frozenset({1}))))))
+    with virtual_rig(monkeypatch, CONFIG, {"line": chain}) as rig:
+        rig.wait(rig.rig.until("x", lambda state: state.link is LinkState.UP))
+        yield rig
+
+
+def test_a_probe_latches_and_its_position_can_be_read(bench: VirtualRig):
+    assert bench.run("axis power x on").code == 0
+
+    probed = bench.run("axis probe x --source forward_limit --distance 9 --velocity 4 --wait")
+    latched = bench.run("axis watch x --item latch --count 1 --json")
+    nothing = bench.run("axis probe x --source reverse_limit --distance -1 --velocity 4 --wait")
+
+    assert (probed.code, latched.code) == (0, 0)
+    latch = json.loads(latched.printed.splitlines()[0])
+    assert 0.0 <= latch["value"] - 5.0 <= latch["error"]
+    assert nothing.code != 0
+    assert "no input came on the way" in nothing.printed + nothing.errors
+
+
+def test_a_snapshot_shows_positions_inputs_and_the_instant(bench: VirtualRig):
+    assert bench.run("bus set-io-timer cabinet timer --prescale 8").code == 0
+    first = bench.run("bus snapshot line0")
+    reply = json.loads(bench.run("bus snapshot line0 --json").printed)
+    unknown = bench.run("bus snapshot nowhere")
+
+    assert first.code == 0
+    assert first.printed.startswith("x ")
+    assert "cabinet  1=low 2=high" in first.printed
+    assert "all within" in first.printed
+    assert (reply["positions"][0]["axis"], reply["io"][0]["proven"]) == ("x", True)
+    assert (unknown.code, "line0" in unknown.errors) == (1, True)
+
+
+def test_outputs_are_set_by_line_and_level(bench: VirtualRig):
+    done = bench.run("bus set-io cabinet 4=high 9=low --pwm1 0.5")
+    back = json.loads(bench.run("bus set-io cabinet 4=input --json").printed)
+    forbidden = bench.run("bus set-io cabinet 5=high")
+    misspelt = bench.run("bus set-io cabinet 4=on")
+
+    assert done.code == 0
+    assert done.printed.startswith("cabinet: 1=low 2=high 3=high 4=high")
+    assert done.printed.strip().endswith("outputs: 4, 9")
+    assert back["outputs"] == [9]
+    assert (forbidden.code, "not configured as an output" in forbidden.errors) == (1, True)
+    assert misspelt.code == 2
+    assert "LINE=high" in misspelt.errors
