@@ -5,11 +5,11 @@ import json
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.samples import LinkState
+from ldcnd.model.samples import LatchSample, LinkState, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring
 from ldcnd.sim.plant import MotorPlant
-from tests.support.command_line import VirtualRig, virtual_rig
+from tests.support.command_line import Ran, VirtualRig, virtual_rig
 from tests.support.dialect_rig import GAINS
 
 AXIS = {
@@ -45,16 +45,21 @@ def bench(monkeypatch):
         yield rig
 
 
+def last_line(ran: Ran) -> str:
+    """Return what was printed last: the daemon logs in the same process."""
+    return ran.printed.splitlines()[-1]
+
+
 def test_a_probe_latches_and_its_position_can_be_read(bench: VirtualRig):
     assert bench.run("axis power x on").code == 0
 
     probed = bench.run("axis probe x --source forward_limit --distance 9 --velocity 4 --wait")
-    latched = bench.run("axis watch x --item latch --count 1 --json")
+    latch = bench.wait(bench.rig.client.last("x", TelemetryItem.LATCH))
     nothing = bench.run("axis probe x --source reverse_limit --distance -1 --velocity 4 --wait")
 
-    assert (probed.code, latched.code) == (0, 0)
-    latch = json.loads(latched.printed.splitlines()[0])
-    assert 0.0 <= latch["value"] - 5.0 <= latch["error"]
+    assert probed.code == 0
+    assert isinstance(latch, LatchSample)
+    assert 0.0 <= latch.value - 5.0 <= latch.error
     assert nothing.code != 0
     assert "no input came on the way" in nothing.printed + nothing.errors
 
@@ -62,11 +67,11 @@ def test_a_probe_latches_and_its_position_can_be_read(bench: VirtualRig):
 def test_a_snapshot_shows_positions_inputs_and_the_instant(bench: VirtualRig):
     assert bench.run("bus set-io-timer cabinet timer --prescale 8").code == 0
     first = bench.run("bus snapshot line0")
-    reply = json.loads(bench.run("bus snapshot line0 --json").printed)
+    reply = json.loads(last_line(bench.run("bus snapshot line0 --json")))
     unknown = bench.run("bus snapshot nowhere")
 
     assert first.code == 0
-    assert first.printed.startswith("x ")
+    assert "\nx " in f"\n{first.printed}"
     assert "cabinet  1=low 2=high" in first.printed
     assert "all within" in first.printed
     assert (reply["positions"][0]["axis"], reply["io"][0]["proven"]) == ("x", True)
@@ -75,13 +80,13 @@ def test_a_snapshot_shows_positions_inputs_and_the_instant(bench: VirtualRig):
 
 def test_outputs_are_set_by_line_and_level(bench: VirtualRig):
     done = bench.run("bus set-io cabinet 4=high 9=low --pwm1 0.5")
-    back = json.loads(bench.run("bus set-io cabinet 4=input --json").printed)
+    back = json.loads(last_line(bench.run("bus set-io cabinet 4=input --json")))
     forbidden = bench.run("bus set-io cabinet 5=high")
     misspelt = bench.run("bus set-io cabinet 4=on")
 
     assert done.code == 0
-    assert done.printed.startswith("cabinet: 1=low 2=high 3=high 4=high")
-    assert done.printed.strip().endswith("outputs: 4, 9")
+    assert last_line(done).startswith("cabinet: 1=low 2=high 3=high 4=high")
+    assert last_line(done).endswith("outputs: 4, 9")
     assert back["outputs"] == [9]
     assert (forbidden.code, "not configured as an output" in forbidden.errors) == (1, True)
     assert misspelt.code == 2

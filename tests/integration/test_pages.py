@@ -68,14 +68,14 @@ NOT_RUN = {
         "test_command_prints_findings_as_json_lines"
     ),
     ("docs/how-to/probe-and-inputs.md", "ldcnd bus snapshot line0"): (
-        "test_a_snapshot_tells_the_position_of_a_moving_axis_within_its_bound"
+        "test_a_snapshot_shows_positions_inputs_and_the_instant"
     ),
     (
         "docs/how-to/probe-and-inputs.md",
         "ldcnd axis probe x --source forward_limit --distance 25 --velocity 1 --wait",
-    ): "test_a_switch_is_latched_within_its_bound_and_the_reference_stays",
+    ): "test_a_probe_latches_and_its_position_can_be_read",
     ("docs/how-to/probe-and-inputs.md", "ldcnd bus set-io cabinet 4=high 9=low --pwm1 0.5"): (
-        "test_inputs_and_analog_inputs_are_published"
+        "test_outputs_are_set_by_line_and_level"
     ),
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",

@@ -1,11 +1,13 @@
 """Each fix of the table is noticed when it is missing."""
 
 import os
+import re
 import subprocess
 import sys
 
 import pytest
 
+from tests.mutants.ldcn_reverts import LDCN_REVERTS
 from tests.mutants.reverts import REVERT, REVERTS, ROOT, Revert
 
 
@@ -19,6 +21,14 @@ def test_a_fix_that_can_be_taken_back_stands_in_its_module(revert: Revert):
     for test in revert.noticed_by:
         file, _, function = test.partition("::")
         assert f"def {function.partition('[')[0]}(" in (ROOT / file).read_text(encoding="utf-8")
+
+
+def test_the_reference_names_exactly_the_tests_that_hold_what_was_found():
+    page = (ROOT / "docs" / "reference" / "ldcn-nmc.md").read_text(encoding="utf-8")
+    table = page.partition("## Findings against the manuals")[2].partition("\n###")[0]
+
+    held = {test.rpartition("::")[2].partition("[")[0] for revert in LDCN_REVERTS for test in revert.noticed_by}
+    assert set(re.findall(r"`(test_\w+)`", table)) == held
 
 
 @pytest.mark.soak

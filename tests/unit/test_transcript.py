@@ -3,8 +3,7 @@ from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_IO, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.transcript import LdcnTranscript
 from ldcnd.drivers.smartstep.packet import Command as SmartStepCommand
-from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus
-from ldcnd.drivers.smartstep.transcript import SmartStepTranscript
+from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus, SmartStepTranscript
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 

@@ -22,13 +22,12 @@ from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drivers.smartstep.ledger import EepromLedger
 from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
 from ldcnd.drivers.smartstep.network import SmartStepNetwork, smartstep_opener
-from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT
+from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT, CommandCutter, SmartStepTranscript
 from ldcnd.drivers.smartstep.parameter_store import EepromRules
 from ldcnd.drivers.smartstep.parameters import digit_texts
 from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Echo, Framing, SmartStepProfile
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP as PROFILE
-from ldcnd.drivers.smartstep.transcript import CommandCutter, SmartStepTranscript
 from ldcnd.drivers.smartstep.transfer import check_values, listed
 from ldcnd.drivers.transcript import Describe
 from ldcnd.errors import ConfigError
