@@ -301,7 +301,8 @@ class Rejoin:
         exchange = commands.read_status(Node(each.address, each.profile), MOTION_ITEMS)
         before = await self._bus.execute(exchange)
         await asyncio.sleep(WATCH_S)
-        return not _moves(before, await self._bus.execute(exchange))
+        after = await self._bus.execute(exchange)
+        return not _moves(before, after)
 
     def _suspect(self, missing: Iterable[int]) -> None:
         strays = [(self._rate.at_reset, address) for address in missing]
