@@ -68,10 +68,12 @@ def test_what_a_trace_publishes_as_good_is_right(**case):
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-@given(**DRIVES)
-@settings(max_examples=10_000, deadline=None)
-def test_what_ten_thousand_drives_publish_as_good_is_right(**case):
-    good_is_right(**case)
+@pytest.mark.parametrize("order", list(ByteOrder))
+@pytest.mark.parametrize("layout", LAYOUTS)
+@given(**{name: drawn for name, drawn in DRIVES.items() if name not in {"layout", "order"}})
+@settings(max_examples=1_700, deadline=None)
+def test_what_ten_thousand_drives_publish_as_good_is_right(layout, order, **case):
+    good_is_right(layout, order, **case)
 
 
 def good_is_right(layout, order, gear, numerator, traces):
@@ -136,10 +138,11 @@ async def test_a_trace_over_the_line_is_right_or_marked(**case):
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-@given(**LINES)
-@settings(max_examples=1_000, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-async def test_a_thousand_traces_over_the_line_are_right_or_marked(**case):
-    await right_or_marked(**case)
+@pytest.mark.parametrize("layout", LAYOUTS)
+@given(**{name: drawn for name, drawn in LINES.items() if name != "layout"})
+@settings(max_examples=340, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+async def test_a_thousand_traces_over_the_line_are_right_or_marked(layout, **case):
+    await right_or_marked(layout, **case)
 
 
 async def right_or_marked(layout, order, checksum, count_unit, longest, gear, pulses, run, channels):  # noqa: PLR0917
