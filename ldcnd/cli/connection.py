@@ -30,13 +30,13 @@ CommandT = TypeVar("CommandT", bound=Callable[..., object])
 
 
 def of_options(model: type[ModelT], **values: object) -> ModelT:
-    """Return a model of what was typed.
+    """Return a model of what was typed; an option that was not typed is left to the model.
 
     Raises:
         click.BadParameter: a value is none that the model takes, such as nan; names the option.
     """
     try:
-        return model.model_validate(values)
+        return model.model_validate({name: value for name, value in values.items() if value is not None})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         name = ".".join(map(str, wrong["loc"])) or "value"

@@ -57,7 +57,8 @@ def test_a_probe_latches_and_its_position_can_be_read(bench: VirtualRig):
     latch = bench.wait(bench.rig.client.last("x", TelemetryItem.LATCH))
     nothing = bench.run("axis probe x --source reverse_limit --distance -1 --velocity 4 --wait")
 
-    assert probed.code == 0
+    assert probed.code == 0, probed.errors
+    assert "5.00" in last_line(probed)
     assert isinstance(latch, LatchSample)
     assert 0.0 <= latch.value - 5.0 <= latch.error
     assert nothing.code != 0
