@@ -53,7 +53,7 @@ class Groups:
         plan: GroupPlan,
         addressing: Addressing,
         drives: Mapping[str, LdcnAxis],
-        io: tuple[IoModule, ...],
+        io: tuple[IoModule, ...] = (),
         *,
         snapshots: bool,
     ) -> None:
