@@ -33,7 +33,7 @@ export function Snapshot({ rig, bus }) {
     ),
   ];
   return html`<h3>One instant</h3>
-    <p class="row"><${Action} act=${() => ofRig(rig, "snapshot", { bus })} onDone=${setTaken}>Take a snapshot of ${bus}<//></p>
+    <p class="row"><${Action} act=${() => ofRig(rig, "snapshot", { bus })} onDone=${setTaken}>Take a snapshot of ${rig.name} on ${bus}<//></p>
     ${taken && html`<${Table} label=${`Snapshot of ${rig.name} on ${bus}`} head=${["Of", "Value", "#Counts", "Remark"]} rows=${rows} />
     <p class="quiet">All within ${number(taken.t_error_ns / 1e6, 2)} ms.</p>`}`;
 }
