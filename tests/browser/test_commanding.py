@@ -201,7 +201,7 @@ async def test_an_output_is_set_and_an_instant_taken_from_the_network_page(house
         await expect(module.get_by_role("status")).to_contain_text("Outputs: 4.")
 
         await desk.button("Take a snapshot of sim on line0").click()
-        taken = desk.page.get_by_role("table", name="Snapshot of sim on line0")
+        taken = desk.panel("Snapshot of sim on line0")
         await expect(taken).to_contain_text("cabinet")
         await expect(taken.get_by_role("row")).to_have_count(6)
         await module.get_by_label("Becomes").select_option("input")
