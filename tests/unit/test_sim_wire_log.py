@@ -2,8 +2,7 @@
 
 from ldcnd.cli.sim import WireLogFile
 from ldcnd.drivers.ldcn.packet import PacketReader
-from ldcnd.drivers.smartstep.packet import add_parity
-from ldcnd.drivers.smartstep.transcript import CommandCutter
+from ldcnd.drivers.smartstep.packet import CommandCutter, add_parity
 from ldcnd.wirelog.capture import parse_capture
 from ldcnd.wirelog.recorder import WireEvent
 
