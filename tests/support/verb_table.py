@@ -47,7 +47,6 @@ EXPLAINED = {
     ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
     ("renew", "command line"): "a command that holds control renews it by itself",
-    ("outcome", "command line"): "`ldcnd events` shows it",
     ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
     ("why", "command line"): "`ldcnd why`",
     ("rehearse", "command line"): "`ldcnd drill`",
