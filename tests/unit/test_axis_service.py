@@ -224,6 +224,25 @@ async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent
         assert not bench.axis.stop_is_pending
 
 
+async def test_a_motor_that_was_taken_over_with_a_closed_loop_is_not_switched_off_by_a_stop_before_its_first_reading():
+    async with axis_bench(powered=False) as bench:
+        bench.axis.taken_over()
+
+        await bench.stop()
+
+        assert bench.drive.told == [("stop", StopMode.SMOOTH)]
+
+
+async def test_a_line_that_is_taken_over_again_changes_nothing_that_was_seen():
+    async with axis_bench(powered=False) as bench:
+        await bench.settled()
+        bench.axis.taken_over()
+
+        await bench.stop()
+
+        assert bench.drive.told == [("stop", StopMode.OFF)]
+
+
 async def test_a_motor_that_must_be_off_first_is_switched_off():
     async with axis_bench() as bench:
         bench.axis.switch_off()

@@ -540,8 +540,13 @@ class AxisService:
             self.tracker.stop_unconfirmed(self._clock.now_ns())
 
     def taken_over(self) -> None:
-        """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
+        """Its drive is as another host has left it: what moves in it without an end is to be brought to rest.
+
+        Its loop is closed, or `switch_off` would have been called: a stop before the first reading keeps it so.
+        """
         self._inherited = self.stoppable
+        if self.stoppable and not self._seen:
+            self.tracker.enabled = True
 
     def _end_what_has_no_end(self, reading: AxisReading, at_s: float) -> None:
         """Have a motion stopped that an earlier host has left, if its profile is done and yet it goes on.
