@@ -10,15 +10,16 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile, Support
 from ldcnd.drivers.ldcn.received import LoadTrajectory, SetGain, decode_command
-from ldcnd.drivers.ldcn.registers import (
-    Gains,
+from ldcnd.drivers.ldcn.registers import Gains
+from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, decode_status, encode_status
+from ldcnd.drivers.ldcn.trajectory import (
+    ProfileMode,
+    Trajectory,
     acceleration_counts_per_s2,
     programmed_acceleration,
     programmed_velocity,
     velocity_counts_per_s,
 )
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, decode_status, encode_status
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 
 SERVOS = [profile for profile in PROFILES.values() if profile.support is Support.FULL]
 

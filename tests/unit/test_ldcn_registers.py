@@ -3,9 +3,9 @@
 import pytest
 
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import (
+from ldcnd.drivers.ldcn.registers import baud_divisor
+from ldcnd.drivers.ldcn.trajectory import (
     acceleration_counts_per_s2,
-    baud_divisor,
     programmed_acceleration,
     programmed_velocity,
     velocity_counts_per_s,

@@ -1,12 +1,9 @@
-"""LDCN/NMC registers: those made of clocks, the data of Set Gain, and what the host knows of what it cannot read back.
+"""LDCN/NMC registers: the codes of baud rates, the data of Set Gain, and what the host knows of what it cannot read back.
 
-Velocity and acceleration are 16.16 fixed-point numbers of counts per servo tick (per tick squared); on devices whose
-servo rate divisor also slows the profile generator, the tick is the divisor times 0.512 ms.
 Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Conditions", "Set Baud Rate" and the
 calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from enum import Enum
@@ -54,46 +51,6 @@ BAUD_KEYS = MappingProxyType({code: baud for rates in BAUD_DIVISORS.values() for
 """What PIC-SERVO SC looks the byte up in: it knows both families and sets its clock to the rate itself."""
 
 
-def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profile) -> int:
-    """Return the velocity register for a speed of at least 0, rounded to the nearest; 33.554432 per count/s at SR 1.
-
-    Raises:
-        ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
-    """
-    return _programmed(
-        "velocity", "counts/s", counts_per_s, _velocity_factor(servo_divisor, profile), profile.most_velocity
-    )
-
-
-def velocity_counts_per_s(programmed: int, servo_divisor: int, profile: Profile) -> float:
-    """Return the speed that a velocity register stands for, in counts per second.
-
-    Raises:
-        ValueOutOfRange: the servo rate divisor is outside 1 to 255.
-    """
-    return programmed / _velocity_factor(servo_divisor, profile)
-
-
-def programmed_acceleration(counts_per_s2: float, servo_divisor: int, profile: Profile) -> int:
-    """Return the acceleration register, rounded to the nearest; 0.017179869184 per count/s^2 at SR 1.
-
-    Raises:
-        ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
-    """
-    return _programmed(
-        "acceleration", "counts/s^2", counts_per_s2, _acceleration_factor(servo_divisor, profile), MOST_RATE
-    )
-
-
-def acceleration_counts_per_s2(programmed: int, servo_divisor: int, profile: Profile) -> float:
-    """Return the acceleration that an acceleration register stands for, in counts per second squared.
-
-    Raises:
-        ValueOutOfRange: the servo rate divisor is outside 1 to 255.
-    """
-    return programmed / _acceleration_factor(servo_divisor, profile)
-
-
 def baud_divisor(baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> int:
     """Return the Set Baud Rate code of a rate: a printed one, or the divisor that makes it within 1 %.
 
@@ -129,47 +86,6 @@ def baud_at_reset(clock_hz: int) -> int:
 def module_baud(profile: Profile, code: int) -> float | None:
     """Return the rate that a device takes at this code of Set Baud Rate, 0 to 255; None when it knows no such code."""
     return BAUD_KEYS.get(code) if profile.baud_keys else actual_baud(code, profile.clock_hz)
-
-
-def _velocity_factor(servo_divisor: int, profile: Profile) -> float:
-    return FRACTION * _profile_tick_s(servo_divisor, profile)
-
-
-def _acceleration_factor(servo_divisor: int, profile: Profile) -> float:
-    return FRACTION * _profile_tick_s(servo_divisor, profile) ** 2
-
-
-def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
-    if not 1 <= servo_divisor <= MOST_DIVISOR:
-        raise ValueOutOfRange(
-            f"servo rate divisor {servo_divisor} is outside 1 to {MOST_DIVISOR}",
-            value=servo_divisor,
-            limit=1 if servo_divisor < 1 else MOST_DIVISOR,
-            nearest=min(max(servo_divisor, 1), MOST_DIVISOR),
-        )
-    return CYCLE_CLOCKS / profile.clock_hz * (servo_divisor if profile.divisor_slows_profile else 1)
-
-
-def _programmed(what: str, unit: str, value: float, factor: float, most_register: int) -> int:
-    most = most_register / factor
-    if not 0 <= value <= most:
-        nearest = most if value > most else 0.0
-        raise ValueOutOfRange(
-            f"{what} {value:.10g} {unit} is outside 0 to {most:.10g}",
-            value=value,
-            limit=nearest,
-            nearest=nearest,
-        )
-    register = math.floor(value * factor + 0.5)
-    if register == 0 and value > 0:
-        least = 1 / factor
-        raise ValueOutOfRange(
-            f"{what} {value:g} {unit} is too small for the drive, the least is {least:g}",
-            value=value,
-            limit=least,
-            nearest=least,
-        )
-    return min(register, most_register)
 
 
 _KP = Field("KP", 2, 0, 0x7FFF)

@@ -1,5 +1,7 @@
 """The data of Load Trajectory, and the motions of the daemon as such data.
 
+Velocity and acceleration are 16.16 fixed-point numbers of counts per servo tick (per tick squared); on devices whose
+servo rate divisor also slows the profile generator, the tick is the divisor times 0.512 ms.
 Sources: LS-182AP manual, "Load Trajectory", "PWM Mode Operation", "Absolute positioning mode", "Analog positioning
 sensor control"; PIC-SERVO manual, 4.4, 4.5, 5.2. Where the LS-182AP text has bit 4 choose between trapezoid and
 velocity it means bit 5, as its own list of bits says.
@@ -12,15 +14,8 @@ from enum import IntFlag, StrEnum
 from ldcnd.drivers.driver import AnalogMotion, Motion, PwmOutput
 from ldcnd.drivers.ldcn.faults import SENSOR_BITS, SENSOR_LEAST, SENSOR_MOST
 from ldcnd.drivers.ldcn.packet import POSITION, Field
-from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import (
-    MOST_RATE,
-    TRAJECTORY_NAMES,
-    acceleration_counts_per_s2,
-    programmed_acceleration,
-    programmed_velocity,
-    velocity_counts_per_s,
-)
+from ldcnd.drivers.ldcn.profiles import CYCLE_CLOCKS, Profile
+from ldcnd.drivers.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE, TRAJECTORY_NAMES
 from ldcnd.errors import NotSupported, ValueOutOfRange
 
 ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
@@ -53,7 +48,7 @@ class Trajectory:
 
     Attributes:
         position: counts, -0x7FFFFFFF to 0x7FFFFFFF; the goal in trapezoidal mode.
-        velocity: programmed velocity, 0 to 0x7FFFFFFF, see registers.py.
+        velocity: programmed velocity, 0 to 0x7FFFFFFF.
         acceleration: programmed acceleration, 0 to 0x7FFFFFFF.
         pwm_or_target: without the servo the PWM value, 0 to 255; with it, on devices with absolute positioning, the A/D
             value at which a motion in velocity mode ends.
@@ -256,3 +251,84 @@ def _check_analog_target(target: int, profile: Profile) -> None:
             limit=nearest,
             nearest=nearest,
         )
+
+
+def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profile) -> int:
+    """Return the velocity register for a speed of at least 0, rounded to the nearest; 33.554432 per count/s at SR 1.
+
+    Raises:
+        ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
+    """
+    return _programmed(
+        "velocity", "counts/s", counts_per_s, _velocity_factor(servo_divisor, profile), profile.most_velocity
+    )
+
+
+def velocity_counts_per_s(programmed: int, servo_divisor: int, profile: Profile) -> float:
+    """Return the speed that a velocity register stands for, in counts per second.
+
+    Raises:
+        ValueOutOfRange: the servo rate divisor is outside 1 to 255.
+    """
+    return programmed / _velocity_factor(servo_divisor, profile)
+
+
+def programmed_acceleration(counts_per_s2: float, servo_divisor: int, profile: Profile) -> int:
+    """Return the acceleration register, rounded to the nearest; 0.017179869184 per count/s^2 at SR 1.
+
+    Raises:
+        ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
+    """
+    return _programmed(
+        "acceleration", "counts/s^2", counts_per_s2, _acceleration_factor(servo_divisor, profile), MOST_RATE
+    )
+
+
+def acceleration_counts_per_s2(programmed: int, servo_divisor: int, profile: Profile) -> float:
+    """Return the acceleration that an acceleration register stands for, in counts per second squared.
+
+    Raises:
+        ValueOutOfRange: the servo rate divisor is outside 1 to 255.
+    """
+    return programmed / _acceleration_factor(servo_divisor, profile)
+
+
+def _velocity_factor(servo_divisor: int, profile: Profile) -> float:
+    return FRACTION * _profile_tick_s(servo_divisor, profile)
+
+
+def _acceleration_factor(servo_divisor: int, profile: Profile) -> float:
+    return FRACTION * _profile_tick_s(servo_divisor, profile) ** 2
+
+
+def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
+    if not 1 <= servo_divisor <= MOST_DIVISOR:
+        raise ValueOutOfRange(
+            f"servo rate divisor {servo_divisor} is outside 1 to {MOST_DIVISOR}",
+            value=servo_divisor,
+            limit=1 if servo_divisor < 1 else MOST_DIVISOR,
+            nearest=min(max(servo_divisor, 1), MOST_DIVISOR),
+        )
+    return CYCLE_CLOCKS / profile.clock_hz * (servo_divisor if profile.divisor_slows_profile else 1)
+
+
+def _programmed(what: str, unit: str, value: float, factor: float, most_register: int) -> int:
+    most = most_register / factor
+    if not 0 <= value <= most:
+        nearest = most if value > most else 0.0
+        raise ValueOutOfRange(
+            f"{what} {value:.10g} {unit} is outside 0 to {most:.10g}",
+            value=value,
+            limit=nearest,
+            nearest=nearest,
+        )
+    register = math.floor(value * factor + 0.5)
+    if register == 0 and value > 0:
+        least = 1 / factor
+        raise ValueOutOfRange(
+            f"{what} {value:g} {unit} is too small for the drive, the least is {least:g}",
+            value=value,
+            limit=least,
+            nearest=least,
+        )
+    return min(register, most_register)
