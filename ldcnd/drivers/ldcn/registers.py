@@ -1,4 +1,4 @@
-"""LDCN/NMC registers: the codes of baud rates, the data of Set Gain, and what the host knows of what it cannot read back.
+"""LDCN/NMC registers: codes of baud rates, the data of Set Gain, and what the host knows of what it cannot read back.
 
 Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Conditions", "Set Baud Rate" and the
 calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
