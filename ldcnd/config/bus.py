@@ -113,6 +113,11 @@ refuse, and skip where the drives' speed only shows on site."""
         return Rs485(**self.rs485.model_dump()) if self.rs485 else None
 
     @property
+    def takes_over(self) -> bool:
+        """Whether the drives are taken over as they are at the start, so that what an earlier daemon knew may hold."""
+        return False
+
+    @property
     def simulated(self) -> str:
         """Name of the simulated line that it is; empty for a real port."""
         return self.port.removeprefix(SIMULATED) if self.port.startswith(SIMULATED) else ""

@@ -5,7 +5,7 @@ seconds; units, limits, states and authority are the daemon's.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -393,6 +393,57 @@ class HasOutputs(ABC):
 
         Raises:
             NotSupported: the model cannot.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a drive shows of the time since its position was last known.
+
+    Attributes:
+        counts: position, in counts since the drive was reset, as this host counts them.
+        counter: the same as the drive itself counts it, which another host reads, too.
+        mark: what the register for marks holds; 0 after a reset.
+        enabled: the position loop is closed.
+        position_lost: it may have missed counts.
+    """
+
+    counts: int
+    counter: int
+    mark: int
+    enabled: bool
+    position_lost: bool
+
+
+async def nothing() -> None:
+    """Do nothing."""
+
+
+class KeepsMark(ABC):
+    """It has a register that a host can set to the present position, and that a reset clears.
+
+    A mark that is still there proves that the drive was not reset since, so that its counter goes on from where it was.
+
+    Attributes:
+        about_to_renumber: awaited before the drive's counter is given another number; it may refuse that.
+    """
+
+    about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
+
+    @abstractmethod
+    async def evidence(self) -> Evidence:
+        """Read what the drive shows.
+
+        Raises:
+            BusError: the line failed.
+        """
+
+    @abstractmethod
+    async def leave_mark(self) -> None:
+        """Have the drive set the register to its position; nothing moves. The register may be that of captures.
+
+        Raises:
+            BusError: the line failed.
         """
 
 

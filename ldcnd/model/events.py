@@ -9,6 +9,8 @@ from ldcnd.model.frozen import Frozen
 
 ALARM_HISTORY = "alarm_history"
 """The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
+REFERENCE = "reference"
+"""The verb of an event of the start: the reference that an earlier daemon has kept holds, or was refused."""
 UNSETTLED = "unsettled"
 """The verb of an event beside that of a motion that did not settle in its time."""
 
@@ -59,8 +61,8 @@ class CommandEvent(Frozen):
     command_id: str
     """Which command."""
     verb: str
-    """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, and `unsettled` for a
-    motion that did not settle, which nobody asked for."""
+    """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
+    motion that did not settle, `reference` for what became of a kept reference: nobody asked for these."""
     client: str | None
     """The client, as it calls itself; not authenticated."""
     login: str | None = None

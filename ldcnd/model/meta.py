@@ -164,6 +164,19 @@ class AxisLimits(Frozen):
     """Highest acceleration, in units a second squared."""
 
 
+class PastFault(Frozen):
+    """A fault that an axis has had."""
+
+    code: str
+    """Stable code of the fault."""
+    text: str
+    """What it means and what to do."""
+    since: int
+    """When the daemon first saw it, UTC in ns since 1970."""
+    source: str
+    """Who said so: drive or daemon."""
+
+
 class AxisInfo(Frozen):
     """What an axis is: served on `meta/axes/<axis>`."""
 
@@ -207,3 +220,5 @@ class AxisInfo(Frozen):
     """How its polls fare while its line cannot carry all of them."""
     registers: tuple[RegisterInfo, ...] = ()
     """What the drive's write-only registers hold, as far as the daemon knows."""
+    past_faults: tuple[PastFault, ...] = ()
+    """The latest faults, oldest first; with a `state_dir` also those before the daemon was started."""

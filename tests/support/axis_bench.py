@@ -214,7 +214,7 @@ class AxisBench:
             lambda _axis, verb, status, reason, _code: self.notes.append((verb, status, reason)),
         )
         self.tracker = self.axis.tracker
-        self.axis.connected(referenced=True)
+        self.axis.connected(placed=True)
 
     def _ended(
         self, command: ActiveCommand, status: CommandStatus, reason: str | None, _arrival: Arrival | None

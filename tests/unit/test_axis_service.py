@@ -566,10 +566,10 @@ async def test_an_axis_is_at_work_while_it_has_a_command_or_may_move():
 async def test_a_referenced_line_counts_from_the_drives_zero_again():
     async with axis_bench() as bench:
         bench.axis.telemetry.origin_counts = 77.0
-        bench.axis.connected(referenced=False)
+        bench.axis.connected(placed=False)
         assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (False, 77.0)
 
-        bench.axis.connected(referenced=True)
+        bench.axis.connected(placed=True)
         assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (True, 0.0)
 
 

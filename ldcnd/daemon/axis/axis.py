@@ -16,13 +16,15 @@ from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
+from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.axis.motion import AxisMotion, preview
 from ldcnd.daemon.axis.parameters import Parameters
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.procedures.jog import Hold
-from ldcnd.daemon.axis.state import REST_COUNTS, AxisTracker, ObservedTracker
+from ldcnd.daemon.axis.reference import ReferenceKeeper
+from ldcnd.daemon.axis.state import REFERENCE_REFUSED, REST_COUNTS, AxisTracker, ObservedTracker
 from ldcnd.daemon.axis.telemetry import Arrivals, AxisTelemetry, EndTold, Note
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
@@ -30,9 +32,10 @@ from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
 from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.driver import AxisReading, Drive, Fault, Moves, Readable, Records, StopMode, parameters_of
 from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.network import BringUpReport
 from ldcnd.drivers.scaling import Scale
 from ldcnd.drivers.tracer import Tracer
-from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests
+from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests, WrongState
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.commands import (
@@ -48,7 +51,7 @@ from ldcnd.model.commands import (
     Stop,
     Verb,
 )
-from ldcnd.model.events import ALARM_HISTORY, CommandStatus
+from ldcnd.model.events import ALARM_HISTORY, REFERENCE, CommandStatus
 from ldcnd.model.rig_commands import FrozenPosition
 from ldcnd.model.samples import LinkState, Moving, TelemetryItem
 
@@ -184,6 +187,9 @@ class AxisService:
         next_command_id: Callable[[], str],
         ended: EndTold,
         note: Note = _no_note,
+        *,
+        kept: KeptFiles | None = None,
+        keeps_reference: bool = False,
     ) -> None:
         self.config = config
         self.driver = driver
@@ -207,7 +213,13 @@ class AxisService:
         self._clock = clock
         self._next_command_id = next_command_id
         self._note = note
-        self._motion = AxisMotion(config, moves, self.scale, self.tracker, self.telemetry, clock, self._read)
+        self.reference = ReferenceKeeper(
+            config, driver, self.tracker, self.telemetry, clock, kept, references=keeps_reference
+        )
+        self._recalled: float | None = None
+        self._motion = AxisMotion(
+            config, moves, self.scale, self.tracker, self.telemetry, clock, self._read, self.reference
+        )
         self._commands = AxisCommands(self._motion)
         self._plausibility = PlausibilityGate(config, self.scale)
         self._turns = AxisTurns(config.name)
@@ -261,12 +273,34 @@ class AxisService:
         self._motion.reconfigure(config)
         self._plausibility.reconfigure(config)
 
-    def connected(self, *, referenced: bool) -> None:
-        """The line came up; `referenced` when the drive's position is known to be right."""
+    async def recall(self, report: BringUpReport) -> None:
+        """Take up the reference that an earlier daemon has kept, if everything proves it; the line came up anew."""
+        name = self.config.name
+        reset = "its line was reset" if report.reset else ""
+        interrupted = "its drive had lost power" if name in report.restarted else reset
+        origin, refused = await self.reference.recall(report.baud, report.identities.get(name, ""), interrupted)
+        self._recalled = origin
+        if origin is not None:
+            log.info("reference kept", axis=name)
+            self._note(name, REFERENCE, CommandStatus.DONE, "kept: it is as an earlier daemon has left it", None)
+        if not refused:
+            return
+        log.warning("kept reference refused", axis=name, reason=refused)
+        self.tracker.refuse_reference(refused)
+        self._note(name, REFERENCE, CommandStatus.REFUSED, f"not kept: {refused}", REFERENCE_REFUSED.code)
+        try:
+            await self.reference.forget()
+        except WrongState as error:
+            log.error("kept reference not removed", axis=name, reason=error.message)
+
+    def connected(self, *, placed: bool) -> None:
+        """The line came up; `placed` when 0 is where the drive was powered on, and that is the reference."""
         self.line_up = True
-        self.tracker.referenced = referenced
-        if referenced:
-            self.telemetry.origin_counts = 0.0
+        self.tracker.referenced = placed or self._recalled is not None
+        if self.tracker.referenced:
+            self.telemetry.origin_counts = 0.0 if placed else self._recalled or 0.0
+        self._recalled = None
+        self.reference.woken.set()
 
     def disconnected(self) -> None:
         """The drive is out of reach, or has lost power."""
@@ -323,6 +357,7 @@ class AxisService:
         if arrivals.reading:
             arrivals.tell()
             self._ask_in_time(timing.sent_at_s)
+            self.reference.woken.set()
 
     def _ask_soon(self) -> None:
         self._ask_in_time(self._clock.now_s())

@@ -422,6 +422,7 @@ class AxisCommands:
         guards.check_stands(view)
         guards.check_position_kept(view)
         here = await motion.read()  # one reading alone may be wrong
+        await motion.reference.forget()
         turn.still_wanted()
         guards.check_position_kept(self._tracker.view())
         motion.telemetry.origin_counts = here.position_counts - motion.scale.to_counts(position)

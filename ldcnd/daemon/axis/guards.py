@@ -35,6 +35,7 @@ class AxisView:
     link: LinkState
     faults: tuple[str, ...]
     stop_pending: bool = False
+    reference_refused: str = ""
 
 
 def check_reachable(axis: AxisView) -> None:
@@ -112,8 +113,9 @@ def check_stands(axis: AxisView) -> None:
 def check_referenced(axis: AxisView) -> None:
     """Refuse an absolute position on an axis that does not know where it is."""
     if not axis.referenced:
+        kept = f"; what was kept of it was refused: {axis.reference_refused}" if axis.reference_refused else ""
         raise NotReferenced(
-            f"axis {axis.name} is not referenced: its position means nothing",
+            f"axis {axis.name} is not referenced: its position means nothing{kept}",
             axis=axis.name,
             remedy=Remedy("{} or {}", step("home"), step("set_position", "set_position")),
         )

@@ -14,6 +14,7 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.guards import AxisView, check_acceleration, check_position, check_velocity
 from ldcnd.daemon.axis.permit import QuietDrive
 from ldcnd.daemon.axis.procedure import Turn
+from ldcnd.daemon.axis.reference import ReferenceKeeper
 from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
@@ -169,6 +170,7 @@ class AxisMotion:
         telemetry: AxisTelemetry,
         clock: Clock,
         read: Callable[[], Awaitable[AxisReading]],
+        reference: ReferenceKeeper,
     ) -> None:
         """Take what an axis consists of.
 
@@ -180,7 +182,9 @@ class AxisMotion:
             telemetry: publishes it.
             clock: of the daemon.
             read: reads the drive's state at once.
+            reference: keeps its reference.
         """
+        self.reference = reference
         self.config = config
         self._window_counts = window_counts(config)
         self.driver = driver
@@ -332,6 +336,7 @@ class AxisMotion:
         self._loop.call_soon(self._tell_state)
 
     def _tell_state(self) -> None:
+        self.reference.woken.set()
         self.telemetry.state(self.clock.now_ns())
 
     def reply(self, turn: Turn) -> CommandReply:

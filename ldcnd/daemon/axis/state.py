@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from ldcnd.config.axis import AxisConfig
@@ -12,6 +12,7 @@ from ldcnd.exchange import Timing
 from ldcnd.fault_pages import page_of
 from ldcnd.model.commands import Verb
 from ldcnd.model.events import CommandStatus
+from ldcnd.model.meta import PastFault
 from ldcnd.model.samples import AxisState, FaultEntry, LinkState, Moving, Quality
 
 MISSES_UNTIL_DOWN = 3
@@ -48,8 +49,14 @@ JUMPED = Fault(
     " then send reset and home",
     loses_position=True,
 )
-OF_DAEMON = (LINK_LOST, LOOP_OPENED, JUMPED, NOT_SETTLED, STOP_UNCONFIRMED)
+REFERENCE_REFUSED = Fault(
+    "reference_refused",
+    "the reference that an earlier daemon has kept was refused",
+    stops=False,
+)
+OF_DAEMON = (LINK_LOST, LOOP_OPENED, JUMPED, NOT_SETTLED, REFERENCE_REFUSED, STOP_UNCONFIRMED)
 """Faults that the daemon finds; the drive tells all others."""
+OF_DAEMON_CODES = frozenset(fault.code for fault in OF_DAEMON)
 
 
 class Completion(Enum):
@@ -153,6 +160,10 @@ def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None
     pass
 
 
+def _ignore(_fault: PastFault) -> None:
+    pass
+
+
 StateShown = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None]
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
 """What a value read just now is worth, by the drive's link."""
@@ -209,6 +220,9 @@ class AxisTracker:
     """The state of one axis, changed only by what was observed or commanded.
 
     Attributes:
+        found: takes every fault as it comes up.
+        refused: why the reference that an earlier daemon has kept was refused; empty when none was, and once there is
+            another one.
         settle: judges the end of the motion under way; None where the end of its profile is its end.
     """
 
@@ -235,6 +249,8 @@ class AxisTracker:
         self.active_faults: tuple[FaultEntry, ...] = ()
         self.first_fault: FaultEntry | None = None
         self._failure: str | None = None
+        self.found: Callable[[PastFault], None] = _ignore
+        self.refused = ""
         self._own: tuple[Fault, ...] = ()  # faults that this daemon has found, until reset
         self.settle: SettleJudge | None = None
         self._ends_at_s: float | None = None  # when the profile under way should end
@@ -257,6 +273,7 @@ class AxisTracker:
             self.link,
             tuple(fault.text for fault in self.active_faults),
             self.stop_pending,
+            self.refused,
         )
 
     def shown(self) -> "StateShown":
@@ -306,7 +323,7 @@ class AxisTracker:
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
         """Digest a reading; `now_ns` stamps the faults that it brings up."""
-        faults = (*reading.faults, *self._own) if self._own else reading.faults
+        faults = (*reading.faults, *self._own_now()) if self._own else reading.faults
         self._misses = 0
         self.link = LinkState.UP
         if faults or self.active_faults:
@@ -377,6 +394,12 @@ class AxisTracker:
             return None  # not as planned: the ordinary polls tell
         return at_s + max(judge.settling.time_s / 2, LEAST_LOOK_S)
 
+    def refuse_reference(self, reason: str) -> None:
+        """The reference that an earlier daemon has kept does not hold: a warning until there is another one."""
+        self.refused = reason
+        text = f"{REFERENCE_REFUSED.text}: {reason}; home the axis, or set its position"
+        self._own = (*self._own, replace(REFERENCE_REFUSED, text=text))
+
     def jumped(self) -> None:
         """The next reading shows a position that no motion has led to: a fault until reset."""
         if JUMPED not in self._own:
@@ -405,9 +428,22 @@ class AxisTracker:
         known = {entry.code: entry for entry in self.active_faults}
         if self.stop_pending:
             faults = (*faults, STOP_UNCONFIRMED)
-        self.active_faults = tuple(known.get(fault.code) or _entry(fault, now_ns) for fault in faults)
-        if self.first_fault is None and self.active_faults:
-            self.first_fault = self.active_faults[0]
+        self.active_faults = tuple(known.get(fault.code) or self._entered(fault, now_ns) for fault in faults)
+        if self.first_fault is None:
+            causes = (fault for fault in self.active_faults if fault.code != REFERENCE_REFUSED.code)
+            self.first_fault = next(causes, None)
+
+    def _own_now(self) -> tuple[Fault, ...]:
+        """Return the faults that this daemon has found, without a refusal that another reference has made void."""
+        if self.refused and self.referenced:
+            self.refused = ""
+            self._own = tuple(fault for fault in self._own if fault.code != REFERENCE_REFUSED.code)
+        return self._own
+
+    def _entered(self, fault: Fault, now_ns: int) -> FaultEntry:
+        entry = _entry(fault, now_ns)
+        self.found(PastFault(code=entry.code, text=entry.text, since=entry.since, source=entry.source))
+        return entry
 
     def _fail(self, reason: str, *, settled: bool | None = None) -> None:
         self.state = AxisState.ERROR_STOP
@@ -505,7 +541,7 @@ def _entry(fault: Fault, now_ns: int) -> FaultEntry:
         code=fault.code,
         text=fault.text,
         since=now_ns,
-        source="daemon" if fault in OF_DAEMON else "drive",
+        source="daemon" if fault.code in OF_DAEMON_CODES else "drive",
         stops=fault.stops,
         page=page_of(fault.code),
     )

@@ -81,6 +81,7 @@ class BusService:
                 group.create_task(self._probe_stop_lane(1.0 / self._stop_probe_hz), name=f"stop probes {name}")
             for axis in self.axes:
                 group.create_task(axis.run(), name=f"axis {axis.config.name}")
+                group.create_task(axis.reference.run(), name=f"reference {axis.config.name}")
                 group.create_task(axis.traces.run(), name=f"traces {axis.config.name}")
 
     async def wait_up(self) -> None:
@@ -175,6 +176,9 @@ class BusService:
                 else:
                     axis.taken_over()
             await self._send_pending_stops()
+            if not self._was_up:
+                for axis in self.axes:
+                    await axis.recall(report)
             self.report, self._baud = report, report.baud
             self._connect(report)
             await self._look_after()
@@ -271,7 +275,7 @@ class BusService:
         now_s = asyncio.get_running_loop().time()
         for axis in self.axes:
             trusted = axis.config.reference == "at_reset" and axis.config.name in report.placed and not self._was_up
-            axis.connected(referenced=trusted)
+            axis.connected(placed=trusted)
             self._poll(axis, now_s)
         for watch in self.network.watches:
             self.bus.add_poller(watch)

@@ -12,6 +12,7 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.config.bus import BusConfig
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
+from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, random_token
 from ldcnd.daemon.command.dispatch import Dispatcher
@@ -88,8 +89,22 @@ def build_daemon(
     def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         events.note(axis, verb, status, reason, code=code)
 
+    kept = KeptFiles(config.state_dir) if config.state_dir else None
+    taken_over = frozenset(axis.name for bus in config.bus if bus.takes_over for axis in bus.axis)
+
     def make_axis(axis: AxisConfig, bus: Bus, driver: Drive) -> AxisService:
-        return AxisService(axis, bus, driver, publisher, clock, events.next_command_id, ledger.ended, note)
+        return AxisService(
+            axis,
+            bus,
+            driver,
+            publisher,
+            clock,
+            events.next_command_id,
+            ledger.ended,
+            note,
+            kept=kept,
+            keeps_reference=axis.name in taken_over,
+        )
 
     open_lines = {name: FAMILIES[name].open_lines(config.state_dir) for name in {bus.family for bus in config.bus}}
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}

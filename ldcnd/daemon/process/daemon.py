@@ -155,6 +155,7 @@ class Daemon:
                 await self._ending.wait()
                 requests.close()
                 await self._come_to_rest()
+                await self._keep_references()
                 if self._failure:
                     raise self._failure
             finally:
@@ -219,6 +220,12 @@ class Daemon:
                     )
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
+
+    async def _keep_references(self) -> None:
+        """Keep where each axis is while its line is still up; bounded."""
+        async with asyncio.TaskGroup() as group:
+            for name, axis in self.rig.axes.items():
+                group.create_task(axis.reference.finish(), name=f"keep {name}")
 
     def _returned(self, axis: AxisService, group: asyncio.TaskGroup) -> None:
         """A drive answers again that was out of reach: if it still moves, do what its policy says."""

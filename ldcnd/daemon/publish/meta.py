@@ -166,7 +166,8 @@ def _covered(expression: str, keys: tuple[str, ...]) -> tuple[str, ...]:
 def _axis_source(axis: AxisService) -> object:
     """Return what the description of an axis is made of, as far as it changes."""
     driver = axis.driver
-    return axis.config, driver.identity, registers_of(driver), driver.adc_full_scale, axis.traces.channels
+    past = axis.reference.faults
+    return axis.config, driver.identity, registers_of(driver), driver.adc_full_scale, axis.traces.channels, past
 
 
 def bus_info(bus: BusService) -> BusInfo:
@@ -227,6 +228,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
             RegisterInfo(name=register.name, value=register.value, provenance=register.provenance)
             for register in registers_of(driver)
         ),
+        past_faults=axis.reference.faults,
     )
 
 

@@ -24,9 +24,11 @@ from ldcnd.drivers.driver import (
     AnalogMotion,
     AxisReading,
     AxisSpec,
+    Evidence,
     HasOutputs,
     HomeCapture,
     Homes,
+    KeepsMark,
     Motion,
     Moves,
     PwmOutput,
@@ -146,6 +148,7 @@ def _shifted(motion: Motion, offset_counts: int) -> Motion:
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""
 STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+EVIDENCE_ITEMS = STATE_ITEMS | StatusItem.HOME
 
 STOP_CONTROLS = {
     StopMode.SMOOTH: StopControl.AMP_ENABLE | StopControl.SMOOTH,
@@ -164,7 +167,7 @@ def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusIt
     return mask
 
 
-class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersRegisters):
+class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersRegisters, KeepsMark):
     """A drive at one address, in the dialect of its profile."""
 
     shows_inputs = True
@@ -450,6 +453,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
                 axis=self.spec.name,
                 remedy="move in two parts",
             )
+        await self.about_to_renumber()
         self.state.setting_back = before
         self._book.doubt(("position",))  # the target that was loaded last means another place
         with contextlib.suppress(OutcomeUnknown):
@@ -630,6 +634,27 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         if status.home is None:
             raise BadReply(f"axis {self.spec.name}: the status packet lacks the home position")
         return status.home + self.state.offset_counts
+
+    # -- what proves that its counter goes on ------------------------------------------------------------------------
+
+    @override
+    async def evidence(self) -> Evidence:
+        """See `KeepsMark`: the mark is in the home register."""
+        status = await self._bus.execute(commands.read_status(self._node, EVIDENCE_ITEMS), Lane.BACKGROUND)
+        if status.home is None or status.position is None:
+            raise BadReply(f"axis {self.spec.name}: the status packet lacks position or home")
+        reading = self.state.reading(status)
+        return Evidence(
+            counts=reading.position_counts,
+            counter=status.position,
+            mark=status.home,
+            enabled=reading.enabled,
+            position_lost=any(fault.loses_position for fault in reading.faults),
+        )
+
+    @override
+    async def leave_mark(self) -> None:
+        await self._bus.execute(commands.save_home(self._node), Lane.BACKGROUND)
 
     # -- registers ---------------------------------------------------------------------------------------------------
 

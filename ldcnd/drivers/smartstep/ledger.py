@@ -7,11 +7,11 @@ Source: manual 2.2, note on EEPROM.
 
 import asyncio
 import json
-import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from ldcnd import durable
 from ldcnd.errors import ConfigError, EepromBudgetSpent, Remedy, step
 
 EEPROM_LIFE = 10_000
@@ -93,7 +93,7 @@ class EepromLedger:
         text = json.dumps(self._counts, indent=1, sort_keys=True)
         loop = asyncio.get_running_loop()
         try:
-            await loop.run_in_executor(self._worker, _replace_file, self._path, text)
+            await loop.run_in_executor(self._worker, durable.replace, self._path, text)
         except OSError as error:
             self._counts[axis] = before
             raise ConfigError(
@@ -122,14 +122,3 @@ def _counts(document: Mapping[str, object]) -> dict[str, int]:
             raise ValueError(f"{parameter}: {writes!r} is not a number of writes")
         counts[parameter] = writes
     return counts
-
-
-def _replace_file(path: Path, text: str) -> None:
-    """Replace the file whole, and only once the new one is on the disk."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".new")
-    with draft.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)

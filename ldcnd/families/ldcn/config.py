@@ -115,6 +115,11 @@ None where polls would miss their turns for it."""
         return tuple(module.name for module in self.module if module.name)
 
     @property
+    @override
+    def takes_over(self) -> bool:
+        return self.start is StartPolicy.ADOPT
+
+    @property
     def clock_hz(self) -> int:
         """Clock of the drives, in Hz."""
         return round(self.clock_mhz * 1e6)

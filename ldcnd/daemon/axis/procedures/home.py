@@ -152,6 +152,7 @@ class HomeSequence(Procedure):
             guards.check_position(view, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
         off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
+        await motion.reference.forget()  # before the drive captures: what is kept would be of another origin
         finds = search.find_velocity is not None and search.runs_onto_switch(motion.scale)
         await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
         return motion.reply(self.turn).model_copy(

@@ -1,0 +1,136 @@
+"""What of an axis outlives the daemon: its reference, with what proves it, and the faults it has had. One file each.
+
+A reference is removed from the disk before anything may change it, and written again afterwards: a crash in between
+costs the reference, and a file never says more than was true when it was written.
+"""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+import pydantic
+
+from ldcnd import durable
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.meta import PastFault
+
+FORMAT = 1
+DISK_TIME_S = 2.0
+"""A disk that takes longer than this counts as failed."""
+ResultT = TypeVar("ResultT")
+
+
+class KeptReference(Frozen):
+    """Where position 0 is on the counter of a drive, and what must still be so for that to hold."""
+
+    format: int
+    """Of this file; another one is refused."""
+    written: int
+    """When, UTC in ns since 1970."""
+    address: int
+    """Of the drive on its line."""
+    identity: str
+    """What the drive says it is."""
+    baud: int
+    """Rate of the line: a drive that was reset is at another one."""
+    scale: tuple[float, str, float | None]
+    """Counts per unit, negative in reverse; unit; modulo."""
+    origin: float
+    """Position 0 on the drive's own counter."""
+    mark: int
+    """What the drive's mark register holds; a reset clears it."""
+    enabled: bool
+    """The position loop was closed."""
+    low: int
+    """The drive's counter is here at least,"""
+    high: int
+    """and here at most: both are where it stands, or a motion under way lies between them."""
+
+
+class FaultFile(Frozen):
+    """The faults of one axis."""
+
+    faults: tuple[PastFault, ...]
+    """Oldest first."""
+
+
+class KeptFiles:
+    """The files of one rig.
+
+    One thread writes them, so that they change in the order in which that was asked.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._worker = ThreadPoolExecutor(1, "kept files")
+
+    async def reference(self, axis: str) -> KeptReference | None:
+        """Return the reference that is kept of an axis; None without one.
+
+        Raises:
+            OSError, ValueError: it cannot be read, or makes no sense.
+        """
+        return await self._in_thread(_read(self._path("references", axis), KeptReference))
+
+    async def keep_reference(self, axis: str, reference: KeptReference) -> None:
+        """Write the reference of an axis; it is on the disk when this returns.
+
+        Raises:
+            OSError: it cannot be written; what was kept before still is.
+        """
+        path, text = self._path("references", axis), reference.model_dump_json()
+        await self._in_thread(lambda: durable.replace(path, text))
+
+    async def remove_reference(self, axis: str) -> None:
+        """Remove the reference of an axis; it has gone from the disk when this returns.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
+        path = self._path("references", axis)
+        await self._in_thread(lambda: durable.remove(path))
+
+    async def faults(self, axis: str) -> tuple[PastFault, ...]:
+        """Return the faults that are kept of an axis, oldest first.
+
+        Raises:
+            OSError, ValueError: they cannot be read, or make no sense.
+        """
+        kept = await self._in_thread(_read(self._path("faults", axis), FaultFile))
+        return kept.faults if kept else ()
+
+    async def keep_faults(self, axis: str, faults: tuple[PastFault, ...]) -> None:
+        """Write the faults of an axis.
+
+        Raises:
+            OSError: they cannot be written.
+        """
+        path, text = self._path("faults", axis), FaultFile(faults=faults).model_dump_json()
+        await self._in_thread(lambda: durable.replace(path, text))
+
+    def _path(self, what: str, axis: str) -> Path:
+        return self._directory / what / f"{axis}.json"
+
+    async def _in_thread(self, work: Callable[[], ResultT]) -> ResultT:
+        future = asyncio.get_running_loop().run_in_executor(self._worker, work)
+        async with asyncio.timeout(DISK_TIME_S):  # TimeoutError is an OSError
+            return await asyncio.shield(future)
+
+
+ModelT = TypeVar("ModelT", bound=Frozen)
+
+
+def _read(path: Path, model: type[ModelT]) -> Callable[[], ModelT | None]:
+    def read() -> ModelT | None:
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+        try:
+            return model.model_validate_json(text)
+        except pydantic.ValidationError as error:
+            raise ValueError(f"{path}: {error.errors()[0]['msg']}") from error
+
+    return read

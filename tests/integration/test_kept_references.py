@@ -1,0 +1,448 @@
+"""What a daemon keeps of its axes for the next one, on drives that outlive it, and what speaks against it."""
+
+import asyncio
+import errno
+import json
+import os
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ldcnd import durable
+from ldcnd.config.rig import RigConfig
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.received import PlainCommand, ResetPosition
+from ldcnd.errors import NotReferenced, WrongState
+from ldcnd.model.commands import Home, MoveAbsolute, MoveRelative, Power, SetPosition
+from ldcnd.model.events import CommandStatus, ReadEvents
+from ldcnd.model.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+
+COUNTS = 1000
+"""Of x, in a millimetre."""
+
+
+def chain_of(*models: str) -> Chain:
+    models = models or ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
+    return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in models)))
+
+
+def keeping(folder: Path, axes: dict[str, object] | None = None, **bus: object) -> RigConfig:
+    """Return the configuration of a rig that takes its line over, or resets it where it was never used."""
+    changed = {"reference": "required", "loss": {"daemon": "halt"}} | (axes or {})
+    config = simulated_config(changed, **({"start": "adopt", "adopt_fallback": "reset"} | bus))
+    return config.model_copy(update={"state_dir": folder})
+
+
+async def up(rig: ChainRig, axis: str) -> StateSample:
+    """Wait until an axis answers, and is known to stand or to move."""
+    return await rig.until(axis, lambda state: state.link is LinkState.UP and state.moving != "unknown")
+
+
+async def set_out(rig: ChainRig, axis: str = "x", position: float = 40.0, at: float = 7.0) -> None:
+    """Move an axis to where its drive counts 3 mm, call that place `at`, and go to a position."""
+    await up(rig, axis)
+    await rig.client.command(axis, Power(on=True))
+    await ended(rig, axis, MoveRelative(distance=3.0))
+    await rig.client.command(axis, SetPosition(position=at))
+    await asyncio.sleep(2.0)  # virtual; the drive has its mark here
+    await ended(rig, axis, MoveAbsolute(position=position))
+    await asyncio.sleep(2.0)
+
+
+async def ended(rig: ChainRig, axis: str, command: Any) -> None:
+    reply = await rig.client.command(axis, command)
+    await rig.client.wait_for_end(axis, reply.command_id)
+
+
+async def position_of(rig: ChainRig, axis: str = "x") -> PositionSample:
+    async with rig.client.samples(axis, TelemetryItem.POSITION) as positions:
+        _, sample = await anext(positions)
+    assert isinstance(sample, PositionSample)
+    return sample
+
+
+async def refusals(rig: ChainRig, axis: str = "x") -> list[str]:
+    """Return what the events say of kept references."""
+    events = (await rig.client.ask(ReadEvents(axis=axis))).events
+    return [
+        "" if event.status is CommandStatus.DONE else str(event.reason) for event in events if event.verb == "reference"
+    ]
+
+
+@asynccontextmanager
+async def restarted(
+    chain: Chain, config: RigConfig, *, kill: bool = False, position: float = 40.0
+) -> AsyncIterator[ChainRig]:
+    """Run a daemon that references x, end it, and run another one on the same drives."""
+    async with rig_on(chain, config) as rig:
+        await set_out(rig, position=position)
+        if kill:
+            await rig.kill()
+    await asyncio.sleep(1.0)
+    async with rig_on(chain, config) as rig:
+        await up(rig, "x")
+        yield rig
+
+
+@pytest.mark.parametrize("kill", [False, True])
+async def test_a_reference_outlives_the_daemon_and_moves_go_where_they_are_told(tmp_path, kill):
+    chain = chain_of()
+    async with restarted(chain, keeping(tmp_path), kill=kill) as rig:
+        state, position = await up(rig, "x"), await position_of(rig)
+        others = [(await up(rig, axis)).referenced for axis in "yzc"]
+        await ended(rig, "x", MoveAbsolute(position=10.0))
+        went_to = (await position_of(rig)).value
+        said = await refusals(rig)
+
+    assert state.referenced
+    assert others == [False, False, False]
+    assert position.value == pytest.approx(40.0, abs=0.01)
+    assert went_to == pytest.approx(10.0, abs=0.01)
+    assert drive(chain, 1).loop.position == pytest.approx((10 - 7 + 3) * COUNTS, abs=12)
+    assert said == [""]
+
+
+async def test_a_reference_outlives_many_restarts(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with restarted(chain, config):
+        pass
+    for _ in range(3):
+        async with rig_on(chain, config) as rig:
+            assert (await up(rig, "x")).referenced
+            await rig.kill()
+    async with rig_on(chain, config) as rig:
+        assert (await position_of(rig)).value == pytest.approx(40.0, abs=0.01)
+
+
+async def test_a_homed_axis_has_its_mark_from_its_homing(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await up(rig, "z")
+        await rig.client.command("z", Power(on=True))
+        await ended(rig, "z", Home(method="index", velocity=0.5, position=2.0, move_to=20.0))
+        await asyncio.sleep(2.0)
+        marks = [packet for packet in rig.sent if packet.command is Command.SAVE_CURRENT_POSITION_AS_HOME]
+        before = await position_of(rig, "z")
+
+    async with rig_on(chain, config) as rig:
+        state, after = await up(rig, "z"), await position_of(rig, "z")
+
+    assert not marks or abs(drive(chain, 3).loop.home) >= 100
+    assert (state.referenced, after.value) == (True, pytest.approx(before.value, abs=0.001))
+
+
+async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_knows_where_it_is(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=10.0))
+        await asyncio.sleep(1.0)
+        await rig.kill()
+
+    async with rig_on(chain, config) as rig:
+        state = await up(rig, "x")
+        moving = await position_of(rig)
+        await rig.until("x", lambda state: state.state == "standstill")
+        await asyncio.sleep(1.0)
+        there = await position_of(rig)
+
+    assert state.referenced
+    assert 45 < moving.value < 89
+    assert there.value == pytest.approx(90.0, abs=0.01)
+
+
+async def test_turns_of_a_rotary_axis_outlive_the_daemon(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    (bus,) = config.bus
+    axes = tuple(axis.model_copy(update={"modulo": 360.0}) if axis.name == "c" else axis for axis in bus.axis)
+    config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+    async with rig_on(chain, config) as rig:
+        await up(rig, "c")
+        await rig.client.command("c", Power(on=True))
+        await rig.client.command("c", SetPosition(position=0.0))
+        await ended(rig, "c", MoveRelative(distance=2 * 360.0 + 90.0))
+        await asyncio.sleep(2.0)
+
+    async with rig_on(chain, config) as rig:
+        await up(rig, "c")
+        after = await position_of(rig, "c")
+
+    assert (after.turns, after.value) == (2, pytest.approx(90.0, abs=0.1))
+
+
+# -- what speaks against it ------------------------
+
+
+async def between(chain: Chain, config: RigConfig, tamper: Any, **how: Any) -> tuple[bool, list[str]]:
+    """Reference x, end the daemon, tamper with its drive; return whether the next one believes, and what it says."""
+    async with rig_on(chain, config) as rig:
+        await set_out(rig, **how)
+    tamper(drive(chain, 1))
+    await asyncio.sleep(2.0)
+    async with rig_on(chain, config) as rig:
+        state = await up(rig, "x")
+        return state.referenced, await refusals(rig)
+
+
+async def test_a_drive_that_lost_power_has_no_reference(tmp_path):
+    def cut(_drive: object) -> None:
+        now_s = asyncio.get_running_loop().time()
+        for module in chain.modules:
+            module.power(on=False, at_s=now_s)
+            module.power(on=True, at_s=now_s + 0.1)
+
+    chain = chain_of()
+    assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its line was reset"])
+
+
+async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_reference(tmp_path):
+    """Address, identity and rate are what they were, and even the counter is near where it was."""
+
+    def reset(module: Any) -> None:
+        address, group, baud = module.address, module.group, module.baud
+        module.restart()
+        module.address, module.group, module.baud = address, group, baud
+        module.loop.renumber(3000 + 33 * COUNTS)
+        module.loop.close()
+        module.loop.home = 0
+
+    believed, said = await between(chain_of(), keeping(tmp_path), reset)
+    assert not believed
+    assert "its mark is 0 and was " in said[0]
+
+
+@pytest.mark.parametrize(
+    ("tamper", "why"),
+    [
+        (lambda module: module.execute(ResetPosition()), "its counter reads 0, as after a reset"),
+        (lambda module: module.execute(PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME)), "another program"),
+        (lambda module: module.loop.open(), "its loop is open and was closed"),
+        (lambda module: module.loop.renumber(module.loop.position + 500), "it is 500 counts from where it was left"),
+    ],
+)
+async def test_what_another_program_did_meanwhile_costs_the_reference(tmp_path, tamper, why):
+    believed, said = await between(chain_of(), keeping(tmp_path), tamper)
+    assert (believed, len(said)) == (False, 1)
+    assert why in said[0]
+
+
+async def test_an_axis_that_was_pushed_has_no_reference(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        await rig.client.command("x", Power(on=False))
+        await asyncio.sleep(2.0)
+    drive(chain, 1).shaft.position_counts += 2000
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+
+    assert not state.referenced
+    assert "it was moved while no daemon watched it" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"counts_per_unit": 2000}, "scale, unit or modulo was"),
+        ({"direction": "reverse"}, "scale, unit or modulo was"),
+    ],
+)
+async def test_another_configuration_costs_the_reference(tmp_path, changed, why):
+    chain = chain_of()
+    async with rig_on(chain, keeping(tmp_path)) as rig:
+        await set_out(rig)
+    async with rig_on(chain, keeping(tmp_path, changed)) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+    assert not state.referenced
+    assert why in said[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [("", "cannot be read"), ("{", "cannot be read"), ('{"format": 9}', "cannot be read"), (None, "another version")],
+)
+async def test_a_file_that_makes_no_sense_costs_the_reference(tmp_path, text, why):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+    file = tmp_path / "references" / "x.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 2}) if text is None else text)
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+    assert not state.referenced
+    assert why in said[0]
+    assert not file.exists()
+
+
+async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_refused(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+    drive(chain, 1).loop.renumber(500)
+    async with rig_on(chain, config) as rig:
+        await up(rig, "x")
+        fault = await rig.client.last("x", TelemetryItem.FAULT)
+        with pytest.raises(NotReferenced, match="what was kept of it was refused: it is -35"):
+            await rig.client.command("x", MoveAbsolute(position=1.0))
+        await rig.kill()
+    async with rig_on(chain, config) as rig:
+        again, said = await up(rig, "x"), await refusals(rig)
+        await rig.client.command("x", SetPosition(position=1.0))
+        cleared = await rig.until("x", lambda state: state.referenced)
+        await asyncio.sleep(1.0)
+        later = await rig.client.last("x", TelemetryItem.FAULT)
+
+    assert isinstance(fault, FaultSample)
+    assert isinstance(later, FaultSample)
+    assert [(entry.code, entry.stops, entry.source) for entry in fault.active] == [
+        ("reference_refused", False, "daemon")
+    ]
+    assert fault.first is None
+    assert (again.referenced, said) == (False, [])
+    assert (cleared.referenced, later.active) == (True, ())
+
+
+# -- a crash between what happens and what is written ------------------------
+
+
+async def test_a_crash_right_behind_a_new_origin_never_brings_back_the_old_one(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        await rig.client.command("x", SetPosition(position=-5.0))
+        await rig.kill()
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+
+    assert (state.referenced, said) == (False, [])
+
+
+async def test_a_crash_in_mid_homing_leaves_no_reference(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        await rig.client.command("x", Home(method="index", velocity=0.5, position=0.0))
+        await rig.kill()
+    async with rig_on(chain, config) as rig:
+        assert not (await up(rig, "x")).referenced
+
+
+async def test_a_counter_is_not_set_back_before_the_reference_is_off_the_disk(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        keeper = rig.daemon.rig.axis("x").reference
+        file = tmp_path / "references" / "x.json"
+        assert file.exists()
+
+        await keeper._drive.about_to_renumber()
+
+        assert not file.exists()
+        assert rig.daemon.rig.axis("x").driver.about_to_renumber == keeper.forget
+
+
+# -- disks ------------------------
+
+
+async def test_a_full_disk_costs_the_reference_and_nothing_else(tmp_path, monkeypatch):
+    def full(path: Path, text: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    chain, config = chain_of(), keeping(tmp_path)
+    monkeypatch.setattr(durable, "replace", full)
+    async with restarted(chain, config) as rig:
+        state = await up(rig, "x")
+        await rig.client.command("x", SetPosition(position=1.0))
+        await ended(rig, "x", MoveAbsolute(position=2.0))
+        there = await position_of(rig)
+
+    assert not state.referenced
+    assert there.value == pytest.approx(2.0, abs=0.01)
+    assert not (tmp_path / "references").exists()
+
+
+async def test_a_reference_that_cannot_be_removed_from_the_disk_is_made_void_in_the_drive(tmp_path, monkeypatch):
+    def read_only(path: Path, *_text: str) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        monkeypatch.setattr(durable, "replace", read_only)
+        monkeypatch.setattr(durable, "remove", read_only)
+
+        await rig.client.command("x", SetPosition(position=-5.0))
+        await ended(rig, "x", MoveAbsolute(position=-4.0))
+        there = await position_of(rig)
+        await rig.kill()
+    monkeypatch.undo()
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+
+    assert there.value == pytest.approx(-4.0, abs=0.01)
+    assert not state.referenced
+    assert re.search("its mark is 36... and was 3...:", said[0])
+
+
+async def test_where_neither_disk_nor_drive_can_forget_a_reference_there_is_no_other(tmp_path, monkeypatch):
+    def read_only(path: Path, *_text: str) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig, position=7.0)
+        drive(chain, 1).loop.home = drive(chain, 1).loop.position  # it stands on its mark to the count
+        await asyncio.sleep(15.0)
+        monkeypatch.setattr(durable, "replace", read_only)
+        monkeypatch.setattr(durable, "remove", read_only)
+
+        for command in (SetPosition(position=-5.0), Home(method="index", velocity=0.5)):
+            with pytest.raises(WrongState, match="the reference that is kept cannot be removed: Read-only file system"):
+                await rig.client.command("x", command)
+        await ended(rig, "x", MoveAbsolute(position=41.0))
+        assert (await position_of(rig)).value == pytest.approx(41.0, abs=0.01)
+
+
+async def test_a_disk_that_does_not_answer_holds_up_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(asyncio.get_running_loop().__class__, "run_in_executor", _never)
+    chain = chain_of()
+    async with rig_on(chain, keeping(tmp_path)) as rig:
+        await up(rig, "x")
+        await rig.client.command("x", Power(on=True))
+        for position in (0.0, 10.0):
+            await rig.client.command("x", SetPosition(position=position))
+            await ended(rig, "x", MoveAbsolute(position=5.0))
+            assert (await position_of(rig)).value == pytest.approx(5.0, abs=0.01)
+            await asyncio.sleep(5.0)
+            await ended(rig, "x", MoveRelative(distance=1.0))
+
+
+def _never(loop: asyncio.AbstractEventLoop, *_work: object) -> asyncio.Future[None]:
+    return loop.create_future()
+
+
+# -- faults ------------------------
+
+
+async def test_faults_outlive_the_daemon(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        drive(chain, 1).loop.open()  # as after an excess position error
+        await rig.until("x", lambda state: state.state == "error_stop")
+        await asyncio.sleep(1.0)
+        first = next(info for info in await rig.client.axes() if info.axis == "x").past_faults
+    async with rig_on(chain, config) as rig:
+        await up(rig, "x")
+        await asyncio.sleep(0.1)
+        kept = next(info for info in await rig.client.axes() if info.axis == "x").past_faults
+
+    assert [fault.code for fault in first] == ["position_error"]
+    assert kept[: len(first)] == first
