@@ -212,7 +212,7 @@ LDCN_REVERTS = (
         ("tests/unit/test_ldcn_received.py::test_a_missing_step_multiplier_is_one",),
     ),
     Revert(
-        LDCN + "registers.py",
+        LDCN + "trajectory.py",
         "(servo_divisor if profile.divisor_slows_profile else 1)",
         "servo_divisor",
         ("tests/unit/test_ldcn_registers.py::test_the_servo_divisor_slows_the_profile_on_version_4_but_not_on_sc",),
