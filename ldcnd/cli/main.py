@@ -29,6 +29,7 @@ COMMANDS = {
     "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
     "drill": ("ldcnd.cli.drill", "Rehearse the loss of a client, a line or the daemon."),
     "bus": ("ldcnd.cli.bus", "Look at the lines of a running daemon."),
+    "speed": ("ldcnd.cli.rig:speed", "Show or set the speed override of the rig."),
     "console": ("ldcnd.cli.console", "Show rigs in a browser."),
     "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),
     "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),

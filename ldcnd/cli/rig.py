@@ -4,13 +4,14 @@ import asyncio
 import os
 import shlex
 import sys
+from collections.abc import Mapping
 
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, show_lines
-from ldcnd.cli.quantities import outcome, values_of
+from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, halted
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.lease import control
@@ -18,7 +19,15 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LeaseExpired
 from ldcnd.model.commands import Power, Reset, StopReply
 from ldcnd.model.events import ReadOutcome
-from ldcnd.model.rig_commands import AxisMove, ListHolders, MoveTogether, MoveTogetherReply
+from ldcnd.model.rig_commands import (
+    AxisMove,
+    LinePath,
+    ListHolders,
+    MoveTogether,
+    MoveTogetherReply,
+    PreviewTogether,
+    SetSpeedOverride,
+)
 
 GROUP_TIME_S = 10.0
 
@@ -70,6 +79,31 @@ def power(sender: Sender, switch: str, axes: tuple[str, ...]) -> None:
     sender.send_to_all(axes, Power(on=switch == "on"))
 
 
+@click.command()
+@click.argument("percent", type=Finite(0, 100), required=False)
+@commanding
+def speed(sender: Sender, percent: float | None) -> None:
+    """Set the speed override of the rig to PERCENT of every velocity; without PERCENT show it.
+
+    At 0 what moves is halted and nothing begins. Raising it needs control of the axes where moving them would.
+    """
+
+    async def shown(client: RigClient) -> str:
+        states = [await client.state(info.axis) for info in await client.axes()]
+        return ", ".join(sorted({f"{rounded(state.speed_override)} %" for state in states if state}))
+
+    if percent is None:
+        show_lines(sender.target.run(shown))
+        return
+    leases = (sender.lease,) if sender.lease else ()
+    request = of_options(SetSpeedOverride, percent=percent, leases=leases, client=None if sender.lease else NAME)
+    reply = sender.target.run(lambda client: client.ask(request))
+    told = [f"{axis}: goes on at another speed" for axis in reply.changed] + [
+        f"{axis}: halted" for axis in reply.halted
+    ]
+    sender.target.show(reply, f"speed override {rounded(reply.percent)} %", *told)
+
+
 @click.group()
 def group() -> None:
     """Move several axes that start in the same servo cycle."""
@@ -79,18 +113,25 @@ def group() -> None:
 @click.argument("moves", nargs=-1, required=True, metavar="AXIS=POSITION...")
 @click.option("--velocity", type=Finite(), help="Units a second, for each axis; the axis defaults when missing.")
 @click.option("--acceleration", type=Finite(), help="Units a second squared; the axis defaults when missing.")
+@click.option("--straight", is_flag=True, help="Keep to a straight line: all ramp alike and arrive together.")
+@click.option("--max-deviation", type=Finite(), help="Refuse a line that would be left by more, in axis units.")
 @click.option("--wait", is_flag=True, help="Return when all have ended; Ctrl-C halts them.")
 @commanding
 def group_move(
-    sender: Sender, moves: tuple[str, ...], velocity: float | None, acceleration: float | None, *, wait: bool
+    sender: Sender,
+    moves: tuple[str, ...],
+    velocity: float | None,
+    acceleration: float | None,
+    *,
+    straight: bool,
+    max_deviation: float | None,
+    wait: bool,
 ) -> None:
     """Start absolute moves of all members of a configured group together, or none of them: `x=10 y=20`."""
-    wanted = []
-    for each in moves:
-        axis, _, position = each.partition("=")
-        values = {"axis": axis, "position": position, "velocity": velocity, "acceleration": acceleration}
-        wanted.append(of_options(AxisMove, **values, lease=sender.lease, client=None if sender.lease else NAME))
-    request = of_options(MoveTogether, moves=tuple(wanted))
+    who = {"lease": sender.lease, "client": None if sender.lease else NAME}
+    wanted = _shares(moves, velocity, acceleration, who)
+    path = LinePath.LINEAR if straight else LinePath.INDEPENDENT
+    request = of_options(MoveTogether, moves=wanted, path=path, max_deviation=max_deviation)
     if wait:
         end_as_interrupted()
 
@@ -109,6 +150,8 @@ def group_move(
         lines = [
             f"{each.axis}: accepted{values_of(each, info)}" for each, info in zip(reply.replies, infos, strict=True)
         ]
+        if reply.deviation is not None:
+            lines.append(f"at most {rounded(reply.deviation)} from the line")
         sender.target.show(reply, *lines)
         if not wait:
             return []
@@ -120,6 +163,35 @@ def group_move(
 
     if sender.target.run(work):
         sys.exit(FAILED)
+
+
+@group.command("preview", context_settings={"ignore_unknown_options": True})
+@click.argument("moves", nargs=-1, required=True, metavar="AXIS=POSITION...")
+@click.option("--velocity", type=Finite(), help="Units a second, for each axis; the axis defaults when missing.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis defaults when missing.")
+@with_target
+def group_preview(target: Target, moves: tuple[str, ...], velocity: float | None, acceleration: float | None) -> None:
+    """Say how long a straight line of a group would take, and how far from it the axes would get; nothing moves."""
+    request = of_options(PreviewTogether, moves=_shares(moves, velocity, acceleration, {}), path=LinePath.LINEAR)
+    reply = target.run(lambda client: client.ask(request))
+    lines = [
+        f"{each.axis}: to {rounded(each.position)} at {rounded(each.velocity)} with {rounded(each.acceleration)}"
+        for each in reply.shares
+    ]
+    lines.append(f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation or 0.0)} from the line")
+    target.show(reply, *lines)
+
+
+def _shares(
+    moves: tuple[str, ...], velocity: float | None, acceleration: float | None, who: Mapping[str, str | None]
+) -> tuple[AxisMove, ...]:
+    """Return what is to be done, from `axis=position` of each axis."""
+    shares = []
+    for each in moves:
+        axis, _, position = each.partition("=")
+        values = {"axis": axis, "position": position, "velocity": velocity, "acceleration": acceleration}
+        shares.append(of_options(AxisMove, **values, **who))
+    return tuple(shares)
 
 
 @click.group()

@@ -18,6 +18,7 @@ from ldcnd.client.notebook import table
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.events import CommandEvent
+from ldcnd.model.rig_commands import LinePath
 from ldcnd.model.samples import PositionSample, Sample
 
 P = ParamSpec("P")
@@ -172,11 +173,22 @@ class Rig(Facade[rig.Rig]):
         """The names of its axes."""
         return self._wrapped.axes
 
+    preview_together = _waiting(rig.Rig.preview_together)
+    set_speed_override = _waiting(rig.Rig.set_speed_override)
+
     def move_together(
-        self, targets: dict[str, float], *, velocity: float | None = None, acceleration: float | None = None
+        self,
+        targets: dict[str, float],
+        *,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        path: LinePath = LinePath.INDEPENDENT,
+        max_deviation: float | None = None,
     ) -> tuple[Motion, ...]:
         """Start absolute moves of the members of one group in the same servo cycle; see `ldcnd.Rig.move_together`."""
-        moves = self._wrapped.move_together(targets, velocity=velocity, acceleration=acceleration)
+        moves = self._wrapped.move_together(
+            targets, velocity=velocity, acceleration=acceleration, path=path, max_deviation=max_deviation
+        )
         return tuple(Motion(self._loop, move) for move in self._loop.run(moves))
 
     @overload

@@ -25,12 +25,17 @@ from ldcnd.model.rig_commands import (
     HolderList,
     IoReply,
     IoTimer,
+    LinePath,
     ListHolders,
     MoveTogether,
+    PreviewTogether,
+    PreviewTogetherReply,
     SetIo,
     SetIoTimer,
+    SetSpeedOverride,
     Snapshot,
     SnapshotReply,
+    SpeedOverrideReply,
 )
 from ldcnd.model.samples import FaultSample, Sample
 
@@ -147,14 +152,22 @@ class Rig:
         return await self._client.stop()
 
     async def move_together(
-        self, targets: Mapping[str, float], *, velocity: float | None = None, acceleration: float | None = None
+        self,
+        targets: Mapping[str, float],
+        *,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        path: LinePath = LinePath.INDEPENDENT,
+        max_deviation: float | None = None,
     ) -> tuple[Motion, ...]:
         """Start absolute moves of the members of one group in the same servo cycle, or none of them.
 
         Args:
             targets: by axis, in axis units; exactly the members of a configured group, all controlled here.
-            velocity: of each of them, in its units a second; the axis default when missing.
+            velocity: of each of them, in its units a second; the axis default when missing. On a line the highest.
             acceleration: likewise.
+            path: the way between: each for itself, or on a straight line.
+            max_deviation: a line that would be left by more, in axis units, is refused.
 
         Raises:
             LeaseRequired: one of them is not controlled by this program.
@@ -166,8 +179,33 @@ class Rig:
                 raise LeaseRequired(f"axis {name} is not controlled here", axis=name, remedy="use Rig.control")
             move = AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
             moves.append(control.stamped(move, name))
-        reply = await self._client.ask(MoveTogether(moves=tuple(moves)))
+        reply = await self._client.ask(MoveTogether(moves=tuple(moves), path=path, max_deviation=max_deviation))
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
+
+    async def set_speed_override(self, percent: float) -> SpeedOverrideReply:
+        """Scale every velocity of the rig, 0 to 100 %; at 0 what moves is halted and nothing begins.
+
+        Raises:
+            LeaseHeld, LeaseRequired: it would be raised, and another program controls one of the axes.
+        """
+        controls = [control for name in self.axes if (control := self._axis(name).control)]
+        leases = tuple({control.lease.lease for control in controls})
+        return await self._client.ask(SetSpeedOverride(percent=percent, leases=leases))
+
+    async def preview_together(
+        self,
+        targets: Mapping[str, float],
+        *,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        path: LinePath = LinePath.LINEAR,
+    ) -> PreviewTogetherReply:
+        """Ask what `move_together` would do: durations, and how far from a straight line the axes would get."""
+        moves = tuple(
+            AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
+            for name, position in targets.items()
+        )
+        return await self._client.ask(PreviewTogether(moves=moves, path=path))
 
     # -- what it says ------------------------------------------------------------------------------------------------
 

@@ -113,6 +113,15 @@ class TrackingConfig(Frozen):
     """Most set-points a second."""
 
 
+class ApproachConfig(Frozen):
+    """From which side a move comes to its goal, where the mechanics have play."""
+
+    direction: Literal["positive", "negative"]
+    """The direction of the last motion."""
+    distance: float = Field(gt=0)
+    """How far before the goal it begins, in axis units: more than the play."""
+
+
 class LossPolicy(StrEnum):
     """What an axis does when a client, the line or the daemon disappears."""
 
@@ -203,6 +212,9 @@ counts as 0. The latter only for a line that no host has used since: after a res
     """Bounds of `track`; without them the axis follows no set-points."""
     settle: SettleConfig = SettleConfig()
     """When a motion to a target is done."""
+    approach: ApproachConfig | None = None
+    """`move_absolute` and `move_relative` come to their goal from one side, by two motions where one would not do; \
+other motions, also those of a group, do not."""
     rates: RatesConfig = RatesConfig()
     """How often each item is published."""
     priority: PollPriority = "normal"

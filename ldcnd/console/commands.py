@@ -20,7 +20,16 @@ from ldcnd.messaging.codec import Encoding, decode, error_reply
 from ldcnd.model.catalogue import BY_VERB
 from ldcnd.model.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.rig_commands import Acquire, AxisMove, MoveTogether, Release, Renew, SetIo, SetIoTimer
+from ldcnd.model.rig_commands import (
+    Acquire,
+    AxisMove,
+    MoveTogether,
+    Release,
+    Renew,
+    SetIo,
+    SetIoTimer,
+    SetSpeedOverride,
+)
 
 STOP_TIME_S = 3.0
 LEASE_COMMANDS: frozenset[type[Command[Frozen]]] = frozenset({Acquire, Renew, Release})
@@ -98,7 +107,7 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
             if page is None:
                 raise control_needed(asked.moves[0].axis)
             return json_reply(await page.move_together(rig, asked))
-        if isinstance(asked, SetIo | SetIoTimer) and page:
+        if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page:
             asked = asked.model_copy(update={"leases": page.leases(rig)})
         return json_reply(await client.ask(asked))
 

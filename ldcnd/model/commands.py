@@ -655,6 +655,8 @@ class PreviewReply(Frozen):
     """What else is in the way now; see `why`."""
     position: float | None = None
     """Where it would end, in axis units; null when it has no end."""
+    approach_from: float | None = None
+    """Where it would go first, to come to its end from the configured side; null when one motion will do."""
     velocity: float | None = None
     """Velocity that the registers would hold, units a second."""
     velocity_error: float | None = None

@@ -105,14 +105,37 @@ class AxisMove(MoveAbsolute):
     """The axis."""
 
 
+class LinePath(StrEnum):
+    """The way that the axes of a group take between them."""
+
+    INDEPENDENT = "independent"
+    """Each at its own velocity: they start together and arrive when each is there."""
+    LINEAR = "linear"
+    """On a straight line: they ramp alike and arrive together."""
+
+
 class MoveTogetherReply(Frozen):
     """Every drive has proven that it started."""
 
     replies: tuple[CommandReply, ...]
     """One for each axis, in the order of the request."""
+    deviation: float | None = Field(default=None, ge=0)
+    """How far from the line the axes get at most, by their profiles; null when they keep to none."""
 
 
-class MoveTogether(Command[MoveTogetherReply]):
+class GroupMoves(Frozen):
+    """What the axes of a group are to do together."""
+
+    moves: tuple[AxisMove, ...] = Field(min_length=2, max_length=31)
+    """Exactly the members of a group, each once."""
+    path: LinePath = LinePath.INDEPENDENT
+    """The way between. On a line a velocity and an acceleration are the highest that the axis has on it."""
+    max_deviation: float | None = Field(default=None, gt=0)
+    """A line that would be left by more than this is refused; in the unit of the axes, each of which counts with the \
+number of its own unit."""
+
+
+class MoveTogether(GroupMoves, Command[MoveTogetherReply]):
     """Start absolute moves of the axes of one configured group in the same servo cycle, or none of them."""
 
     verb = "move_together"
@@ -121,8 +144,68 @@ class MoveTogether(Command[MoveTogetherReply]):
     needs_lease = True
     ends = Ends.BY_READING
 
-    moves: tuple[AxisMove, ...] = Field(min_length=2, max_length=31)
-    """Exactly the members of a group, each once."""
+
+class AxisShare(Frozen):
+    """The share of one axis in moves that were only planned."""
+
+    axis: str
+    """The axis."""
+    position: float
+    """Where it would end, in axis units."""
+    velocity: float
+    """Velocity that the registers would hold, units a second."""
+    acceleration: float
+    """Acceleration that the registers would hold, units a second squared."""
+    duration_s: float
+    """Of its profile, without settling."""
+
+
+class PreviewTogetherReply(Frozen):
+    """What the moves would be; nothing was sent: the reply to `@cmd/_/preview_together`."""
+
+    shares: tuple[AxisShare, ...]
+    """One for each axis, in the order of the request."""
+    duration_s: float
+    """Of the longest profile, without settling."""
+    deviation: float | None = Field(default=None, ge=0)
+    """As the reply to `move_together` would say it."""
+
+
+class PreviewTogether(GroupMoves, Command[PreviewTogetherReply]):
+    """Ask what `move_together` would do; no effect. Refused where that would be for its values."""
+
+    verb = "preview_together"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+
+class SpeedOverrideReply(Frozen):
+    """The speed override from now on: the reply to `@cmd/_/set_speed_override`."""
+
+    percent: float
+    """Of every velocity."""
+    changed: tuple[str, ...]
+    """Axes whose motion under way goes on at another velocity."""
+    halted: tuple[str, ...]
+    """Axes that were told to halt, because it is 0."""
+
+
+class SetSpeedOverride(Command[SpeedOverrideReply]):
+    """Scale every velocity of the rig, of motions that begin and of those under way where the drive takes it.
+
+    At 0 everything that moves is halted and no motion begins; nothing goes on by itself afterwards.
+    """
+
+    verb = "set_speed_override"
+    about = About.RIG
+
+    percent: float = Field(ge=0, le=100)
+    """Of every velocity; 100 when the daemon starts. Set-points of `track` and duties of `set_pwm` are not scaled."""
+    client: str | None = Field(default=None, max_length=64)
+    """Who asks, for the log."""
+    leases: tuple[str, ...] = Field(default=(), max_length=64)
+    """The sender's leases. To raise the override they must cover every axis of which a motion would need one; lowering
+    it needs none."""
 
 
 class FrozenPosition(Frozen):
@@ -336,6 +419,8 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     ReadEvents,
     Rehearse,
     MoveTogether,
+    PreviewTogether,
+    SetSpeedOverride,
     ReadWireLog,
     Snapshot,
     SetIo,

@@ -222,6 +222,8 @@ class StateSample(Sample):
     """What it is doing."""
     last_error: str | None = None
     """Why the last command ended other than done, until the next command is accepted."""
+    speed_override: float = Field(default=100.0, ge=0, le=100)
+    """Percent of every velocity, for the whole rig; nothing moves at 0."""
 
 
 class MonitorName(StrEnum):

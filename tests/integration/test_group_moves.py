@@ -1,14 +1,23 @@
 """Several axes moved by one request, each through its own queue and guards."""
 
 import asyncio
+import math
 
 import pytest
 
 from ldcnd.daemon.command.dispatch import move_together
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import MalformedRequest, NotSupported, PositionLimit, StopLatched, UnknownAxis
+from ldcnd.drivers.ldcn.registers import FRACTION
+from ldcnd.errors import (
+    MalformedRequest,
+    NotSupported,
+    PositionLimit,
+    StopLatched,
+    UnknownAxis,
+    ValueOutOfRange,
+)
 from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.rig_commands import AxisMove, MoveTogether
+from ldcnd.model.rig_commands import AxisMove, MoveTogether, PreviewTogether
 from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
@@ -31,7 +40,8 @@ async def together(rig, **targets):
     """Ask for a group move."""
     axes = rig.daemon.rig.axes
     moves = {name: MoveAbsolute(position=target) for name, target in targets.items()}
-    return await move_together(rig.daemon.rig, moves, lambda name, share: axes[name].execute(share))
+    reply = await move_together(rig.daemon.rig, moves, lambda name, share: axes[name].execute(share))
+    return reply.replies
 
 
 def starts(rig):
@@ -125,5 +135,65 @@ async def test_an_axis_named_twice_is_refused():
 
         with pytest.raises(MalformedRequest):
             await rig.client.ask(request)
+
+    assert starts(rig) == []
+
+
+def commanded(chain, names="xy"):
+    """Where the profile generators are, in mm."""
+    now_s = asyncio.get_running_loop().time()
+    for address in range(1, len(names) + 1):
+        drive(chain, address).catch_up(now_s)
+    return [drive(chain, address).loop.trajectory.position / FRACTION / 1000 for address in range(1, len(names) + 1)]
+
+
+@pytest.mark.parametrize("velocity", [1.0, 10.0, 20.0])
+async def test_axes_on_a_line_leave_it_by_no_more_than_was_said_before(velocity):
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        moves = tuple(AxisMove(axis=axis, position=to, velocity=velocity) for axis, to in (("x", 12.0), ("y", -5.0)))
+        said = await rig.client.ask(PreviewTogether(moves=moves, path="linear"))
+        reply = await rig.client.ask(MoveTogether(moves=moves, path="linear"))
+        farthest, ended_s = 0.0, [math.inf, math.inf]
+        began_s = asyncio.get_running_loop().time()
+        while asyncio.get_running_loop().time() < began_s + said.duration_s + 0.5:
+            await asyncio.sleep(0.003)
+            x, y = commanded(chain)
+            farthest = max(farthest, abs(5.0 * x + 12.0 * y) / 13.0)
+            now_s = asyncio.get_running_loop().time()
+            ended_s = [
+                min(was, now_s) if at == to else was for was, at, to in zip(ended_s, (x, y), (12.0, -5.0), strict=True)
+            ]
+
+    assert reply.deviation == said.deviation
+    assert farthest <= said.deviation
+    assert said.deviation < 0.02
+    assert abs(ended_s[0] - ended_s[1]) < 0.02
+    assert [each.duration_s for each in reply.replies] == pytest.approx([said.duration_s] * 2, rel=0.01)
+    assert max(abs(each.velocity) for each in reply.replies) <= velocity * 1.001
+
+
+async def test_a_line_that_would_be_left_too_far_moves_nothing():
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        moves = (AxisMove(axis="x", position=12.0), AxisMove(axis="y", position=-5.0))
+        with pytest.raises(ValueOutOfRange, match="leave the line"):
+            await rig.client.ask(MoveTogether(moves=moves, path="linear", max_deviation=1e-6))
+        await asyncio.sleep(1)
+
+    assert starts(rig) == []
+    assert [drive(chain, address).loop.position for address in (1, 2)] == [0, 0]
+
+
+async def test_a_member_of_a_line_beyond_its_limit_keeps_all_at_rest():
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        moves = (AxisMove(axis="x", position=12.0), AxisMove(axis="y", position=-1000.0))
+        for request in (MoveTogether(moves=moves, path="linear"), PreviewTogether(moves=moves, path="linear")):
+            with pytest.raises(PositionLimit, match="axis y"):
+                await rig.client.ask(request)
 
     assert starts(rig) == []

@@ -19,7 +19,8 @@ NEXT = (
 )
 BY_THEMSELVES = ("docs/how-to/simulate-a-line.md", "docs/how-to/secure-a-rig.md")
 OPERATING = tuple(
-    f"docs/how-to/{name}.md" for name in ("commission-a-first-drive", "jog", "home", "tune", "move-a-group")
+    f"docs/how-to/{name}.md"
+    for name in ("commission-a-first-drive", "jog", "home", "tune", "move-a-group", "speed-and-approach")
 )
 FOLLOWED = {FIRST_RIG, *NEXT, *BY_THEMSELVES, *OPERATING}
 """Pages whose blocks are run here, all of them but those in `NOT_RUN`."""

@@ -40,9 +40,7 @@ EXPLAINED = {
     ("renew", "console"): "by itself while a page is open",
     ("outcome", "console"): "the events of the rig show it",
     ("rehearse", "console"): "a loss is rehearsed at the machine, with `ldcnd drill`",
-    ("move_relative", "documentation"): "`ldcnd axis move --relative`, in the reference of the command line",
     ("read_monitors", "console"): "the page of the axis shows the monitors as they are published",
-    ("preview", "documentation"): "`ldcnd axis preview`, in the reference of the command line",
     ("acquire", "documentation"): "[console](../how-to/console.md): Take control",
     ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
@@ -52,7 +50,16 @@ EXPLAINED = {
     ("rehearse", "command line"): "`ldcnd drill`",
 }
 """Why a verb is not in a place; everything else is there."""
-METHODS_OF_RIGS = {"holders", "outcome", "move_together", "snapshot", "set_io", "set_io_timer"}
+METHODS_OF_RIGS = {
+    "holders",
+    "outcome",
+    "move_together",
+    "preview_together",
+    "set_speed_override",
+    "snapshot",
+    "set_io",
+    "set_io_timer",
+}
 NOT_FOR_READERS = {"verbs.md", "python.md", "keys.md", "cli.md", "errors.md", "lab-log.md", "glossary.md"}
 """Pages that are made of the classes, or only define a word."""
 LAST = "write-a-client.md"

@@ -17,7 +17,7 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.kept import KeptFiles
-from ldcnd.daemon.axis.motion import AxisMotion, preview
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.daemon.axis.parameters import Parameters
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
@@ -45,6 +45,7 @@ from ldcnd.model.commands import (
     CommandReply,
     Jog,
     Move,
+    MoveAbsolute,
     Preview,
     PreviewReply,
     QuickStop,
@@ -53,7 +54,7 @@ from ldcnd.model.commands import (
 )
 from ldcnd.model.events import ALARM_HISTORY, REFERENCE, CommandStatus
 from ldcnd.model.rig_commands import FrozenPosition
-from ldcnd.model.samples import LinkState, Moving, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 
 log = get_logger("axis")
 
@@ -473,6 +474,24 @@ class AxisService:
                 permit.ask()
             return await execute()
 
+    async def set_speed_share(self, share: float) -> tuple[bool, bool]:
+        """Take another speed override, 0 to 1; return whether what moves goes on at another speed, or was halted.
+
+        Raises:
+            LdcndError: a motion under way could not be changed; those that begin have the new one all the same.
+        """
+        self._motion.speed_share = self.tracker.speed_share = share
+        self.telemetry.state(self._clock.now_ns())
+        if share <= 0:
+            if not self.at_work or self.tracker.state is AxisState.DISABLED:
+                return False, False
+            await self.bring_to_rest(StopMode.SMOOTH)
+            return False, True
+        async with self._turns.at_work:
+            changed = await self._commands.change_speed()
+        self._turns.wake()
+        return changed, False
+
     def begin_hold(self, command_id: str, request: Jog) -> Hold:
         """Remember who holds a jog, from its command on."""
         return self._commands.holds.begin(command_id, request, self._clock.now_s())
@@ -487,6 +506,15 @@ class AxisService:
         reply = self._commands.renew_jog(request, command_id)
         self._turns.wake()
         return reply
+
+    def planned(self, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:
+        """Return what this axis would do for its share of a group move, by itself; no effect.
+
+        Raises:
+            RequestRefused: its values are refused.
+        """
+        motion = self._motion
+        return motion, motion.plan_to(motion.unwrapped(move.position, move.direction), move.velocity, move.acceleration)
 
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""

@@ -1,12 +1,14 @@
 """What each command does to one axis: check, plan, talk to the drive, tell the tracker."""
 
 import math
+from dataclasses import replace
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.permit import cannot
 from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
+from ldcnd.daemon.axis.procedures.approach import ApproachMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
 from ldcnd.daemon.axis.procedures.home import HomeSequence
 from ldcnd.daemon.axis.procedures.jog import HeldJog, Holds, no_such_jog
@@ -15,7 +17,7 @@ from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE, VelocityChange, runs
 from ldcnd.daemon.axis.state import Completion
-from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, StopMode, TakesGains, Warns
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
 from ldcnd.errors import (
     DriveFault,
     NotSupported,
@@ -78,6 +80,7 @@ class AxisCommands:
         self._gains = motion.driver.spec.gains
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
+        self._moved: tuple[Turn, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
         self._retry_s: float | None = None  # when the step that was not taken is taken again
 
     async def carry_out(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
@@ -343,9 +346,11 @@ class AxisCommands:
         guards.check_may_follow(self._tracker.view())
         match request:
             case MoveAbsolute():
-                self._plan_absolute(request)
+                goal = self._plan_absolute(request)
+                self._motion.before_approach(goal, request.velocity, request.acceleration)
             case MoveRelative():
-                self._plan_relative(request)
+                goal = self._plan_relative(request)
+                self._motion.before_approach(goal, request.velocity, request.acceleration)
             case MoveVelocity():
                 self._plan_velocity(request)
             case Jog():
@@ -353,7 +358,7 @@ class AxisCommands:
 
     async def _move_absolute(self, turn: Turn, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(request)
-        return await self._move(turn, self._plan_absolute(request), AxisState.DISCRETE_MOTION)
+        return await self._move_to(turn, request, self._plan_absolute(request))
 
     async def _move_relative(self, turn: Turn, request: MoveRelative) -> CommandReply:
         self._check_may_start(request)
@@ -361,8 +366,16 @@ class AxisCommands:
             here = (await self._motion.read()).position_counts  # one reading alone may be wrong
             turn.still_wanted()
             self._check_may_start(request)
-            return await self._move(turn, self._plan_relative(request, here), AxisState.DISCRETE_MOTION)
-        return await self._move(turn, self._plan_relative(request), AxisState.DISCRETE_MOTION)
+            return await self._move_to(turn, request, self._plan_relative(request, here))
+        return await self._move_to(turn, request, self._plan_relative(request))
+
+    async def _move_to(self, turn: Turn, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
+        """Go to a goal, from the configured side where there is one."""
+        if self._motion.config.approach and (
+            first := self._motion.before_approach(goal, request.velocity, request.acceleration)
+        ):
+            return await self._undertake(ApproachMove(self._motion, turn, request, first, goal))
+        return await self._move(turn, goal, AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
         self._check_may_start(request)
@@ -391,7 +404,7 @@ class AxisCommands:
         if end is None:
             here = self._motion.telemetry.position(self._motion.latest().position_counts)
             longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(plan.motion.velocity_counts_per_s)
-            end = here + request.velocity * min(self._motion.config.jog_horizon_s, longest_s)
+            end = here + plan.velocity * min(self._motion.config.jog_horizon_s, longest_s)
         return plan.velocity, self._motion.plan_to(end, abs(request.velocity), request.acceleration)
 
     async def _move(
@@ -402,8 +415,10 @@ class AxisCommands:
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
         await turn.permit.load(plan.motion)
+        self._moved = turn, plan.motion, self._motion.speed_share
         await self._motion.start(turn, state, completion, plan=plan)
         self._motion.target_counts = plan.motion.target_counts
+        self._motion.approached = state is AxisState.DISCRETE_MOTION
         return self._motion.reply(turn).model_copy(
             update={
                 "position": self._motion.shown(plan.position),
@@ -412,6 +427,35 @@ class AxisCommands:
                 "duration_s": plan.duration_s,
             }
         )
+
+    async def change_speed(self) -> bool:
+        """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
+
+        Only where a drive takes another velocity for a trapezoid under way: its goal stays, so nothing moves twice.
+
+        Raises:
+            RequestRefused: it may not be moved any more.
+            BusError: the line failed; it goes on at the one velocity or the other.
+        """
+        tracker, share = self._tracker, self._motion.speed_share
+        command = tracker.command
+        if isinstance(self.procedure, HeldJog):
+            self.step_due = self.step_due or self.procedure.wants_step
+            return self.step_due
+        if self._moved is None or not self._driver.retargets or command is None or share <= 0:
+            return False
+        turn, motion, before = self._moved
+        if command.command_id != turn.command_id or command.completion is not Completion.PROFILE or share == before:
+            return False
+        changed = self._driver.quantise(
+            replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
+        )
+        await turn.permit.load(changed)
+        if tracker.command is not command:
+            return False  # it has ended meanwhile: what was loaded is not started
+        await turn.permit.start()
+        self._moved = turn, changed, share
+        return True
 
     # -- registers ---------------------------------------------------------------------------------------------------
 

@@ -174,6 +174,16 @@ def check_acceleration(axis: AxisView, limits: AxisLimits, acceleration: float) 
         )
 
 
+def no_speed(axis: str) -> WrongState:
+    """Return the refusal of a motion while the speed override of the rig is 0."""
+    return WrongState(
+        f"axis {axis}: the speed override of the rig is 0 %",
+        axis=axis,
+        value=0.0,
+        remedy=Remedy("{} above 0 %", step("set_speed_override", "set the speed override")),
+    )
+
+
 def _faulted(axis: AxisView) -> WrongState:
     causes = "; ".join(axis.faults) or "a command ended badly"
     return WrongState(

@@ -7,18 +7,25 @@ registers. A preview is worked out by the very code that would do it, and not do
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.guards import AxisView, check_acceleration, check_position, check_velocity
+from ldcnd.daemon.axis.guards import (
+    AxisView,
+    check_acceleration,
+    check_position,
+    check_velocity,
+    no_speed,
+)
 from ldcnd.daemon.axis.permit import QuietDrive
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.reference import ReferenceKeeper
 from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
+from ldcnd.daemon.axis.straight import LineAxis
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
-from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Motion
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Homes, Motion
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import (
     BusError,
@@ -58,7 +65,18 @@ class MotionPlan:
 class MotionPlanner:
     """Plans the motions of one axis."""
 
-    def __init__(self, config: AxisConfig, driver: QuietDrive, scale: Scale) -> None:
+    def __init__(
+        self, config: AxisConfig, driver: QuietDrive, scale: Scale, speed_share: Callable[[], float] = lambda: 1.0
+    ) -> None:
+        """Plan by this configuration.
+
+        Args:
+            config: of the axis.
+            driver: of its drive.
+            scale: between counts and axis units.
+            speed_share: returns the share of every velocity that the speed override of the rig leaves.
+        """
+        self._speed_share = speed_share
         self._config = config
         self._driver = driver
         self._scale = scale
@@ -121,10 +139,8 @@ class MotionPlanner:
                 value=0.0,
                 remedy=Remedy("{}", step("halt")),
             )
-        _, rate = self._checked(view, velocity, acceleration)
-        motion = self._driver.quantise(
-            Motion(None, self._scale.to_counts(velocity), rate * self._scale.counts_per_unit)
-        )
+        speed, rate = self._checked(view, velocity, acceleration)
+        motion = self._driver.quantise(Motion(None, self._scale.to_counts(speed), rate * self._scale.counts_per_unit))
         return MotionPlan(
             motion,
             None,
@@ -143,7 +159,18 @@ class MotionPlanner:
         rate = self._config.acceleration if acceleration is None else acceleration
         check_velocity(view, self._config.limits, speed)
         check_acceleration(view, self._config.limits, rate)
-        return speed, rate
+        share = self._speed_share()
+        if share <= 0:
+            raise no_speed(view.name)
+        return speed * share, rate
+
+
+def both_s(first: MotionPlan, goal: MotionPlan) -> float:
+    """Return how long a motion and the approach that follows it take, without settling."""
+    way = abs((goal.motion.target_counts or 0) - (first.motion.target_counts or 0))
+    motion = goal.motion
+    last_s = profile_duration_s(way, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
+    return (first.duration_s or 0.0) + last_s
 
 
 def profile_duration_s(distance: float, velocity: float, acceleration: float) -> float:
@@ -159,6 +186,8 @@ class AxisMotion:
     Attributes:
         reading: the latest; None before the first.
         target_counts: where the last motion was told to end; None when it had no end or something came after it.
+        approached: that motion came from the side that the configuration names.
+        speed_share: of every velocity, by the speed override of the rig; 0 to 1.
     """
 
     def __init__(
@@ -193,16 +222,18 @@ class AxisMotion:
         self.telemetry = telemetry
         self.clock = clock
         self.read = read
-        self.planner = MotionPlanner(config, driver, scale)
+        self.speed_share = 1.0
+        self.planner = MotionPlanner(config, driver, scale, lambda: self.speed_share)
         self.reading: AxisReading | None = None
         self.target_counts: int | None = None
+        self.approached = False
         self._loop = asyncio.get_running_loop()
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Plan with other limits and speeds from now on."""
         self.config = config
         self._window_counts = window_counts(config)
-        self.planner = MotionPlanner(config, self.driver, self.scale)
+        self.planner = MotionPlanner(config, self.driver, self.scale, lambda: self.speed_share)
 
     def latest(self) -> AxisReading:
         """Return the latest reading.
@@ -269,6 +300,56 @@ class AxisMotion:
             acceleration=acceleration,
         )
 
+    def before_approach(
+        self, goal: MotionPlan, velocity: float | None, acceleration: float | None
+    ) -> MotionPlan | None:
+        """Return the motion from which on a goal is approached from its side; None when one motion to it will do.
+
+        Args:
+            goal: the motion to it.
+            velocity: that was asked for; None for the default of the axis.
+            acceleration: likewise.
+
+        Raises:
+            PositionLimit: that motion would leave the software limits.
+        """
+        approach = self.config.approach
+        if approach is None or goal.position is None:
+            return None
+        forward = approach.direction == "positive"
+        here_counts = self.target_counts
+        here = self.telemetry.position(self.latest().position_counts if here_counts is None else here_counts)
+        way = goal.position - here if forward else here - goal.position
+        if way >= approach.distance or (way >= 0 and self.approached and here_counts is not None):
+            return None
+        begin = goal.position - (approach.distance if forward else -approach.distance)
+        return self.plan_to(begin, velocity, acceleration)
+
+    def on_line(self, plan: MotionPlan) -> LineAxis:
+        """Return the share of this axis in a straight line that ends where a plan does, no faster than the plan."""
+        motion, here = plan.motion, self.target_counts
+        return LineAxis(
+            from_counts=self.latest().position_counts if here is None else here,
+            target_counts=motion.target_counts or 0,
+            counts_per_unit=self.scale.counts_per_unit,
+            most_velocity=motion.velocity_counts_per_s,
+            most_acceleration=motion.acceleration_counts_per_s2,
+            quantise=self.driver.quantise,
+            cycle_s=self.driver.capture_s if isinstance(self.driver, Homes) else 0.0,
+        )
+
+    def replanned(self, plan: MotionPlan, motion: Motion) -> MotionPlan:
+        """Return a plan with another velocity and acceleration, to the same target."""
+        share = self.on_line(replace(plan, motion=motion))
+        counts_per_unit = self.scale.counts_per_unit
+        return replace(
+            plan,
+            motion=motion,
+            velocity=motion.velocity_counts_per_s / counts_per_unit,
+            acceleration=motion.acceleration_counts_per_s2 / counts_per_unit,
+            duration_s=profile_duration_s(share.way, share.most_velocity, share.most_acceleration),
+        )
+
     async def start(
         self,
         turn: Turn,
@@ -303,7 +384,7 @@ class AxisMotion:
         plan: MotionPlan | None = None,
     ) -> None:
         """Say what the axis is about to do; readings count again once `AxisTracker.started` was called."""
-        self.target_counts = None
+        self.target_counts, self.approached = None, False
         target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
         now_ns = self.clock.now_ns()
         settling = self._settling(plan) if plan and completion is Completion.PROFILE else None
@@ -360,11 +441,12 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
     name = motion.config.name
     try:
         plan = _plan(motion, request)
+        first = motion.before_approach(plan, request.velocity, request.acceleration)
     except MalformedRequest:
         raise
     except RequestRefused as error:
         return PreviewReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
-    exchanges = motion.driver.exchanges(plan.motion)
+    exchanges = [each for leg in (first, plan) if leg for each in motion.driver.exchanges(leg.motion)]
     asked_velocity = motion.config.velocity if request.velocity is None else request.velocity
     asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
     return PreviewReply(
@@ -372,11 +454,12 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
         refusal=None,
         obstacles=obstacles,
         position=motion.shown(plan.position),
+        approach_from=motion.shown(first.position) if first else None,
         velocity=plan.velocity,
         velocity_error=plan.velocity - asked_velocity,
         acceleration=plan.acceleration,
         acceleration_error=plan.acceleration - asked_acceleration,
-        duration_s=plan.duration_s,
+        duration_s=both_s(first, plan) if first else plan.duration_s,
         packets=tuple(exchange.request.hex(" ") for exchange in exchanges),
         bus_s=sum(bus.longest_s(exchange) for exchange in exchanges),
     )

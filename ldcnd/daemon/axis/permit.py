@@ -193,12 +193,24 @@ class Permit:
         """Raise when nothing of this command may move the axis now.
 
         Raises:
-            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop.
+            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
+                speed override of 0.
         """
         self.to_move()()
 
     def to_move(self) -> Condition:
         """Return what `ask_to_move` asks now, to be asked again when a packet's turn has come."""
+        energise, tracker = self._to_energise(), self._gate.tracker
+
+        def condition() -> None:
+            energise()
+            if tracker.speed_share <= 0:
+                raise guards.no_speed(tracker.name)
+
+        return condition
+
+    def _to_energise(self) -> Condition:
+        """Return what is asked before the loop is closed."""
         begun = self._begun
 
         def condition() -> None:
@@ -217,7 +229,7 @@ class Permit:
 
     async def start(self) -> None:
         """Start what was loaded; see `Moves.start`."""
-        with self._beginning():
+        with self._beginning(self.to_move()):
             await self._gate.driver.start()
 
     async def track(self, position_counts: int) -> None:
@@ -225,15 +237,15 @@ class Permit:
         drive = self._gate.driver
         if not isinstance(drive, Tracks):
             raise cannot(drive.spec, "track")
-        with self._beginning():
+        with self._beginning(self.to_move()):
             await drive.track(position_counts)
 
     async def power_on(self) -> None:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
-        self.ask_to_move()
+        self._to_energise()()
         was_on = self._gate.tracker.enabled
         try:
-            with self._beginning():
+            with self._beginning(self._to_energise()):
                 await self._gate.driver.power(on=True)
             self.still_wanted()
         except RequestRefused:
@@ -250,9 +262,8 @@ class Permit:
         with only_while(self.ask):
             await drive.set_gains(gains)
 
-    def _beginning(self) -> only_while:
+    def _beginning(self, condition: Condition) -> only_while:
         """Return the context of the packets that begin a motion; from now on the command is not late any more."""
-        condition = self.to_move()
         self.begun()
         return only_while(condition)
 

@@ -164,7 +164,9 @@ def _ignore(_fault: PastFault) -> None:
     pass
 
 
-StateShown = tuple[Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None]
+StateShown = tuple[
+    Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None, float
+]
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
 """What a value read just now is worth, by the drive's link."""
 
@@ -248,6 +250,7 @@ class AxisTracker:
         self.last_error: str | None = None
         self.active_faults: tuple[FaultEntry, ...] = ()
         self.first_fault: FaultEntry | None = None
+        self.speed_share = 1.0
         self._failure: str | None = None
         self.found: Callable[[PastFault], None] = _ignore
         self.refused = ""
@@ -289,6 +292,7 @@ class AxisTracker:
             self.stop_pending,
             self.command,
             self.last_error,
+            self.speed_share,
         )
 
     @property

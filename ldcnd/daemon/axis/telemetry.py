@@ -135,7 +135,9 @@ class AxisTelemetry:
         """Publish state and faults if they changed, or if they are due anyway."""
         tracker = self._tracker
         shown = tracker.shown()
-        quality, state, enabled, referenced, moving, link, stop_latched, stop_pending, command, last_error = shown
+        quality, state, enabled, referenced, moving, link, stop_latched, stop_pending, command, last_error, share = (
+            shown
+        )
         if due or shown != self._last_state:
             self._last_state = shown
             self._state.publish(
@@ -151,6 +153,7 @@ class AxisTelemetry:
                 stop_pending=stop_pending,
                 command=command and _current(command),
                 last_error=last_error,
+                speed_override=100.0 * share,
             )
         faults = (tracker.active_faults, tracker.first_fault)
         if due or faults != self._last_faults:

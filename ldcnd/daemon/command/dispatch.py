@@ -1,19 +1,20 @@
 """Where commands are admitted and routed: who may, whether again, what became of it; then the axis, then the ledger."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from functools import partial
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Permit, Right
-from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
+from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting, plans_on_line
 from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, Lease
 from ldcnd.daemon.command.ledger import Entry, EventLog, Ledger
 from ldcnd.daemon.command.loss import LeaseWatch, concerned, rehearse
 from ldcnd.daemon.command.why import explain
+from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.modules import ModuleService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import (
@@ -26,6 +27,7 @@ from ldcnd.errors import (
     OutcomeUnknown,
     RequestRefused,
 )
+from ldcnd.log import get_logger
 from ldcnd.messaging.keys import RIG_ITSELF
 from ldcnd.model.commands import (
     AxisCommand,
@@ -46,20 +48,29 @@ from ldcnd.model.events import CommandOutcome, CommandStatus, ReadEvents, ReadOu
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.rig_commands import (
     Acquire,
+    AxisShare,
+    GroupMoves,
     Holder,
     HolderList,
     LeaseReply,
+    LinePath,
     ListHolders,
     MoveTogether,
     MoveTogetherReply,
+    PreviewTogether,
+    PreviewTogetherReply,
     ReadWireLog,
     Rehearse,
     Release,
     Renew,
     SetIo,
     SetIoTimer,
+    SetSpeedOverride,
     Snapshot,
+    SpeedOverrideReply,
 )
+
+log = get_logger("commands")
 
 
 class Dispatcher:
@@ -116,7 +127,11 @@ class Dispatcher:
                 why = self.why(self._rig.axis(axis), Why(absolute=command.position is not None))
                 return self._rig.axis(axis).preview(command, tuple(cause.text for cause in why.causes))
             case MoveTogether():
-                return MoveTogetherReply(replies=await self._move_together(command, login))
+                return await self._move_together(command, login)
+            case SetSpeedOverride():
+                return await self._set_speed_override(command)
+            case PreviewTogether():
+                return preview_together(self._rig, command)
             case Snapshot():
                 return await self._rig.line(command.bus).snapshot(self._clock)
             case SetIo():
@@ -297,11 +312,41 @@ class Dispatcher:
                 remedy="end one of the two daemons",
             )
 
-    async def _move_together(self, command: MoveTogether, login: str | None) -> tuple[CommandReply, ...]:
-        moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in command.moves}
-        if len(moves) < len(command.moves):
-            raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
-        return await move_together(self._rig, moves, partial(self.carry_out, login=login))
+    async def _set_speed_override(self, command: SetSpeedOverride) -> SpeedOverrideReply:
+        """Scale the velocities of all axes; to lower them needs no right, as a stop needs none."""
+        share = command.percent / 100.0
+        axes = [self._rig.axis(name) for name in self._rig.axes]
+        if any(share > axis.tracker.speed_share for axis in axes):
+            for name in self._rig.axes:
+                self._refuse_rival(name)
+                holder = self.authority.holder(name)
+                own = holder.token if holder and holder.token in command.leases else None
+                self.authority.admit(name, own, None, self._clock.now_s())
+        log.info("speed override", percent=command.percent, client=command.client)
+        changed, halted = [], []
+
+        async def change(axis: AxisService) -> None:
+            name = axis.config.name
+            try:
+                other_speed, at_rest = await axis.set_speed_share(share)
+            except LdcndError as error:
+                log.warning("motion goes on at its speed", axis=name, reason=error.message)
+                return
+            if other_speed:
+                changed.append(name)
+            if at_rest:
+                halted.append(name)
+
+        async with asyncio.TaskGroup() as group:
+            for axis in axes:
+                group.create_task(change(axis), name=f"speed override {axis.config.name}")
+        return SpeedOverrideReply(percent=command.percent, changed=tuple(sorted(changed)), halted=tuple(sorted(halted)))
+
+    async def _move_together(self, command: MoveTogether, login: str | None) -> MoveTogetherReply:
+        moves = _shares(command)
+        execute = partial(self.carry_out, login=login)
+        straight = command.path is LinePath.LINEAR
+        return await move_together(self._rig, moves, execute, straight=straight, max_deviation=command.max_deviation)
 
     # -- the rig as a whole; nothing here moves anything -----------------------------------------------------------
 
@@ -370,25 +415,31 @@ Execute = Callable[[str, AxisCommand[CommandReply]], Awaitable[CommandReply]]
 """Carries out a command of an axis, with whatever the daemon asks before it does."""
 
 
-async def move_together(rig: Rig, moves: Mapping[str, MoveAbsolute], execute: Execute) -> tuple[CommandReply, ...]:
+async def move_together(
+    rig: Rig,
+    moves: Mapping[str, MoveAbsolute],
+    execute: Execute,
+    *,
+    straight: bool = False,
+    max_deviation: float | None = None,
+) -> MoveTogetherReply:
     """Start absolute moves of several axes together; returns once every drive has proven that it started.
 
     Args:
         rig: the daemon's.
         moves: by axis name; exactly the members of one configured group.
         execute: how a single command is carried out.
+        straight: they keep to a straight line.
+        max_deviation: the line is refused if they would leave it by more, in axis units.
 
     Raises:
         UnknownAxis: there is no such axis.
         NotSupported: the axes are on different lines, or are no group.
-        RequestRefused: a member cannot move; nothing was started.
+        RequestRefused: a member cannot move, or they would leave the line; nothing was started.
         BusError: the line failed; `OutcomeUnknown` when a drive may have started, then all were told to stop.
     """
-    lines = {bus for bus in rig.buses for name in moves if rig.axis(name) in bus.axes}
-    if len(lines) != 1:
-        raise NotSupported(f"axes {', '.join(moves)} are not on one line, so they cannot start together")
-    (line,) = lines
-    meeting = Meeting(line.network, frozenset(moves))
+    line = _line_of(rig, moves)
+    meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)
 
     async def take_part(name: str, move: MoveAbsolute) -> CommandReply | LdcndError:
         try:
@@ -405,4 +456,51 @@ async def move_together(rig: Rig, moves: Mapping[str, MoveAbsolute], execute: Ex
         if isinstance(result, LdcndError):
             raise meeting.failure or result
         replies.append(result)
-    return tuple(replies)
+    return MoveTogetherReply(replies=tuple(replies), deviation=meeting.deviation)
+
+
+def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply:
+    """Plan moves of a group without sending anything.
+
+    Raises:
+        UnknownAxis, NotSupported, RequestRefused: as `move_together`, but for what is in the way only now.
+    """
+    moves = _shares(request)
+    _line_of(rig, moves)
+    axes = {name: rig.axis(name).planned(move) for name, move in moves.items()}
+    plans, deviation = {name: plan for name, (_, plan) in axes.items()}, None
+    if request.path is LinePath.LINEAR:
+        plans, deviation = plans_on_line(axes, request.max_deviation)
+    shares = tuple(
+        AxisShare(
+            axis=name,
+            position=axes[name][0].shown(plan.position) or 0.0,
+            velocity=plan.velocity,
+            acceleration=plan.acceleration,
+            duration_s=plan.duration_s or 0.0,
+        )
+        for name, plan in plans.items()
+    )
+    longest_s = max(share.duration_s for share in shares)
+    return PreviewTogetherReply(shares=shares, duration_s=longest_s, deviation=deviation)
+
+
+def _shares(command: GroupMoves) -> dict[str, MoveAbsolute]:
+    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in command.moves}
+    if len(moves) < len(command.moves):
+        raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
+    return moves
+
+
+def _line_of(rig: Rig, names: Iterable[str]) -> BusService:
+    """Return the line that all these axes are on.
+
+    Raises:
+        UnknownAxis, NotSupported: as `move_together`.
+    """
+    wanted = list(names)
+    lines = {bus for bus in rig.buses for name in wanted if rig.axis(name) in bus.axes}
+    if len(lines) != 1:
+        raise NotSupported(f"axes {', '.join(wanted)} are not on one line, so they cannot start together")
+    (line,) = lines
+    return line

@@ -10,6 +10,7 @@ import { command, controls, release, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { endpoints, useRigs } from "../session/rigs.js";
 import { GroupMoves } from "./rig_groups.js";
+import { SpeedOverride } from "./rig_speed.js";
 
 const COLUMNS = ["Axis", "State", "Position", "Velocity", "Target", "A/D", "Faults", "Values", "Control", "Commands"];
 const FULL = 0.9;
@@ -76,6 +77,7 @@ function RigSection({ rig }) {
     </header>
     ${rig.worth && html`<p class="notice mark" data-level="bad">${rig.worth.why} The values below are the last known ones.</p>`}
     <${RigCommands} rig=${rig} />
+    <${SpeedOverride} rig=${rig} />
     <${GroupMoves} rig=${rig} />
     ${[...rig.buses.values()].map((bus) => html`<${BusSection} key=${bus.name} rig=${rig} bus=${bus} />`)}
   </section>`;

@@ -1,9 +1,9 @@
 /** Moves of a group: axes that start in the same servo cycle, or none of them. */
 
 import { html, useId, useState } from "../html.js";
-import { Action, enterSends, Field, Panel, Reason } from "../parts/controls.js";
+import { Action, enterSends, Field, Panel, Reason, Tick } from "../parts/controls.js";
 import { decimalsOf, number } from "../parts/format.js";
-import { moveTogether } from "../session/control.js";
+import { moveTogether, previewLine } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 
 /** A panel for each group of a rig. */
@@ -18,6 +18,8 @@ export function GroupMoves({ rig }) {
 function GroupMove({ group, axes }) {
   const [targets, setTargets] = useState({});
   const [speed, setSpeed] = useState(null);
+  const [straight, setStraight] = useState(false);
+  const [line, setLine] = useState(null);
   const reason = useId();
   const hindered = axes.find((axis) => obstacle(axis, "move_absolute"));
   const missing = axes.find(({ name }) => targets[name] === null || targets[name] === undefined);
@@ -33,8 +35,13 @@ function GroupMove({ group, axes }) {
       )}
       <${Field} label="Velocity" unit=${`${axes[0].info.unit}/s`} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
     </div>
-    <p class="row"><${Action} kind="main" act=${() => moveTogether(axes, targets, speed)} obstacle=${way || null}
-      reason=${reason}>Move ${axes.map(({ name }) => name).join(" and ")} together<//></p>
+    <${Tick} label="Straight line: all ramp alike and arrive together" checked=${straight} onChange=${setStraight} />
+    <p class="row"><${Action} kind="main" act=${() => moveTogether(axes, targets, speed, straight)} obstacle=${way || null}
+      reason=${reason}>Move ${axes.map(({ name }) => name).join(" and ")} together<//>
+      ${straight && html`<${Action} act=${async () => setLine(await previewLine(axes, targets, speed))} obstacle=${missing ? way : null}
+        reason=${reason}>Preview the line<//>`}</p>
+    ${straight && line && html`<p role="status">${number(line.duration_s, 2)} s, at most
+      ${number(line.deviation, 4)} ${axes[0].info.unit} from the line.</p>`}
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
 }

@@ -77,13 +77,25 @@ export function command(axis, verb, body = {}, patienceMs = undefined) {
 }
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
-export function moveTogether(axes, targets, velocity) {
+export function moveTogether(axes, targets, velocity, straight = false) {
   for (const axis of axes) noteMoved(axis);
-  const moves = axes.map((axis) => ({
-    ...given({ axis: axis.name, position: targets[axis.name], velocity }),
-    command_id: crypto.randomUUID(),
-  }));
-  return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves });
+  const moves = shares(axes, targets, velocity).map((move) => ({ ...move, command_id: crypto.randomUUID() }));
+  return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
+}
+
+/** Scale every velocity of a rig, in percent; 0 halts what moves. */
+export function setSpeedOverride(rig, percent) {
+  return ask(`${rigPath(rig.name)}/rig/set_speed_override`, { percent });
+}
+
+/** Ask how long a straight line would take and how far from it the axes would get; no effect. */
+export function previewLine(axes, targets, velocity) {
+  const moves = shares(axes, targets, velocity);
+  return ask(`${rigPath(axes[0].rig.name)}/rig/preview_together`, { moves, path: "linear" });
+}
+
+function shares(axes, targets, velocity) {
+  return axes.map(({ name }) => given({ axis: name, position: targets[name], velocity }));
 }
 
 /** Ask a rig for what concerns a whole line; the console adds this page's leases. */

@@ -5,6 +5,7 @@ others have arrived; then the line starts them together, or none of them moves.
 """
 
 import asyncio
+from collections.abc import Mapping
 
 from typing_extensions import override
 
@@ -13,9 +14,10 @@ from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.permit import start_together
 from ldcnd.daemon.axis.procedure import Procedure, Turn
 from ldcnd.daemon.axis.state import Completion
+from ldcnd.daemon.axis.straight import straight_line
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.network import Network
-from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, WrongState
+from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
 from ldcnd.model.commands import CommandReply, MoveAbsolute
 from ldcnd.model.samples import AxisState
 
@@ -41,11 +43,51 @@ class GroupMoveRequest(MoveAbsolute):
         return self._meeting
 
 
-class Meeting:
-    """Where the members of one group move wait until all have their turns, and where it is started once."""
+def plans_on_line(
+    axes: Mapping[str, tuple[AxisMotion, MotionPlan]], max_deviation: float | None
+) -> tuple[dict[str, MotionPlan], float]:
+    """Return the plans of moves that keep to a straight line, and how far from it they get, in axis units.
 
-    def __init__(self, network: Network, names: frozenset[str]) -> None:
+    Args:
+        axes: and what each of them would do by itself.
+        max_deviation: from the line; None for any.
+
+    Raises:
+        ValueOutOfRange: they would get farther from the line than that.
+    """
+    line = straight_line({name: motion.on_line(plan) for name, (motion, plan) in axes.items()})
+    if max_deviation is not None and line.deviation > max_deviation:
+        raise ValueOutOfRange(
+            f"axes {', '.join(sorted(axes))} would leave the line by {line.deviation:.4g}, more than {max_deviation:g}",
+            value=line.deviation,
+            limit=max_deviation,
+            remedy="move more slowly, or allow more",
+        )
+    return {name: motion.replanned(plan, line.motions[name]) for name, (motion, plan) in axes.items()}, line.deviation
+
+
+class Meeting:
+    """Where the members of one group move wait until all have their turns, and where it is started once.
+
+    Attributes:
+        deviation: how far from a straight line they get; None until they are started, and when they keep to none.
+    """
+
+    def __init__(
+        self, network: Network, names: frozenset[str], *, straight: bool = False, max_deviation: float | None = None
+    ) -> None:
+        """Wait for these axes.
+
+        Args:
+            network: of their line.
+            names: of the members.
+            straight: they keep to a straight line.
+            max_deviation: the line is refused if they would leave it by more, in axis units.
+        """
+        self.deviation: float | None = None
         self._network = network
+        self._straight = straight
+        self._max_deviation = max_deviation
         self._missing = set(names)
         self._members: dict[str, GroupMember] = {}
         self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -81,8 +123,13 @@ class Meeting:
             raise late from None
 
     async def _start(self) -> None:
-        motions = {name: member.plan.motion for name, member in self._members.items()}
         try:
+            if self._straight:
+                axes = {name: (member.motion, member.plan) for name, member in self._members.items()}
+                plans, self.deviation = plans_on_line(axes, self._max_deviation)
+                for name, member in self._members.items():
+                    member.plan = plans[name]
+            motions = {name: member.plan.motion for name, member in self._members.items()}
             permits = [member.turn.permit for member in self._members.values()]
             await start_together(self._network, motions, permits, self._about_to_start)
         except LdcndError as error:
@@ -108,7 +155,7 @@ class GroupMember(Procedure):
     def __init__(self, motion: AxisMotion, turn: Turn, request: GroupMoveRequest) -> None:
         self.turn = turn
         self.plan: MotionPlan
-        self._motion = motion
+        self.motion = motion
         self._request = request
         self._announced = False
 
@@ -118,7 +165,7 @@ class GroupMember(Procedure):
         Raises:
             LdcndError: as `move_absolute`, or because another member could not.
         """
-        meeting, motion = self._request.meeting, self._motion
+        meeting, motion = self._request.meeting, self.motion
         try:
             view = motion.tracker.view()
             guards.check_may_move(view)
@@ -144,7 +191,7 @@ class GroupMember(Procedure):
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""
         self._announced = True
-        self._motion.begin(
+        self.motion.begin(
             self.turn.command_id, self.turn.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=self.plan
         )
 
@@ -158,7 +205,7 @@ class GroupMember(Procedure):
 
     def _not_started(self, error: LdcndError) -> None:
         """Let the readings tell after an unknown outcome; otherwise the axis is where it was."""
-        motion = self._motion
+        motion = self.motion
         if not self._announced:
             return
         if isinstance(error, OutcomeUnknown):

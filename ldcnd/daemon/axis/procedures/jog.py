@@ -120,7 +120,7 @@ class HeldJog(Procedure):
         self.turn = turn
         self._motion = motion
         self._hold = hold
-        self._wanted: tuple[float, float | None] = (0.0, None)  # velocity and acceleration at which it runs
+        self._wanted: tuple[float, float | None, float] = (0.0, None, 1.0)  # at what it runs: see `_asked`
         self._phase = _Phase.RESTS
         self._extend_at_s = math.inf
 
@@ -183,15 +183,16 @@ class HeldJog(Procedure):
         return True
 
     @property
-    def _asked(self) -> tuple[float, float | None]:
-        return self._hold.velocity, self._hold.acceleration
+    def _asked(self) -> tuple[float, float | None, float]:
+        """Velocity and acceleration, and the share of the velocity that the speed override leaves."""
+        return self._hold.velocity, self._hold.acceleration, self._motion.speed_share
 
     async def _run(self) -> CommandReply:
         """Have the drive run to a goal that is as far ahead as it may be."""
         motion, asked = self._motion, self._asked
         here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
         self.turn.permit.ask_to_move()
-        plan, velocity, reach_s, at_limit = self._plan(motion.telemetry.position(here), *asked)
+        plan, velocity, reach_s, at_limit = self._plan(motion.telemetry.position(here), *asked[:2])
         await self.turn.permit.load(plan.motion)
         self._wanted = asked
         self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if nobody knows whether the drive has started
@@ -209,7 +210,7 @@ class HeldJog(Procedure):
         forward = velocity > 0
         longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
         reach_s = min(self._reach_s, longest_s)
-        way = abs(velocity) * reach_s + velocity * velocity / (2 * steady.acceleration)
+        way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
         end = here + way if forward else here - way
         at_limit = False
         if view.referenced:

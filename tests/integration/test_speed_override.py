@@ -1,0 +1,137 @@
+"""The speed override of a rig: motions that begin, motions under way, and nothing at 0."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.errors import LeaseHeld, WrongState
+from ldcnd.model.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, Preview, SetPwm, Track
+from ldcnd.model.rig_commands import Acquire, SetSpeedOverride
+from ldcnd.model.samples import AxisState
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
+
+dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+PWM = {"duty": 0.1, "duration_s": 5.0}
+TRACKING = {"step": 0.5, "rate": 50}
+MOTIONS = [
+    MoveAbsolute(position=1.0),
+    MoveRelative(distance=1.0),
+    MoveVelocity(velocity=1.0),
+    Jog(velocity=1.0),
+    Home(method="index", velocity=1.0),
+    SetPwm(duty=0.05, duration_s=1.0),
+]
+
+
+async def override(rig, percent, **more):
+    return await rig.rig.client.ask(SetSpeedOverride(percent=percent, **more))
+
+
+async def speed(rig):
+    """Return how fast the shaft turns, mm/s, over a tenth of a second."""
+    loop = asyncio.get_running_loop()
+    rig.drive.catch_up(loop.time())
+    before = rig.position_mm
+    await asyncio.sleep(0.1)
+    rig.drive.catch_up(loop.time())
+    return (rig.position_mm - before) / 0.1
+
+
+@dialects
+async def test_motions_that_begin_have_their_share_of_the_velocity_and_say_so(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await override(rig, 25)
+        said = await rig.rig.client.ask(Preview(position=10.0, velocity=8.0), AXIS)
+        reply = await rig.send(MoveAbsolute(position=10.0, velocity=8.0))
+        await asyncio.sleep(0.5)
+        measured = await speed(rig)
+        state = await rig.rig.client.state(AXIS)
+        await rig.until(lambda state: state.command is None)
+
+        assert (reply.velocity, said.velocity) == (pytest.approx(2.0, abs=0.01),) * 2
+        assert measured == pytest.approx(2.0, abs=0.1)
+        assert state.speed_override == 25.0
+        assert rig.position_mm == pytest.approx(10.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("dialect", "goes_on_at"), [(SC, 2.0), (V4, 8.0), (LS_182AP, 8.0)], ids=str)
+async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_ends_at_its_goal(dialect, goes_on_at):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
+        await asyncio.sleep(0.3)
+        said = await override(rig, 25)
+        await asyncio.sleep(0.3)
+        measured = await speed(rig)
+        state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+
+        assert measured == pytest.approx(goes_on_at, abs=0.2)
+        assert said.changed == ((AXIS,) if dialect is SC else ())
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        assert rig.position_mm == pytest.approx(15.0, abs=0.02)
+
+
+async def test_a_jog_under_way_changes_its_speed_with_any_drive():
+    for dialect in (SC, LS_182AP):
+        async with dialect_rig(dialect) as rig:
+            await rig.power_on()
+            jog = await rig.send(Jog(velocity=8.0, hold_s=1.0))
+            await override(rig, 50)
+            for _ in range(4):
+                await asyncio.sleep(0.2)
+                await rig.send(Jog(velocity=8.0, hold_s=1.0, renews=jog.command_id))
+            assert await speed(rig) == pytest.approx(4.0, abs=0.3)
+
+
+@dialects
+async def test_at_0_percent_what_moves_halts_nothing_begins_and_nothing_goes_on_by_itself(dialect):
+    async with dialect_rig(dialect, pwm=PWM, tracking=TRACKING) as rig:
+        await rig.power_on()
+        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
+        await asyncio.sleep(0.3)
+        said = await override(rig, 0)
+        state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+        await rig.until(lambda state: state.command is None)
+        here = round((await rig.rig.client.position(AXIS)).value, 3)
+        for motion in (*MOTIONS, Track(position=here)):
+            with pytest.raises(WrongState, match="0 %"):
+                await rig.send(motion)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+        stood = rig.position_mm
+        await override(rig, 100)
+        await asyncio.sleep(2.0)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+
+        assert said.halted == (AXIS,)
+        assert state.speed_override == 0.0
+        assert stood < 5.0
+        assert rig.position_mm == pytest.approx(stood, abs=0.02)
+
+
+async def test_at_0_percent_the_loop_may_be_closed():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.until(lambda state: state.state is AxisState.DISABLED)
+        await override(rig, 0)
+        await rig.send(Power(on=True))
+        assert (await rig.until(lambda state: state.enabled)).state is AxisState.STANDSTILL
+
+
+async def test_a_move_that_waits_is_not_begun_at_0_percent():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=5.0, velocity=5.0))
+        waiting = asyncio.create_task(rig.send(MoveAbsolute(position=10.0, buffer_mode="buffered")))
+        await asyncio.sleep(0.2)
+        await override(rig, 0)
+        with pytest.raises(Exception, match=r"overtaken|0 %"):
+            await waiting
+
+
+async def test_anyone_may_lower_it_and_raising_it_needs_control():
+    async with dialect_rig(LS_182AP) as rig:
+        held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))
+        await override(rig, 10)
+        with pytest.raises(LeaseHeld):
+            await override(rig, 50)
+        assert (await override(rig, 50, leases=(held.lease,))).percent == 50
