@@ -15,7 +15,7 @@ acceleration = 200
 limits = {{ position_min = -100, position_max = 100, velocity = 50, acceleration = 1000 }}
 gains = {{ kp = 350, kd = 3000, ki = 400, il = 400, ol = 250, el = 4000 }}
 home = {{ method = "index", velocity = 1 }}
-rates = {{ position = 5, velocity = 5, adc = 1, state = 5 }}
+rates = {{ position = 3, velocity = 3, adc = 0.5, state = 3 }}
 loss = {{ bus = "{loss}" }}
 """
 LINE = """
