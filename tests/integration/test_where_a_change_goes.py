@@ -12,6 +12,8 @@ import pytest
 
 from tests.support.process import ROOT
 
+pytestmark = pytest.mark.timeout(240)  # two programs start in it, on a machine that may do much else
+
 PROGRAM = """
 import asyncio, json
 from ldcnd.cli.quantities import sample_text
