@@ -41,7 +41,7 @@ LEAST_TESTS = 3
 """Fewest tests for a mutant, where so many run the line: the budget may be less than what one of them costs."""
 MEMORY_BYTES = 4 << 30
 """Address space of a fork: a mutant that appends for ever ends here."""
-FRESH_TESTS = 40
+FRESH_TESTS = 200
 """Most tests for a mutant that needs a pytest of its own."""
 KILLED = RECORDS / "killed.jsonl"
 """What was killed by which test."""

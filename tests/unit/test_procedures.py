@@ -30,6 +30,7 @@ from ldcnd.model.commands import (
     Home,
     HomeMethod,
     HomeStop,
+    Jog,
     MoveAbsolute,
     MoveAnalog,
     MoveVelocity,
@@ -938,6 +939,44 @@ async def test_a_relative_move_counts_from_the_target_of_a_group_move():
 
         assert one.axis._motion.target_counts == 10_000
         assert replace(one.drive.shown).position_counts == 10_004
+
+
+# -- jogs that a hand holds --------------------------------------------------------------------------------------------
+
+
+async def test_a_jog_that_is_being_stopped_takes_no_renewal():
+    refused = []
+
+    async def renewed() -> None:
+        with pytest.raises(LeaseExpired) as error:
+            bench.axis.renew_jog(Jog(velocity=5.0), "jog")
+        refused.append(error.value.value)
+
+    async with axis_bench() as bench:
+        await bench.send(Jog(velocity=5.0, hold_s=0.5), "jog")
+        await bench.pass_s(0.1, **RUNNING)
+        bench.drive.during["stop"] = renewed
+        await asyncio.sleep(0.5)
+        await bench.settled()
+
+        assert refused == ["jog"]
+        assert bench.drive.calls == ["load", "start", "stop"]
+
+
+async def test_a_jog_that_turns_round_on_a_drive_that_must_stand_for_it_waits_until_it_stands():
+    async with axis_bench() as bench:
+        await bench.send(Jog(velocity=5.0, hold_s=1.0), "jog")
+        await bench.pass_s(0.1, **RUNNING)
+        bench.axis.renew_jog(Jog(velocity=-5.0, hold_s=1.0), "jog")
+        await bench.pass_s(0.01, **RUNNING)
+        assert bench.drive.calls == ["load", "start", "stop"]
+
+        await bench.pass_s(0.1, profile_done=True, velocity_counts_per_s=5000.0)
+        assert bench.drive.calls == ["load", "start", "stop"]  # the profile is done, the shaft still follows it
+        for _ in range(6):
+            await bench.pass_s(0.1, **STANDING)
+        assert bench.drive.calls == ["load", "start", "stop", "load", "start"]
+        assert loads(bench)[1].target_counts < 0
 
 
 # -- probes ------------------------------------------------------------------------------------------------------------
