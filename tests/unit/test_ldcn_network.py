@@ -368,6 +368,23 @@ async def test_after_a_search_for_newcomers_all_are_at_the_working_rate_also_whe
         assert await line.bus.execute(read_status(Node(1, LS_182AP), StatusItem.AUX))
 
 
+async def test_a_line_is_not_taken_down_again_and_again_for_a_drive_that_stays_dark():
+    chain = chain_of("ls182ap", "picservo-v4", "picservo-v4")
+    async with bare_network(chain, specs("ls-182ap", "pic-servo-v4", "pic-servo-v4")) as line:
+        await line.network.bring_up()
+        chain.modules[2].power(on=False, at_s=asyncio.get_running_loop().time())
+        await restart(chain, line, 2)
+        with contextlib.suppress(ReplyTimeout):
+            await line.bus.execute(read_status(Node(3, PIC_SERVO_V4), StatusItem.AUX))
+        assert await line.network.rejoin(lambda _: None) == {"a2"}
+        seen = len(line.sent())
+
+        for _ in range(8):
+            assert await line.network.rejoin(lambda _: None) == set()
+
+        assert Command.SET_BAUD_RATE not in {packet.command for packet in line.sent(seen)}
+
+
 @pytest.mark.parametrize(("baud", "hears"), [(19_200, True), (57_600, False)])
 async def test_on_a_port_with_one_rate_newcomers_are_looked_for_only_at_the_rate_of_power_up(baud, hears):
     chain = chain_of("ls182ap", "picservo-v4")
