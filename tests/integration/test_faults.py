@@ -198,7 +198,8 @@ async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_ax
         assert not state.referenced
         assert refusal.value.remedy == "send reset first"
         assert (homed.referenced, homed.last_error) == (True, None)
-        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
+        nearer = MoveAbsolute(position=5.0, velocity=10.0)  # from the index; FAR would lead onto the hard stop
+        assert (await rig.done(nearer)).state is AxisState.STANDSTILL
 
 
 @named((V1, LS_182AP))
