@@ -3,6 +3,7 @@
 Time is virtual, so the figures are those of the simulated drives and of the line, not of this machine.
 """
 
+import argparse
 import asyncio
 from dataclasses import dataclass
 
@@ -84,5 +85,6 @@ async def table() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     with asyncio.Runner(loop_factory=JumpingLoop) as runner:
         runner.run(table())

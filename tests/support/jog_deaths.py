@@ -5,6 +5,7 @@ milliseconds. Each run kills at a random instant of a jog. The daemon stays up w
 adopting the line, after its own death.
 """
 
+import argparse
 import asyncio
 import contextlib
 import random
@@ -289,4 +290,8 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["jog"]:
         asyncio.run(jog(*sys.argv[2:]))
     else:
-        asyncio.run(measure(*map(int, (sys.argv[1:] + ["20", "22"][len(sys.argv[1:]) :]))))
+        parser = argparse.ArgumentParser(description=__doc__)
+        parser.add_argument("runs", type=int, nargs="?", default=20)
+        parser.add_argument("seed", type=int, nargs="?", default=22)
+        options = parser.parse_args()
+        asyncio.run(measure(options.runs, options.seed))

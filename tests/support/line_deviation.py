@@ -4,6 +4,7 @@ Two LS-182AP of one group go 40 mm and 15 mm. "Commanded" is what the profile ge
 what the shafts draw, with what their servos lag behind.
 """
 
+import argparse
 import asyncio
 import math
 
@@ -68,4 +69,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()
