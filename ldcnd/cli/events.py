@@ -8,7 +8,7 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.events import ALARM_HISTORY, UNSETTLED, CommandEvent
+from ldcnd.model.events import ALARM_HISTORY, REFERENCE, UNSETTLED, CommandEvent
 
 
 @click.command()
@@ -37,8 +37,9 @@ def command(target: Target, axis: str | None, count: int, *, follow: bool) -> No
 
 def _show(target: Target, event: CommandEvent) -> None:
     at = datetime.fromtimestamp(event.t / 1e9, UTC).isoformat(timespec="milliseconds")
-    if event.verb in (ALARM_HISTORY, UNSETTLED):
-        target.show(event, f"{at} {event.axis:8} {event.verb:14} {event.code}: {event.reason}")
+    if event.verb in (ALARM_HISTORY, UNSETTLED, REFERENCE):
+        code = f"{event.code}: " if event.code else ""
+        target.show(event, f"{at} {event.axis:8} {event.verb:14} {code}{event.reason}")
         return
     who = f"{event.client or 'unnamed'} ({f'login {event.login}' if event.login else 'not authenticated'})"
     why = f": {event.reason}" if event.reason else ""

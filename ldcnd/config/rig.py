@@ -101,7 +101,8 @@ class RigConfig(Frozen):
     authority: Literal["open", "leased"] = "open"
     """Whether a lease is needed to move anything; readers and stops never need one."""
     state_dir: Path | None = None
-    """Where the daemon keeps what must outlive it, such as the wear of EEPROMs; without it EEPROM is not written."""
+    """Where the daemon keeps what must outlive it: the wear of EEPROMs, faults of axes, and with start = "adopt" \
+their references; without it EEPROM is not written."""
     captures: CapturesConfig = CapturesConfig()
     """Captures that the daemon writes by itself."""
     heartbeat: HeartbeatConfig | None = None

@@ -17,7 +17,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import Halt, MoveRelative, Power, Reset, SetPosition
 from ldcnd.model.samples import LinkState, PositionSample, TelemetryItem
-from tests.support.process import ROOT, answering, client, free_port, process, simulated_terminal
+from tests.support.process import ROOT, START_TIME_S, answering, client, free_port, process, simulated_terminal
 
 pytestmark = pytest.mark.real_time
 
@@ -49,7 +49,7 @@ class Truth:
 
 
 async def _position(rig: RigClient) -> PositionSample:
-    async with rig.samples("x", TelemetryItem.POSITION) as positions, asyncio.timeout(10):
+    async with rig.samples("x", TelemetryItem.POSITION) as positions, asyncio.timeout(START_TIME_S):
         _, sample = await anext(positions)
     assert isinstance(sample, PositionSample)
     return sample
@@ -117,9 +117,8 @@ async def _lives(config: Path, lives: int, dice: random.Random) -> Truth:
     return truth
 
 
-@pytest.mark.parametrize(
-    ("lives", "seed"), [(3, 1), pytest.param(250, None, marks=[pytest.mark.soak, pytest.mark.timeout(3600)])]
-)
+@pytest.mark.timeout(3600)  # two processes start in turn, on however busy a machine
+@pytest.mark.parametrize(("lives", "seed"), [(2, 1), pytest.param(250, None, marks=pytest.mark.soak)])
 async def test_no_reference_that_a_killed_daemon_has_left_is_wrong(tmp_path, lives, seed):
     seed = seed if seed is not None else random.randrange(1_000_000)
     print(f"seed {seed}")
