@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -63,7 +63,9 @@ def pytest_runtest_makereport(
     report = yield
     bench = getattr(item, "funcargs", {}).get("bench")
     if call.when == "call" and report.failed and bench:
-        said = bench.guest.run(f"journalctl -q --no-pager -o short-monotonic -n {JOURNAL_LINES}").stdout
+        said = "the guest does not answer"
+        with suppress(OSError):
+            said = bench.guest.run(f"journalctl -q --no-pager -o short-monotonic -n {JOURNAL_LINES}").stdout
         report.sections.append(("journal of the guest", said))
     return report
 
