@@ -50,6 +50,21 @@ async def test_a_reply_in_pieces_is_one_reply():
     assert bench.statistics.resynchronisations == 0
 
 
+@pytest.mark.parametrize("bytewise", [True, False])
+@pytest.mark.parametrize("repeatable", [True, False])
+@pytest.mark.parametrize("paced", [True, False])
+async def test_whoever_answers_is_known_to_answer_however_the_reply_comes(
+    *, bytewise: bool, repeatable: bool, paced: bool
+):
+    bench = Bench(paced=paced)
+    bench.wire.bytewise = bytewise
+
+    bench.add(1, repeatable=repeatable)
+    await settle()
+
+    assert bench.users.story == ["answered 1", "completed 1"]
+
+
 async def test_timing_brackets_the_reply():
     bench = Bench()
     bench.replies({1: [Say(toy.reply(1), after_s=0.0005)]})
