@@ -53,9 +53,7 @@ async def test_a_reply_in_pieces_is_one_reply():
 @pytest.mark.parametrize("bytewise", [True, False])
 @pytest.mark.parametrize("repeatable", [True, False])
 @pytest.mark.parametrize("paced", [True, False])
-async def test_whoever_answers_is_known_to_answer_however_the_reply_comes(
-    *, bytewise: bool, repeatable: bool, paced: bool
-):
+async def test_any_whole_reply_shows_that_its_node_answers(*, bytewise: bool, repeatable: bool, paced: bool):
     bench = Bench(paced=paced)
     bench.wire.bytewise = bytewise
 
