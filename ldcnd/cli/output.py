@@ -14,6 +14,7 @@ TYPED = {
     "set_gains": "axis gains {axis} --kp KP --el EL",
     "set_outputs": "axis outputs {axis} --limit1 input --limit2 input",
     "move_relative": "axis move {axis} DISTANCE --relative",
+    "jog": "axis jog {axis} VELOCITY",
     "trace_abort": "trace abort {axis}",
     "clear_counter": "axis clear-counter {axis} COUNTER",
     "restart_eeprom_count": "params restart-count {axis}",

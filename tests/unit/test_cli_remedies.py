@@ -18,6 +18,7 @@ PLACEHOLDERS = {
     "AXIS": "x",
     "POSITION": "1",
     "DISTANCE": "1",
+    "VELOCITY": "1",
     "KP": "1",
     "EL": "1",
     "COUNTER": "feedback",

@@ -5,6 +5,8 @@ const PRESSED = {
   home: "home the axis",
   set_position: "set its current position",
   move_relative: "move it by a distance",
+  jog: "hold a button of Jog",
+  set_speed_override: "set the speed override of the rig",
   reset: "press Reset",
   halt: "press Halt",
   set_gains: "write gains, at least kp and el",
