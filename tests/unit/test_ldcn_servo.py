@@ -328,6 +328,22 @@ async def test_a_drive_is_initialised_once_before_its_loop_is_closed():
     assert drive.module.loop.servo_on
 
 
+async def test_a_set_point_and_a_start_are_never_repeated_by_the_line():
+    drive = await powered()
+    await drive.axis.load(THERE)
+    execute, repeatable = drive.bus.execute, []
+
+    async def noted(exchange, *args, **kwargs):
+        repeatable.append(exchange.repeatable)
+        return await execute(exchange, *args, **kwargs)
+
+    drive.bus.execute = noted
+    await drive.axis.track(100)
+    await drive.axis.start()
+
+    assert repeatable[:2] == [False, False]
+
+
 @pytest.mark.parametrize("absolute", [True, False, None])
 def test_the_sensor_is_read_unless_the_drive_is_known_not_to_position_by_it(absolute) -> None:
     drive = Drive()
