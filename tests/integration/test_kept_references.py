@@ -1,9 +1,11 @@
 """What a daemon keeps of its axes for the next one, on drives that outlive it, and what speaks against it."""
 
 import asyncio
+import contextlib
 import errno
 import json
 import os
+import random
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -16,8 +18,8 @@ from ldcnd import durable
 from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import PlainCommand, ResetPosition
-from ldcnd.errors import NotReferenced, WrongState
-from ldcnd.model.commands import Home, MoveAbsolute, MoveRelative, Power, SetPosition
+from ldcnd.errors import LdcndError, NotReferenced, RequestRefused, WrongState
+from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
 from ldcnd.model.events import CommandStatus, ReadEvents
 from ldcnd.model.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain
@@ -446,3 +448,70 @@ async def test_faults_outlive_the_daemon(tmp_path):
 
     assert [fault.code for fault in first] == ["position_error"]
     assert kept[: len(first)] == first
+
+
+# -- killed at any instant ------------------------------------------------
+
+
+async def _random_step(rig: ChainRig, chain: Chain, dice: random.Random, origins: list[float]) -> None:
+    """Do something with x; `origins` are the places of 0 on its counter, in mm, that it may have been told."""
+    state = await rig.client.state("x")
+    assert state is not None
+    if state.state == "error_stop":
+        await rig.client.command("x", Reset())
+    if not state.enabled:
+        await rig.client.command("x", Power(on=True))
+    if not state.referenced or dice.random() < 0.3:
+        told = dice.uniform(-50.0, 50.0)
+        here = drive(chain, 1).loop.position / COUNTS
+        origins.append(here - told)
+        try:
+            await rig.client.command("x", SetPosition(position=told))
+        except RequestRefused:
+            origins.pop()
+            raise
+        del origins[:-1]
+    await asyncio.sleep(dice.choice((0.0, 0.3, 0.7, 2.0)))
+    reply = await rig.client.command("x", MoveRelative(distance=dice.uniform(-9.0, 10.0)))
+    if dice.random() < 0.2:
+        await rig.client.command("x", Halt())
+    elif dice.random() < 0.2:
+        await rig.client.command("x", Power(on=False))
+    else:
+        await rig.client.wait_for_end("x", reply.command_id)
+    await asyncio.sleep(dice.choice((0.0, 0.3, 0.7, 2.0)))
+
+
+async def _live(rig: ChainRig, chain: Chain, dice: random.Random, origins: list[float]) -> None:
+    while True:
+        await asyncio.sleep(0.05)  # a refusal takes no virtual time
+        with contextlib.suppress(LdcndError):
+            await _random_step(rig, chain, dice, origins)
+
+
+@pytest.mark.parametrize(("lives", "seed"), [(12, 5), pytest.param(500, 7, marks=pytest.mark.soak)])
+async def test_whenever_a_daemon_is_killed_no_reference_that_is_believed_is_wrong(tmp_path, lives, seed):
+    dice = random.Random(seed)
+    chain, config = chain_of(), keeping(tmp_path)
+    origins: list[float] = []
+    kept = refused = 0
+    for _ in range(lives):
+        async with rig_on(chain, config) as rig:
+            state = await up(rig, "x")
+            if state.referenced:
+                kept += 1
+                sample = await position_of(rig)
+                believed = sample.counts / COUNTS - sample.value
+                assert min(abs(believed - origin) for origin in origins) < 0.05, (believed, origins)
+                origins = [origin for origin in origins if abs(believed - origin) < 0.05]
+            else:
+                refused += 1
+            living = asyncio.create_task(_live(rig, chain, dice, origins), name="living")
+            await asyncio.sleep(dice.uniform(0.0, 6.0))
+            await rig.kill()
+            living.cancel()
+            await asyncio.wait([living])
+        await asyncio.sleep(dice.choice((0.0, 1.0)))
+
+    print(f"{lives} lives: reference kept {kept} times, refused or not kept {refused} times, wrong never")
+    assert kept > lives / 10

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError
+from ldcnd.errors import LdcndError, RequestRefused
 from ldcnd.model.commands import Halt, MoveRelative, Power, Reset, SetPosition
 from ldcnd.model.samples import LinkState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, START_TIME_S, answering, client, free_port, process, simulated_terminal
@@ -75,7 +75,11 @@ async def _step(rig: RigClient, dice: random.Random, truth: Truth) -> None:
         here = (await _position(rig)).counts / COUNTS_PER_MM
         before = truth.origins
         truth.origins = [*before, here - told]
-        await rig.command("x", SetPosition(position=told))
+        try:
+            await rig.command("x", SetPosition(position=told))
+        except RequestRefused:
+            truth.origins = before
+            raise
         truth.origins = [here - told]
     reply = await rig.command("x", MoveRelative(distance=dice.uniform(-4.0, 6.0)))
     if dice.random() < 0.2:
