@@ -178,7 +178,7 @@ class Deaths:
         async with await asyncio.start_server(network.serve, "127.0.0.1", 0) as server:
             through = server.sockets[0].getsockname()[1] if kind == "network" else self.port
             program = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "tests.support.jog_deaths", "jog", f"tcp/127.0.0.1:{through}", axis,
+                sys.executable, "-m", "tests.support.jog_deaths", "--jog", f"tcp/127.0.0.1:{through}", axis,
                 cwd=ROOT, stdout=PIPE, stderr=DEVNULL,
             )  # fmt: skip
             try:
@@ -286,12 +286,15 @@ async def measure(runs: int, seed: int) -> None:
             print(f"seed {seed}\n{table(rig.late_s)}")
 
 
+def main() -> None:
+    """Measure, or be the program that dies."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=int, nargs="?", default=20)
+    parser.add_argument("seed", type=int, nargs="?", default=22)
+    parser.add_argument("--jog", nargs=2, metavar=("ENDPOINT", "AXIS"), help="jog until killed")
+    asked = parser.parse_args()
+    asyncio.run(jog(*asked.jog) if asked.jog else measure(asked.runs, asked.seed))
+
+
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["jog"]:
-        asyncio.run(jog(*sys.argv[2:]))
-    else:
-        parser = argparse.ArgumentParser(description=__doc__)
-        parser.add_argument("runs", type=int, nargs="?", default=20)
-        parser.add_argument("seed", type=int, nargs="?", default=22)
-        options = parser.parse_args()
-        asyncio.run(measure(options.runs, options.seed))
+    main()

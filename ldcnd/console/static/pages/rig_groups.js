@@ -26,7 +26,7 @@ function GroupMove({ group, axes }) {
   const way = hindered
     ? `${hindered.name}: ${obstacle(hindered, "move_absolute")}`
     : missing && `The position of ${missing.name} is missing.`;
-  return html`<${Panel} title=${`Group ${group}`} note="All start in the same servo cycle, or none.">
+  return html`<${Panel} title=${`Group ${group}`} note="All start in the same servo cycle, or none; on a straight line they ramp alike and arrive together.">
     <div class="fields" onKeyDown=${enterSends}>
       ${axes.map(
         ({ name, info, samples }) => html`<${Field} key=${name} label=${`${name} to`} unit=${info.unit} value=${targets[name]}
@@ -35,7 +35,7 @@ function GroupMove({ group, axes }) {
       )}
       <${Field} label="Velocity" unit=${`${axes[0].info.unit}/s`} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
     </div>
-    <${Tick} label="Straight line: all ramp alike and arrive together" checked=${straight} onChange=${setStraight} />
+    <${Tick} label="Straight line" checked=${straight} onChange=${setStraight} />
     <p class="row"><${Action} kind="main" act=${() => moveTogether(axes, targets, speed, straight)} obstacle=${way || null}
       reason=${reason}>Move ${axes.map(({ name }) => name).join(" and ")} together<//>
       ${straight && html`<${Action} act=${async () => setLine(await previewLine(axes, targets, speed))} obstacle=${missing ? way : null}
