@@ -4,7 +4,7 @@ import pytest
 
 from tests.support.jog_deaths import DRIVES, KINDS, bound_s, deaths
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.timeout(300)]
 
 SEED = 22
 
