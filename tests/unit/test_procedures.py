@@ -12,6 +12,7 @@ from ldcnd.daemon.axis.permit import Right
 from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.drivers.driver import AnalogMotion, Fault, HomeCapture, Motion, PwmOutput, StopMode
 from ldcnd.errors import (
+    CommandExpired,
     LdcndError,
     LeaseExpired,
     MalformedRequest,
@@ -227,6 +228,25 @@ async def test_a_switch_is_found_fast_then_left_and_then_searched_slowly():
         assert [load[0].velocity_counts_per_s for load in loads(bench)] == [15_000.0, 5000.0]
         assert loads(bench)[1][0].target_counts < 0
         assert [load[1].stop for load in loads(bench)] == [StopMode.SMOOTH] * 2
+
+
+async def test_a_search_that_has_begun_is_not_late_for_its_further_legs():
+    late = []
+
+    def in_time() -> None:
+        if late:
+            raise CommandExpired("it comes too late")
+
+    async with axis_bench() as bench:
+        await bench.settled(forward_limit=False)
+        await bench.send(ONTO_SWITCH.model_copy(update={"find_velocity": 15.0}), "home", Right(in_time=in_time))
+        late.append(True)
+        await bench.pass_s(0.1, **SEARCHING)
+        await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
+        await bench.pass_s(0.1, **RESTING)
+
+        assert bench.drive.calls.count("start") == 2
+        assert status(bench, "home") == []
 
 
 async def test_a_search_away_from_its_switch_looks_at_no_switch_and_finds_nothing_first():
