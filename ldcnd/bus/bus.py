@@ -356,7 +356,7 @@ class Bus(Users):
             line.kick()
             await self._closed.wait()
         finally:
-            line.close("the bus was closed")
+            line.close("the bus was closed", for_good=True)
             await transport.close()
 
     # -- for the line (see `Users`) ----------------------------------------------------------------------------------

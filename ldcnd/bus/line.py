@@ -150,17 +150,19 @@ class Line(Receiver):
         elif self.phase is Phase.REPLY and self._turn and self._turn.exchange.repeatable:
             self._distrusted, self._missing = True, NOT_PLAIN
 
-    def close(self, reason: str) -> None:
-        """Leave the line; the turn on the wire, if any, is lost, and no poll counts as missed by its drive.
+    def close(self, reason: str, *, for_good: bool = False) -> None:
+        """Leave the line; the turn on the wire, if any, is lost. Safe to call twice.
 
-        Safe to call twice.
+        Args:
+            reason: for the errors.
+            for_good: the bus ends: a poll that this cuts off is not missed by its drive.
         """
         if self.phase is Phase.CLOSED:
             return
         self.phase = Phase.CLOSED
         self._watchdog.cancel()
         turn, self._turn = self._turn, None
-        if turn and turn.lane is POLL:
+        if for_good and turn and turn.lane is POLL:
             turn = None
         if turn and turn.lost(ReplyTimeout(f"node {turn.exchange.node}: {reason} before the reply came")):
             self._users.again(turn)
