@@ -45,7 +45,7 @@ async def test_a_new_servo_rate_divisor_keeps_velocities_what_they_are():
         await rig.rig.client.wait_for_end(AXIS, reply.command_id)
 
         assert rig.drive.loop.gains.sr == 2
-        assert loop.time() - began_s == pytest.approx(reply.duration_s, abs=0.1)
+        assert reply.duration_s - 0.1 < loop.time() - began_s < reply.duration_s + 0.3  # it settles afterwards
         await asyncio.sleep(1.0)
         assert rig.position_mm == pytest.approx(10.0, abs=0.02)
 
