@@ -9,6 +9,7 @@ pytestmark = [pytest.mark.real_time, pytest.mark.timeout(300)]
 SEED = 22
 
 
+@pytest.mark.soak
 async def test_a_jog_ends_when_the_program_or_the_daemon_is_killed(tmp_path):
     async with deaths(tmp_path, SEED, host_s=3.0) as rig:
         for kind, axis in (("program, SIGKILL", "l"), ("daemon, SIGKILL", "s")):

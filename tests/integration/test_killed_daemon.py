@@ -34,7 +34,7 @@ async def counts_of(rig, axis):
 
 async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
     link, config = tmp_path / "line0", tmp_path / "adopt.toml"
-    simulated = (ROOT / "config" / "simulated.toml").read_text()
+    simulated = (ROOT / "config" / "simulated.toml").read_text().replace("margin_ms = 50", "margin_ms = 250")
     simulated = simulated[: simulated.index("[[sim]]")].replace('"sim:line0"', f'"{link}"')
     config.write_text(simulated.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'))
 
@@ -65,7 +65,7 @@ async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
 
 async def test_what_a_killed_daemon_has_started_ends_within_its_bound(tmp_path):
     link, config = tmp_path / "line0", tmp_path / "adopt.toml"
-    simulated = (ROOT / "config" / "simulated.toml").read_text()
+    simulated = (ROOT / "config" / "simulated.toml").read_text().replace("margin_ms = 50", "margin_ms = 250")
     simulated = simulated[: simulated.index("[[sim]]")].replace('"sim:line0"', f'"{link}"')
     config.write_text(simulated.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'))
 

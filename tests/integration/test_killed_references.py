@@ -122,7 +122,8 @@ async def _lives(config: Path, lives: int, dice: random.Random) -> Truth:
 
 
 @pytest.mark.timeout(3600)  # two processes start in turn, on however busy a machine
-@pytest.mark.parametrize(("lives", "seed"), [(2, 1), pytest.param(250, None, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize(("lives", "seed"), [(2, 1), (250, None)])
 async def test_no_reference_that_a_killed_daemon_has_left_is_wrong(tmp_path, lives, seed):
     seed = seed if seed is not None else random.randrange(1_000_000)
     print(f"seed {seed}")

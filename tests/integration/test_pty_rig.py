@@ -15,7 +15,7 @@ COUNTS_PER_MM = {"x": 1000, "z": 2000}
 
 
 async def test_the_daemon_moves_and_homes_drives_behind_a_terminal(tmp_path):
-    simulated = (ROOT / "config" / "simulated.toml").read_text()
+    simulated = (ROOT / "config" / "simulated.toml").read_text().replace("margin_ms = 50", "margin_ms = 250")
     link = tmp_path / "line0"
     config = tmp_path / "pty.toml"
     config.write_text(simulated[: simulated.index("[[sim]]")].replace('"sim:line0"', f'"{link}"'))
