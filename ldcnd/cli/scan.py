@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from ldcnd.config.bus import BusConfig
+from ldcnd.config.edit import draft_of
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
 from ldcnd.families.family import ScannedDrive, Scans
@@ -112,16 +113,14 @@ def write(file: Path, family_name: str, port: str, drives: Sequence[ScannedDrive
     for drive in new:
         names.append(name := _free("axis", names, drive.address))
         tables += family.configured_drive(name, drive)
-    draft = file.with_suffix(".new")
-    try:
+    with draft_of(file) as draft:
         draft.write_text(text[:place].rstrip("\n") + "\n" + tables + text[place:], encoding="utf-8")
-        load_config(draft)
+        try:
+            load_config(draft)
+        except ConfigError as error:
+            message = f"{file}: not written, it would not be valid: {error.message}"
+            raise ConfigError(message, remedy="put it in by hand, or write to a new file") from error
         draft.replace(file)
-    except ConfigError as error:
-        message = f"{file}: not written, it would not be valid: {error.message}"
-        raise ConfigError(message, remedy="put it in by hand, or write to a new file") from error
-    finally:
-        draft.unlink(missing_ok=True)
     return [*said, f"{file}: {len(new)} of {len(drives)} added; `ldcnd check-config {file}` says what it promises"]
 
 

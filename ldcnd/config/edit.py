@@ -2,8 +2,8 @@
 
 import re
 import tomllib
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ldcnd.config.rig import load_config
@@ -26,8 +26,7 @@ def set_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> Non
         ConfigError: the file is laid out so that the tables have to be put in by hand, or would be none any more.
     """
     lines = config.read_text(encoding="utf-8").splitlines()
-    draft = config.with_suffix(".new")
-    try:
+    with draft_of(config) as draft:
         for place in _places(lines, axis):
             end = _end_of_axis(lines, place)
             section = lines[place:end]
@@ -38,10 +37,21 @@ def set_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> Non
                 if _holds(draft, axis, tables):
                     draft.replace(config)
                     return
-    finally:
-        draft.unlink(missing_ok=True)
     by_hand = "\n".join(_table(name, values) for name, values in tables.items())
     raise ConfigError(f"{config}: put this behind axis {axis} by hand:\n{by_hand}")
+
+
+@contextmanager
+def draft_of(config: Path) -> Iterator[Path]:
+    """Yield where a new version of a configuration is written and checked; it goes unless it has replaced the old one.
+
+    It is beside the old one, because a configuration names other files as seen from its folder.
+    """
+    draft = config.with_name(f".{config.name}.draft")
+    try:
+        yield draft
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def _table(name: str, values: Literals) -> str:

@@ -161,10 +161,22 @@ async def test_nothing_is_reset_while_a_drive_moves_or_may(addressed):
     assert {Command(packet.command) for packet in packets(sent)} <= HARMLESS
 
 
+async def test_a_silent_line_is_not_reset():
+    chain = build_chain(ChainSpec((ModuleSpec("ls-182ap", plant=LONG),)))
+    chain.modules[0].address, chain.modules[0].address_out = 40, True  # another host has given it, and moves it
+    runs(chain.modules[0])
+
+    _, findings, sent = await scanned(chain, give_addresses=True)
+
+    assert any(finding.verdict is Verdict.WRONG for finding in findings)
+    assert {Command(packet.command) for packet in packets(sent)} <= HARMLESS
+    assert chain.modules[0].loop.servo_on
+
+
 async def test_a_configuration_is_begun_and_continued_and_what_a_person_wrote_stays(tmp_path):
     chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in ("ls-182ap", "pic-io", "pic-servo-sc"))))
     drives, _, _ = await scanned(chain, give_addresses=True)
-    file = tmp_path / "rig.toml"
+    file = tmp_path / "rig.new"
 
     write(file, "ldcn", PORT, drives[:2])
     begun = file.read_text().replace('name = "axis1"', 'name = "x" # the long one').replace("# gains", "gains")
@@ -179,6 +191,7 @@ async def test_a_configuration_is_begun_and_continued_and_what_a_person_wrote_st
     assert "1 of 3 added" in said[-1]
     assert write(file, "ldcn", PORT, drives[1:])[0] == "address 1 is configured as ls-182ap; nothing answers there"
     assert load_config(file) == rig
+    assert list(tmp_path.iterdir()) == [file]
 
 
 async def test_a_line_of_which_no_axis_can_be_made_leaves_the_file_as_it_was(tmp_path):

@@ -91,7 +91,7 @@ class LineScan:
                 return
             found = await self._find_all()
             seen = await self._watch(found)
-            if self._give_addresses:
+            if self._give_addresses and (found or self._waiting):  # where nothing answers nothing is known to stand
                 refusal = self._why_not(found, seen)
                 if refusal:
                     yield refusal
@@ -166,9 +166,7 @@ class LineScan:
     # -- giving addresses --------------------------------------------------------------------------------------------
 
     def _why_not(self, found: dict[int, Found], seen: dict[int, Seen]) -> Finding | None:
-        """Return what keeps the line from being reset and addressed; None when nothing on it can be moving."""
-        if not self._waiting and not found:
-            return None  # nothing answers: the drives say so themselves
+        """Return what keeps a line that answers from being reset; None when nothing on it can be moving."""
         obstacles = [f"address {address}: {seen[address].words}" for address in found if not seen[address].at_rest]
         if found and self._waiting:
             obstacles.append("modules behind the one without an address cannot be heard, and may move")
