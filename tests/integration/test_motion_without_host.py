@@ -95,6 +95,16 @@ BOUNDED = {
     "move_together": case(
         MoveTogether(moves=[AxisMove(axis=axis, position=10.0, velocity=10.0) for axis in ("x", "y")]), 1.1
     ),
+    "move_together, straight": case(
+        MoveTogether(
+            path="linear",
+            moves=[AxisMove(axis="x", position=10.0, velocity=10.0), AxisMove(axis="y", position=4.0, velocity=10.0)],
+        ),
+        1.2,
+    ),
+    "move_absolute, approached": case(
+        MoveAbsolute(position=-4.0, velocity=10.0), 1.4, approach={"direction": "positive", "distance": 2.0}
+    ),
     "home, index": case(Home(method="index", velocity=-1.0, timeout_s=HORIZON_S), 1.1 * HORIZON_S),
     "home, switch": case(Home(method="forward_limit", velocity=6.0, timeout_s=HORIZON_S), 1.1 * HORIZON_S),
     "home, two speeds": case(
