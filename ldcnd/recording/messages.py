@@ -26,6 +26,7 @@ Published = Measurement | CommandEvent | BusHealth | DaemonHealth
 _ITEMS = {item.value: model for item, model in SAMPLE_MODELS.items()}
 
 
+@lru_cache(maxsize=4096)
 def model_of(key: str) -> type[Published] | None:
     """Return what a key carries, or None for one that only a newer daemon knows."""
     _, _, kind, *rest = key.split("/")
@@ -141,7 +142,7 @@ def entry_of(sample: Sample) -> Entry | None:
     Raises:
         LdcndError: the payload is not what the key carries.
     """
-    model = _known_model(sample.key)
+    model = model_of(sample.key)
     if model is None:
         return None
     if model is not CommandEvent:
@@ -153,11 +154,6 @@ def entry_of(sample: Sample) -> Entry | None:
     published = decode_received(model, sample.payload, sample.encoding)
     message = message_of(published)
     return Entry(type(message), to_json(message), published.t, published.seq)
-
-
-@lru_cache(maxsize=4096)
-def _known_model(key: str) -> type[Published] | None:
-    return model_of(key)
 
 
 def message_of(value: Published) -> Frozen:
