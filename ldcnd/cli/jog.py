@@ -30,7 +30,7 @@ FIRST_REPEAT_S = 0.8
 NEXT_REPEAT_S = 0.25
 """And repeats it at least so often; after a longer silence the key counts as released."""
 HOLD_S = 0.4
-"""The daemon ends the jog when no repetition of the key has reached it for so long."""
+"""Longest time between two repetitions of the key that reach the daemon; then it ends the jog."""
 RENEW_EACH_S = 0.1
 
 
@@ -70,7 +70,7 @@ def jog(
 
 
 async def _for_a_time(info: AxisInfo, held: Control, command: Jog, for_s: float) -> None:
-    """Run the axis for so many seconds, or until its software limit."""
+    """Run the axis for a time, in seconds, or until its software limit."""
     jog = Jogging(partial(held.command, info.axis), command)
     reply = await jog.begin()
     show_lines(f"{info.axis}: runs at {rounded(reply.velocity or command.velocity)} {info.unit}/s for {for_s:g} s")

@@ -156,7 +156,7 @@ class Axis(AxisVerbs, Watched):
         Args:
             velocity: in units a second, positive forward, not 0.
             acceleration: in units a second squared; the axis default when missing.
-            hold_s: the daemon ends the jog when it is not renewed for so long, 0.2 to 1 s.
+            hold_s: longest time between two renewals, 0.2 to 1 s; then the daemon ends the jog.
 
         Raises:
             LdcndError: as the daemon refused it.

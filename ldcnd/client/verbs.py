@@ -174,7 +174,7 @@ class AxisVerbs(ABC):
                 new move.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
-            hold_s: The jog ends so long after it was begun or renewed last, in seconds by the clock of the daemon.
+            hold_s: Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog.
             renews: The command id of the jog that goes on; without it a new one begins. A renewal leaves no event.
         """
         return await self._start(

@@ -371,7 +371,7 @@ class Jog(Move):
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
     hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
-    """The jog ends so long after it was begun or renewed last, in seconds by the clock of the daemon."""
+    """Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog."""
     renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
     """The command id of the jog that goes on; without it a new one begins. A renewal leaves no event."""
 
