@@ -7,7 +7,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 PYTHONS ?= python3.11 python3.12 python3.13 python3.14
 
-.PHONY: run test tests test-edges test-pythons check fix docs dist soak mutants newcomer bench screenshots clean
+.PHONY: run test tests test-system test-edges test-pythons check fix docs dist soak mutants newcomer bench screenshots clean
 
 # what `make test` needs is nine times as large as what `make run` needs
 run: $(if $(wildcard .venv/ready),.venv/ready,.venv/small)
@@ -19,6 +19,10 @@ test: .venv/ready
 
 tests: .venv/ready
 	$(PY) -m pytest -n 3 --dist worksteal
+
+# whole programs as people run them: browsers, systemd, packages, pages to the letter; a quarter of an hour
+test-system: .venv/ready
+	$(PY) -m pytest -m system -n 2 --dist worksteal --timeout 240
 
 check: .venv/ready
 	.venv/bin/ruff check .

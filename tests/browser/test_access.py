@@ -9,7 +9,12 @@ axe = pytest.importorskip("axe_playwright_python.async_playwright", reason="need
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
 
 PAGES = {
     "rig": "Needs attention",

@@ -10,7 +10,12 @@ from ldcnd.model.rig_commands import ListHolders
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
 
 AXES = ("x", "y", "z", "c")
 MOST_TABS = 90

@@ -16,7 +16,12 @@ from tests.support.process import ROOT
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
 
 MINUS = "\N{MINUS SIGN}"
 DRAWN = """

@@ -12,7 +12,12 @@ from ldcnd.model.samples import TelemetryItem
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="package"), pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
 
 
 async def holder(daemon, axis):

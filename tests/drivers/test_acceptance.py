@@ -144,6 +144,7 @@ def test_capture_of_a_trial_plays_back_to_the_same_findings():
     assert list(replayed(capture)) == found
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 def test_smartsteps_are_tried_and_their_capture_plays_back_to_the_same_findings(tmp_path: Path):
     units = simulated_units([SimulatedUnitConfig(number=1), SimulatedUnitConfig(number=2)], 0.0)

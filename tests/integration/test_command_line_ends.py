@@ -14,7 +14,12 @@ import pytest_asyncio
 from ldcnd.model.commands import Halt, Power, SetPosition
 from tests.support.process import LDCND, ROOT, answering, client, daemon, free_port
 
-pytestmark = [pytest.mark.real_time, pytest.mark.asyncio(loop_scope="module"), pytest.mark.timeout(200)]
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.timeout(200),
+]
 
 CONFIG = ROOT / "config" / "simulated.toml"
 PATIENCE_S = 60.0

@@ -181,6 +181,7 @@ async def test_what_cannot_be_served_or_would_let_strangers_in_is_refused_with_t
             assert "Traceback" not in errors.decode()
 
 
+@pytest.mark.system
 async def test_rigs_are_lost_and_regained_behind_daemons_and_routers(tmp_path):
     """Two rigs, two endpoints: a daemon itself, and a router with another daemon behind it."""
     direct, routed = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))

@@ -26,7 +26,7 @@ OURS = (
 )
 COMMANDS = re.compile(r"(?ms)^```sh\n(.*?)^```$")
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 no_package = why_no_package()
 no_machine = no_package or why_no_machine()
 packaged = pytest.mark.skipif(no_package is not None, reason=no_package or "")

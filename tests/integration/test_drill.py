@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.process import LDCND, ROOT, daemon
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 LEASE_S = 0.8
 

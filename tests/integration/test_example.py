@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.process import ROOT, daemon
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 EXAMPLE = ROOT / "examples" / "move_and_watch.py"
 

@@ -33,7 +33,7 @@ for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
 LINES = 8
 
 
-pytestmark = [pytest.mark.real_time, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(240)]
 
 
 async def test_make_run_says_what_to_type_and_the_first_program_moves(tmp_path):

@@ -38,7 +38,7 @@ from tests.support.network import Network, NoNamespaces, router_config, router_w
 from tests.support.process import LDCND
 from tests.support.rig import SIMULATED
 
-pytestmark = [pytest.mark.real_time, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(240)]
 
 NOW = dt.datetime.now(dt.UTC)
 LINKS = (("mill", "gate1"), ("gate1", "gate2"), ("lathe", "gate2"), ("desk", "gate2"))

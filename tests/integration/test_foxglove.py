@@ -16,7 +16,7 @@ from ldcnd.recording.live_view import LiveView
 from tests.support.process import LDCND, ROOT, daemon
 from tests.support.websocket import foxglove_client
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 T_NS = 1_700_000_000_000_000_000
 POSITION = PositionSample(
     t=T_NS, t_error_ns=0, seq=0, quality="good", value=1.5, unit="mm", counts=1500, following_error=None

@@ -17,7 +17,7 @@ from ldcnd.model.events import CommandStatus, ReadEvents
 from ldcnd.model.samples import AxisState, PositionSample, StateSample, TelemetryItem
 from tests.support.process import ROOT, answering, client, daemon, free_port, process
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 RIG = ROOT / "config" / "simulated.toml"
 LEASE_S = 1.0

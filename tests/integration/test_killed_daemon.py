@@ -10,7 +10,7 @@ from ldcnd.model.commands import Home, MoveAbsolute, Power, Probe
 from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, START_TIME_S, _all_axes_answer, client, free_port, process, simulated_terminal
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 
 @asynccontextmanager

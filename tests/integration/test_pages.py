@@ -134,6 +134,7 @@ def test_every_link_leads_somewhere(page) -> None:
             assert (page.parent / place).exists(), target
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 @pytest.mark.timeout(600)
 async def test_the_tutorials_can_be_followed(tmp_path) -> None:
@@ -155,6 +156,7 @@ async def test_the_tutorials_can_be_followed(tmp_path) -> None:
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 @pytest.mark.timeout(240)
 async def test_a_first_drive_is_commissioned_jogged_homed_tuned_and_moved_in_a_group(tmp_path) -> None:
@@ -165,6 +167,7 @@ async def test_a_first_drive_is_commissioned_jogged_homed_tuned_and_moved_in_a_g
     assert (tmp_path / "before.csv").exists()
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("page", BY_THEMSELVES)

@@ -46,6 +46,7 @@ CHANGED = {each: each.limits.value.lowest + 7 if each.limits else 0x0011 for eac
 """Twenty-one parameters as no factory sets them."""
 
 
+@pytest.mark.system
 def test_a_factory_new_drive_is_made_the_one_that_it_replaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     old = SimulatedUnit(None, {**CHANGED, PN000: 0x0101})
     new = SimulatedUnit(None, {PN000: 0x0200})

@@ -9,7 +9,7 @@ from ldcnd.model.commands import Home, MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, client, daemon, simulated_terminal
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 COUNTS_PER_MM = {"x": 1000, "z": 2000}
 

@@ -32,6 +32,7 @@ def is_on_the_disk(part, topic):
     return bool(written) and any(isinstance(record, Channel) and record.topic == topic for record in written)
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 @pytest.mark.timeout(120)
 async def test_a_rig_is_recorded_until_the_signal_and_exported(tmp_path):

@@ -16,6 +16,7 @@ COMMANDS = [line for block in BLOCKS for line in block.splitlines()]
 ON_FILES = [command for command in COMMANDS if "wire-log" not in command]  # test_wire_log_cli.py has the others
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 async def test_what_the_page_does_with_a_capture_can_be_done(tmp_path):
     shutil.copy(FOLDER / "power_loss.capture", tmp_path / "fault.capture")

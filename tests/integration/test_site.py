@@ -11,6 +11,7 @@ from tests.support.process import ROOT
 GENERATED = shutil.ignore_patterns("faults", "install.md")
 
 
+@pytest.mark.system
 @pytest.mark.timeout(180)
 def test_the_site_is_built_without_a_warning(tmp_path):
     """From a copy, because a build gathers pages from elsewhere among the sources."""

@@ -18,7 +18,7 @@ from ldcnd.metrics.server import metrics_server
 from tests.support.browser import console
 from tests.support.process import free_port
 
-pytestmark = [pytest.mark.real_time, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(120)]
 
 HALF = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
 ALLOWANCE_S = 10.0

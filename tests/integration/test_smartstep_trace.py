@@ -59,6 +59,7 @@ async def test_triggered_trace_equals_what_the_drive_recorded_sample_for_sample(
     assert (trace.header.drive.trgadr < 100) is wrapped
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 @pytest.mark.parametrize(("layout", "before_s", "wrapped"), [(LAYOUTS[0], 0.8, False), (LAYOUTS[2], 1.87, True)])
 async def test_triggered_trace_over_real_zenoh_equals_what_the_drive_recorded(layout, before_s, wrapped):

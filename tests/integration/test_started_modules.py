@@ -54,5 +54,6 @@ def test_all_that_pages_tell_readers_to_start_can_be_started():
 
 
 @pytest.mark.real_time
+@pytest.mark.system
 async def test_the_cost_of_a_sample_is_measured():
     assert 0 < await payload_bytes() < await wire_bytes(20) < 1000

@@ -13,6 +13,7 @@ from tests.support.package import package, why_no_package
 
 why_not = why_no_machine() or why_no_package()
 pytestmark = [
+    pytest.mark.system,
     pytest.mark.real_time,
     pytest.mark.skipif(why_not is not None, reason=why_not or ""),
 ]

@@ -12,7 +12,7 @@ from ldcnd.top.glance import RigGlance
 from ldcnd.top.screen import TopScreen
 from tests.support.process import LDCND, ROOT, client, daemon
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 
 async def until(pilot, wanted):

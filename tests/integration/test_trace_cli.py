@@ -11,7 +11,7 @@ from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 
 async def ldcnd(*arguments):

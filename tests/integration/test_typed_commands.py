@@ -9,7 +9,7 @@ from ldcnd.model.samples import Moving
 from tests.support.command_line import run_all
 from tests.support.process import ROOT, client, daemon
 
-pytestmark = [pytest.mark.real_time, pytest.mark.timeout(200)]
+pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(200)]
 
 
 async def test_what_a_drive_can_do_can_be_typed(tmp_path):

@@ -15,7 +15,7 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.commands import Power, Reset
 from tests.support.process import ROOT, daemon
 
-pytestmark = [pytest.mark.real_time, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(120)]
 
 SUBSCRIBERS = 50
 ANSWERED_WITHIN_S = 4.0

@@ -12,7 +12,10 @@ import pytest
 
 from tests.support.process import ROOT
 
-pytestmark = pytest.mark.timeout(240)  # two programs start in it, on a machine that may do much else
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.timeout(240),
+]  # two programs start in it, on a machine that may do much else
 
 PROGRAM = """
 import asyncio, json

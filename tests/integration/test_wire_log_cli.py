@@ -10,7 +10,7 @@ from ldcnd.wirelog.recorder import WireEvent
 from tests.support.command_line import run_all
 from tests.support.process import ROOT, daemon
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 
 PAGE = (ROOT / "docs" / "how-to" / "replay-a-capture.md").read_text(encoding="utf-8")

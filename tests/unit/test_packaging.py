@@ -49,6 +49,7 @@ def twice(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Path]]:
     return results
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
 def test_the_same_source_gives_the_same_bytes(twice: list[dict[str, Path]], kind: str) -> None:
     one, other = (build[kind] for build in twice)
@@ -102,6 +103,7 @@ def bill(*extras: str) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.system
 def test_the_bill_of_materials_has_what_is_pinned_and_nothing_dangling() -> None:
     document = bill()
     parts = {part["name"]: part for part in document["components"]}
@@ -118,6 +120,7 @@ def test_the_bill_of_materials_has_what_is_pinned_and_nothing_dangling() -> None
     assert {(name, part["version"]) for name, part in parts.items()} <= PINS
 
 
+@pytest.mark.system
 def test_an_extra_that_is_not_asked_for_is_not_on_the_bill() -> None:
     names = {part["name"] for part in bill("fast", "journal")["components"]}
 

@@ -13,8 +13,13 @@ from tests.support.smartstep_line import simulated, smartstep_line
 
 MAPS = [
     BENCH_TRIGGER_MAP,
-    TriggerMap(trace1=0x0000, trace2=0x0010, io=0x0020, rising=0x4000, falling=0x8000),
-    TriggerMap(trace1=0x0002, trace2=0x0003, io=0x0000, rising=0x0020, falling=0x0010),
+    *(
+        pytest.param(bits, marks=pytest.mark.soak)  # the further down its bits lie, the longer the search
+        for bits in (
+            TriggerMap(trace1=0x0000, trace2=0x0010, io=0x0020, rising=0x4000, falling=0x8000),
+            TriggerMap(trace1=0x0002, trace2=0x0003, io=0x0000, rising=0x0020, falling=0x0010),
+        )
+    ),
 ]
 
 
