@@ -67,8 +67,8 @@ async def test_every_query_gets_one_answer_and_every_stop_keeps_its_bound(durati
 
     print(answers, f"longest stop {max(waits_s) * 1e3:.2f} ms")
     assert answers["sent"] == sum(answers.values()) - answers["sent"]
-    assert answers["sent"] > 1000
-    assert answers["accepted"] > 30
+    assert answers["sent"] > 60 * duration_s
+    assert answers["accepted"] > duration_s
     assert answers["internal"] == answers["outcome_unknown"] == 0
     assert len(waits_s) >= duration_s - 2
     assert max(waits_s) <= (1 + STOP_EXCHANGES) * LONGEST_EXCHANGE_S

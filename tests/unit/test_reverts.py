@@ -36,7 +36,8 @@ def test_the_reference_names_exactly_the_tests_that_hold_what_was_found():
 @pytest.mark.parametrize("number", range(len(REVERTS)), ids=map(name, REVERTS))
 def test_a_fix_that_is_taken_back_is_missed_by_each_of_its_tests(number: int):
     revert = REVERTS[number]
-    command = ("-q", "--no-header", "--tb=no", "-rA", "-p", "tests.mutants.reverts", "--timeout", "300")
+    which = ("-m", "not soak and not guest and not edges")
+    command = ("-q", "--no-header", "--tb=no", "-rA", "-p", "tests.mutants.reverts", "--timeout", "300", *which)
     run = subprocess.run(  # noqa: S603
         (sys.executable, "-m", "pytest", *command, *revert.noticed_by),
         cwd=ROOT,
