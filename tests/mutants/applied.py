@@ -7,30 +7,17 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Protocol
 
 from tests.mutants.changes import Mutant
 
 MUTANT = "LDCND_MUTANT"
 
 
-class Change(Protocol):
-    """A module that is not as it stands in its file."""
-
-    @property
-    def path(self) -> str:
-        """Of the module, below the root."""
-
-    def module(self, root: Path) -> CodeType:
-        """Return the changed module."""
-
-
 class _ChangedLoader(SourceFileLoader):
-    def __init__(self, name: str, mutant: Change, root: Path) -> None:
+    def __init__(self, name: str, mutant: Mutant, root: Path) -> None:
         super().__init__(name, str(root / mutant.path))
         self._mutant = mutant
         self._root = root
@@ -42,7 +29,7 @@ class _ChangedLoader(SourceFileLoader):
 class ChangedFinder(PathFinder):
     """Finds one module, changed."""
 
-    def __init__(self, mutant: Change, root: Path) -> None:
+    def __init__(self, mutant: Mutant, root: Path) -> None:
         self._mutant = mutant
         self._root = root
 
@@ -62,25 +49,3 @@ def pytest_configure() -> None:
     path, node, kind = json.loads(os.environ[MUTANT])
     mutant = Mutant(path, "", "", (0, 0), node, kind, "")
     sys.meta_path.insert(0, ChangedFinder(mutant, Path(__file__).parents[2]))
-
-
-@dataclass(frozen=True, slots=True)
-class Revert:
-    """One fix that is taken back.
-
-    Attributes:
-        path: of the module.
-        fixed: what stands there, exactly once.
-        broken: what stood there, or what comes to the same.
-        noticed_by: tests every one of which fails without the fix.
-    """
-
-    path: str
-    fixed: str
-    broken: str
-    noticed_by: tuple[str, ...]
-
-    def module(self, root: Path) -> CodeType:
-        """Return the module without the fix."""
-        source = (root / self.path).read_text(encoding="utf-8").replace(self.fixed, self.broken)
-        return compile(source, str(root / self.path), "exec")

@@ -1,144 +1,120 @@
-"""Every mended departure from the manual is put back, one by one; the test that the reference page names must fail."""
+"""Fixes of departures from the manual of SmartStep drives, by their numbers on the reference page."""
 
-import os
-import re
-import shutil
-import subprocess
-import sys
-from dataclasses import dataclass
-from pathlib import Path
+from tests.reverts.revert import Edit, Revert
 
-import pytest
-
-from tests.support.process import ROOT
-
-S = "ldcnd/drivers/smartstep/"
+DRIVER = "ldcnd/drivers/smartstep/"
 PAGES = "ldcnd/console/static/pages/"
 
 
-@dataclass(frozen=True, slots=True)
-class Revert:
-    """A departure put back.
-
-    Attributes:
-        finding: its number on the reference page.
-        edits: file, text that mended it, text in its place.
-        test: must fail then.
-    """
-
-    finding: int
-    test: str
-    edits: tuple[tuple[str, str, str], ...]
-
-
-def revert(finding: int, test: str, path: str, mended: str, before: str, *more: tuple[str, str, str]) -> Revert:
-    return Revert(finding, test, ((path, mended, before), *more))
+def revert(finding: int, test: str, path: str, fixed: str, broken: str, *more: Edit) -> Revert:
+    """Return the departure with this number, put back; the test that the page names notices it."""
+    return Revert((Edit(path, fixed, broken), *more), (f"tests/{test}",), str(finding))
 
 
 REVERTS = (
     revert(
         1,
         "unit/test_smartstep_drive.py::test_any_monitor_is_read_once_the_auto_tuning_result_too",
-        S + "monitors.py",
+        DRIVER + "monitors.py",
         "        MonitorName.AUTO_TUNING_RESULT: AUTO_TUNING_RESULT,\n",
         "",
     ),
     revert(
         2,
         "unit/test_smartstep_transfer.py::test_a_replaced_drive_differs_in_its_unit_number_only_after_a_clone_and_a_power_cycle",
-        S + "transfer.py",
+        DRIVER + "transfer.py",
         "with_digit(word, UNIT_DIGIT, unit_number(held)) if parameter.number == PN000.number else word",
         "held if parameter.number == PN000.number else word",
     ),
     revert(
         2,
         "unit/test_smartstep_transfer.py::test_a_replaced_drive_differs_in_its_unit_number_only_after_a_clone_and_a_power_cycle",
-        S + "transfer.py",
+        DRIVER + "transfer.py",
         "    if memory is not Memory.RAM:\n        stored",
         "    if memory is Memory.EEPROM:\n        stored",
     ),
     revert(
         3,
         "unit/test_smartstep_parameter_store.py::test_no_spelling_of_pn000_goes_round_the_confirmation_of_a_new_unit_number",
-        S + "parameters.py",
+        DRIVER + "parameters.py",
         'return _BY_NUMBER.get(number) or Parameter(number, "")',
         'return Parameter(number, "")',
-        (S + "parameter_store.py", "if parameter.number != PN000.number:", "if parameter != PN000:"),
+        Edit(DRIVER + "parameter_store.py", "if parameter.number != PN000.number:", "if parameter != PN000:"),
     ),
     revert(
         4,
         "unit/test_smartstep_trace.py::test_either_edge_of_a_value_is_refused_because_the_drive_would_take_any_change",
-        S + "trace_result.py",
+        DRIVER + "trace_result.py",
         "    if kind is TriggerKind.EITHER and trigger.channel not in SIGNALS:\n",
         "    if kind is None:\n",
     ),
     revert(
         5,
         "unit/test_smartstep_trace.py::test_a_lost_execute_starts_the_trace_within_seconds",
-        S + "modes.py",
+        DRIVER + "modes.py",
         "            await enter(words, OperatingMode.NORMAL)\n            await enter(words, mode)\n        else:",
         "            return Execution(sent_s, loop.time())\n        else:",
     ),
     revert(
         6,
         "unit/test_smartstep_modes.py::test_a_mode_that_was_left_behind_ends_at_bring_up",
-        S + "network.py",
+        DRIVER + "network.py",
         "ended = await end_mode(words)",
         "ended = None",
     ),
     revert(
         7,
         "unit/test_smartstep_trace.py::test_words_that_contradict_the_monitors_make_a_trace_uncertain",
-        S + "trace_check.py",
+        DRIVER + "trace_check.py",
         "    windows = [(each, window) for each in shown if",
         "    return Judgement()\n    windows = [(each, window) for each in shown if",
     ),
     revert(
         7,
         "unit/test_smartstep_trace.py::test_a_trace_that_was_ended_from_elsewhere_is_no_trace",
-        S + "trace.py",
+        DRIVER + "trace.py",
         "if ended_at_s - self._execution.sent_s < needed_s:",
         "if ended_at_s < 0:",
     ),
     revert(
         8,
         "unit/test_smartstep_trace.py::test_a_smaller_full_scale_resolves_finer_and_is_put_back",
-        S + "trace.py",
+        DRIVER + "trace.py",
         "for name, largest in request.full_scale.items():",
         "for name, largest in {}.items():",
     ),
     revert(
         9,
         "unit/test_smartstep_parameter_store.py::test_a_unit_number_that_collides_is_refused_although_confirmed",
-        S + "parameter_store.py",
+        DRIVER + "parameter_store.py",
         "        await self._require_free(unit)\n",
         "",
     ),
     revert(
         10,
         "unit/test_smartstep_modes.py::test_no_counter_is_cleared_while_command_pulses_come_in_although_run_is_off",
-        S + "modes.py",
+        DRIVER + "modes.py",
         "if pulses_rpm or await words.read(low) != before:",
         "if before is None:",
     ),
     revert(
         11,
         "unit/test_smartstep_trace.py::test_the_gear_of_a_pulse_trace_is_that_of_the_eeprom",
-        S + "trace.py",
+        DRIVER + "trace.py",
         "gear = [await words.read(each.eeprom_address)",
         "gear = [await words.read(each.ram_address)",
     ),
     revert(
         12,
         "unit/test_smartstep_trace.py::test_the_trigger_may_have_come_two_milliseconds_before_it_was_seen",
-        S + "trace_check.py",
+        DRIVER + "trace_check.py",
         "TRIGGER_LATE_S = 0.002",
         "TRIGGER_LATE_S = 0.0",
     ),
     revert(
         13,
         "unit/test_smartstep_drive.py::test_a_signal_is_active_by_the_level_of_the_profile_and_not_by_being_high",
-        S + "monitors.py",
+        DRIVER + "monitors.py",
         'active = tuple(signal.name or "" for signal in on if on[signal])',
         'active = tuple(signal.name or "" for signal in bits)',
     ),
@@ -159,35 +135,35 @@ REVERTS = (
     revert(
         15,
         "unit/test_smartstep_parameter_store.py::test_the_budget_is_that_of_the_eeprom_as_a_whole",
-        S + "ledger.py",
+        DRIVER + "ledger.py",
         "        total = self.total(axis)\n        if total >= budget",
         "        total = self.writes(axis, parameter)\n        if total >= budget",
     ),
     revert(
         16,
         "unit/test_smartstep_drive.py::test_a_warning_with_an_active_alarm_output_stops",
-        S + "drive.py",
+        DRIVER + "drive.py",
         "stops = present.kind is AlarmKind.ALARM or (present.kind is not AlarmKind.NONE and out)",
         "stops = present.kind is AlarmKind.ALARM",
     ),
     revert(
         17,
         "unit/test_smartstep_reference.py::test_every_field_of_the_profile_is_used",
-        S + "profiles.py",
+        DRIVER + "profiles.py",
         "    trace_verify: bool = True\n",
         "    trace_verify: bool = True\n    atomic_counter: bool = False\n",
     ),
     revert(
         18,
         "unit/test_smartstep_trace.py::test_the_fastest_interval_is_two_time_units_of_the_drive",
-        S + "trace.py",
+        DRIVER + "trace.py",
         "            smptms = SHORTEST_INTERVAL\n",
         "            smptms = max(SHORTEST_INTERVAL, 500 // constants.cyclec_us)\n",
     ),
     revert(
         19,
         "unit/test_smartstep_reference.py::test_page_lists_the_assumption_with_its_confidence",
-        S + "profiles.py",
+        DRIVER + "profiles.py",
         '"8000, the divisor of the printed speed formula", Confidence.INFERRED_HIGH',
         '"8000, the divisor of the printed speed formula", Confidence.STATED',
     ),
@@ -201,7 +177,7 @@ REVERTS = (
     revert(
         21,
         "unit/test_smartstep_network.py::test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_only",
-        S + "drive.py",
+        DRIVER + "drive.py",
         "wires_checked=self.wires_checked,",
         "wires_checked=True,",
     ),
@@ -234,55 +210,3 @@ REVERTS = (
         "| 22, 23 | TXD+, TXD- | host to drive |",
     ),
 )
-
-
-@pytest.mark.parametrize("each", REVERTS, ids=lambda each: f"{each.finding}")
-def test_what_mended_a_finding_stands_once_where_it_is_put_back(each):
-    assert [path for path, mended, _ in each.edits if (ROOT / path).read_text().count(mended) != 1] == []
-
-
-def test_every_finding_is_put_back_by_the_test_that_the_reference_page_names():
-    page = (ROOT / "docs" / "reference" / "smartstep.md").read_text().partition("## Departures that were mended")[2]
-    named = {(int(number), test) for number, test in re.findall(r"^\| (\d+) .*`(test_\w+)` \|$", page, re.MULTILINE)}
-
-    assert {(each.finding, each.test.partition("::")[2]) for each in REVERTS} == named
-
-
-@pytest.fixture(scope="module")
-def project(tmp_path_factory: pytest.TempPathFactory):
-    """A copy of the project in which code may be changed."""
-    copy = tmp_path_factory.mktemp("reverts") / "project"
-    left_out = shutil.ignore_patterns(".git", ".venv", "build", "dist", "__pycache__", ".*_cache", ".hypothesis")
-    shutil.copytree(ROOT, copy, ignore=left_out)
-    yield copy
-    shutil.rmtree(copy)
-
-
-def run(project: Path, *tests: str) -> int:
-    named = [f"tests/{test}" for test in tests]
-    ran = subprocess.run(  # noqa: S603
-        (sys.executable, "-m", "pytest", "-q", "-x", "--timeout", "300", "-m", "", *named),
-        cwd=project, env=os.environ | {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True, timeout=1800, check=False,
-    )  # fmt: skip
-    return ran.returncode
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(3600)
-def test_the_tests_pass_before_anything_is_put_back(project):
-    assert run(project, *sorted({each.test for each in REVERTS})) == 0
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("each", REVERTS, ids=lambda each: f"{each.finding}-{each.test.partition('::')[2]}")
-def test_a_finding_that_is_put_back_is_noticed(project, each):
-    texts = {path: (project / path).read_text() for path, _, _ in each.edits}
-    try:
-        for path, mended, before in each.edits:
-            (project / path).write_text((project / path).read_text().replace(mended, before))
-        assert run(project, each.test) == 1
-    finally:
-        for path, text in texts.items():
-            (project / path).write_text(text)

@@ -1,27 +1,16 @@
-"""Fixes that can be taken back one by one, and the tests that must notice each; also the plugin of pytest that does so.
+"""Fixes of what moved unwatched: lost control, pending stops, at most once, permission, adoption."""
 
-The environment says which fix is missing (`LDCND_REVERT`: its place in `REVERTS`).
-"""
+from tests.reverts.revert import revert
 
-import os
-import sys
-from pathlib import Path
-
-from tests.mutants.applied import ChangedFinder, Revert
-from tests.mutants.ldcn_reverts import LDCN_REVERTS
-
-ROOT = Path(__file__).parents[2]
-REVERT = "LDCND_REVERT"
 LOSS = "tests/integration/test_loss_of_control.py::"
 PENDING = "tests/integration/test_pending_stops.py::"
 LEDGER = "tests/unit/test_ledger.py::"
 PERMISSION = "tests/integration/test_permission.py::"
 START = "tests/integration/test_start_policies.py::"
 
-
 REVERTS = (
     # -- lost control
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         """            self._lost(other, other.axes, f"taken by force by {lease.client}", ErrorCode.LEASE_EXPIRED)
 """,
@@ -31,13 +20,13 @@ REVERTS = (
             LOSS + "test_an_axis_taken_by_force_in_mid_motion_comes_to_rest",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         """self._lost(other, other.axes - lease.axes, "its client took a lease that covers less", None)""",
         "pass",
         (LOSS + "test_who_exchanges_a_lease_for_one_that_covers_less_stops_the_rest",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         """self._lost(lease, moving, "released while it moved", None)""",
         "pass",
@@ -46,13 +35,13 @@ REVERTS = (
             LOSS + "test_the_policy_of_the_axis_decides_what_a_release_does",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         "        if not leave_running:\n",
         "        if True:\n",
         (LOSS + "test_a_release_in_mid_motion_stops_unless_it_is_to_leave_it_running[True]",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         """self._lost(lease, lease.axes, "its lease was not renewed", ErrorCode.LEASE_EXPIRED)""",
         "pass",
@@ -62,20 +51,20 @@ REVERTS = (
             "tests/integration/test_authority.py::test_an_axis_halts_when_its_client_disappears",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         "if error.axis is not None and self._refusals.admit() is not None:",
         "if error.axis is not None:",
         (LOSS + "test_refused_acquires_do_not_flood_the_events",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/dispatch.py",
         "                self._admit_rehearsal(command)\n",
         "",
         (LOSS + "test_a_loss_is_rehearsed_under_a_lease_that_covers_what_it_concerns",),
     ),
     # -- pending stops
-    Revert(
+    revert(
         "ldcnd/daemon/axis/axis.py",
         """            if self._pending is not None:
                 self._not_confirmed()
@@ -89,13 +78,13 @@ REVERTS = (
             PENDING + "test_a_stop_before_a_line_is_taken_over_stops_what_still_moves_there",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/line/line.py",
         "await self._send_pending_stops()  # before anything else",
         "pass  #",
         (PENDING + "test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_rate",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/axis/axis.py",
         """            if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
@@ -103,7 +92,7 @@ REVERTS = (
         "",
         (PENDING + "test_stops_during_bring_up_are_answered_at_once_and_do_not_restart_it",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/loss.py",
         """    if tracker.stop_latched and policy is LossPolicy.RUN_TO_TARGET:
         policy = LossPolicy.HALT
@@ -111,13 +100,13 @@ REVERTS = (
         "",
         (PENDING + "test_a_latched_axis_that_moves_when_its_line_is_back_comes_to_rest_whatever_the_policy_says",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/axis/commands.py",
         "if tracker.state is AxisState.ERROR_STOP and self._moves_by_force():",
         "if False:",
         (PENDING + "test_a_moving_axis_in_error_stop_is_not_switched_off_by_a_reset",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/axis/axis.py",
         """        self._inherited = False
         self._pending = None
@@ -127,7 +116,7 @@ REVERTS = (
         (PENDING + "test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm",),
     ),
     # -- the ledger
-    Revert(
+    revert(
         "ldcnd/daemon/command/ledger.py",
         "if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():",
         "if False:",
@@ -137,7 +126,7 @@ REVERTS = (
             LEDGER + "test_an_id_is_remembered_for_the_time_that_the_contract_names",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/ledger.py",
         """sender = RESTING if entry.command.effect is Effect.REST else entry.login or entry.client or \"\"""",
         """sender = \"\"""",
@@ -146,13 +135,13 @@ REVERTS = (
             PERMISSION + "test_a_replay_after_thousands_of_halts_is_answered_and_moves_nothing",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/ledger.py",
         "        if len(self._until_s) >= LARGEST_MEMORY:\n",
         "        if False:\n",
         (LEDGER + "test_ids_that_could_not_be_remembered_are_refused_before_anything_is_done",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/ledger.py",
         """        if command.lease is not None and command.sequence is not None:
             return
@@ -160,14 +149,14 @@ REVERTS = (
         "",
         (LEDGER + "test_an_id_under_a_lease_with_a_sequence_takes_no_memory",),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/command/ledger.py",
         "            if self._entries[command_id].status in FINAL:\n",
         "            if True:\n",
         (LEDGER + "test_what_is_not_over_is_never_forgotten",),
     ),
     # -- permission, take-over, reference, swapped replies
-    Revert(
+    revert(
         "ldcnd/bus/bus.py",
         "        while job and not job.may_go():\n",
         "        while False:\n",
@@ -176,7 +165,7 @@ REVERTS = (
             PERMISSION + "test_a_loop_that_waits_for_the_line_is_not_closed_once_its_lease_has_ended",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/axis/permit.py",
         "        self._right.holds()\n",
         "",
@@ -184,20 +173,18 @@ REVERTS = (
             PERMISSION + "test_a_buffered_move_of_a_lease_that_was_released_is_refused",
             PERMISSION + "test_a_buffered_move_of_a_lease_that_was_taken_by_force_is_refused",
             PERMISSION + "test_a_homing_whose_lease_was_lost_begins_no_further_leg",
-            "tests/property/test_interruptions.py::test_a_daemon_may_be_interrupted_anywhere[suspended]",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/line/line.py",
         "                    axis.taken_over()\n",
         "                    pass\n",
         (
             START + "test_a_motion_without_an_end_that_a_host_has_left_moves_until_it_was_ended",
             "tests/integration/test_motion_without_end.py::test_a_path_that_a_host_has_left_is_stopped",
-            "tests/property/test_interruptions.py::test_a_daemon_may_be_interrupted_anywhere[killed]",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/line/line.py",
         "axis.config.name in report.placed and not",
         "report.reset and not",
@@ -207,17 +194,10 @@ REVERTS = (
             START + "test_a_drive_whose_shaft_turns_while_it_is_reset_is_not_referenced",
         ),
     ),
-    Revert(
+    revert(
         "ldcnd/daemon/axis/axis.py",
         "            self._bus.distrust()  # another drive's reply that came late would be followed by others\n",
         "            pass\n",
         ("tests/integration/test_rough_lines.py::test_a_rough_line_shows_no_false_position_and_lets_stops_through",),
     ),
-    *LDCN_REVERTS,
 )
-
-
-def pytest_configure() -> None:
-    """Put the module without the fix before the module."""
-    if REVERT in os.environ:
-        sys.meta_path.insert(0, ChangedFinder(REVERTS[int(os.environ[REVERT])], ROOT))
