@@ -1,4 +1,4 @@
-"""What was on a line and why: the flight recorder's journal and pages, and captures on disk.
+"""Captures of a line and their causes: the flight recorder's journal and pages, and captures on disk.
 
-Serves operators who look for a fault. Start with `captures.py`.
+Serves operators who search for a fault. Start with `captures.py`.
 """

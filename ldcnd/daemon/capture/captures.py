@@ -34,8 +34,8 @@ class CaptureStore:
 
     Args:
         directory: made when the first capture is written.
-        files: so many captures at most.
-        total_bytes: so much disk space at most; the newest capture stays even if it is larger.
+        files: maximum number of captures.
+        total_bytes: maximum disk space; the newest capture stays even if it is larger.
     """
 
     def __init__(self, directory: Path, files: int, total_bytes: int) -> None:
@@ -102,7 +102,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What the flight recorder of a line held at one instant; quick to take, and then independent of the line."""
+    """The contents of a line's flight recorder at one instant; quick to take, and then independent of the line."""
 
     bus: str
     family: str

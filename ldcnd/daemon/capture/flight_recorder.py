@@ -1,7 +1,7 @@
-"""What clients ask for, written into the flight recorders of the lines concerned, between the packets.
+"""The requests of clients, written into the flight recorders of the lines concerned, between the packets.
 
 A line of the journal is `axis/verb {payload}`, or `@stop/axis {}`, with the payload as JSON. A lease is named by a
-fingerprint: whoever reads a wire log must not be able to command with what it finds there.
+fingerprint: a reader of a wire log must not be able to command with what it contains.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ STOP = "@stop"
 
 
 class Journal:
-    """Knows which line an axis is on; what concerns the rig as a whole is written to all lines."""
+    """Maps an axis to its line; requests that concern the whole rig are written to all lines."""
 
     def __init__(self, rig: Rig) -> None:
         logs = [(line.bus.wire_log, [axis.config.name for axis in line.axes]) for line in rig.buses]
@@ -63,7 +63,7 @@ def fingerprint(token: str) -> str:
 
 
 def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:
-    """Return the records of one line that were asked for, the oldest first, as many as one reply takes.
+    """Return the requested records of one line, the oldest first, as many as one reply takes.
 
     Raises:
         ValueOutOfRange: the rig has no such line.

@@ -1,6 +1,6 @@
-"""Looks for what is worth a capture: a fault of a drive, a line that went down, a line that does not turn.
+"""Triggers captures: a fault of a drive, a line that went down, a line that does not turn.
 
-It looks a few times a second and changes nothing on the way of a packet. The capture is made a moment after its cause,
+It checks a few times a second and never delays a packet. The capture is made a moment after its cause,
 so that it shows what came of it, and never sooner than `PAUSE_S` after the one before: a loose contact fills no disk.
 """
 

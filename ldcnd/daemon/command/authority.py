@@ -1,6 +1,6 @@
-"""Leases: who may move which axis, and since when nobody may. Pure; time is an input.
+"""Leases: which client may move which axis, and since when none may. Pure; time is an input.
 
-A lease ends by the daemon's own clock. It is ended before anything that waited is looked at, so that a command which
+A lease ends by the daemon's own clock. It is ended before any waiting command is examined, so that a command which
 was delivered late - because the daemon, the link or the client was frozen - finds no lease and is refused.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, Remedy, StaleSequence, UnknownAxis, step
 
 REMEMBERED = 256
-"""So many ended leases are remembered, to tell a stale command from a made-up one."""
+"""Maximum number of ended leases kept, to distinguish a stale command from an invented lease."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Authority:
 
         Args:
             axes: the axes of the rig.
-            required: whether a motion needs a lease; without, an axis that nobody holds is open to all.
+            required: whether a motion needs a lease; without, an axis without a holder is open to all.
             next_token: makes what a lease is known by.
         """
         self._next_token = next_token
@@ -74,7 +74,7 @@ class Authority:
 
         Raises:
             UnknownAxis: there is no such axis.
-            LeaseHeld: another client holds one of the axes, and `force` was not asked for.
+            LeaseHeld: another client holds one of the axes, and `force` was not requested.
         """
         wanted = frozenset(axes) or self._axes
         if unknown := sorted(wanted - self._axes):
@@ -125,11 +125,11 @@ class Authority:
         return over
 
     def admit(self, axis: str, token: str | None, sequence: int | None, now_s: float) -> str | None:
-        """Decide whether a command may be looked at; return who sends it, if it says so.
+        """Decide whether a command may be considered; return its sender, if the command names one.
 
         Raises:
             LeaseRequired: the axis needs a lease and the command carries none.
-            LeaseHeld: somebody else holds the axis, or the lease does not cover it.
+            LeaseHeld: another client holds the axis, or the lease does not cover it.
             LeaseExpired, LeaseUnknown: the lease does not hold.
             StaleSequence: the command is not newer than the last one under this lease.
         """

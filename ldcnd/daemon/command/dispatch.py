@@ -108,7 +108,7 @@ class Dispatcher:
 
         Args:
             axis: which axis, or `RIG_ITSELF`.
-            command: what is asked.
+            command: the request.
             login: whose link it came over, for the record.
 
         Raises:
@@ -209,12 +209,12 @@ class Dispatcher:
         return reply
 
     def stopped(self, names: tuple[str, ...], confirmed: tuple[str, ...], command: Stop, login: str | None) -> None:
-        """Enter stops that were carried out already, with who has asked for them: one event for each axis.
+        """Enter stops that were carried out already, with their requester: one event for each axis.
 
         Args:
             names: the axes that were stopped.
             confirmed: those whose drives acknowledged it.
-            command: what came with the stop; nothing but its `client` is looked at.
+            command: the stop request; only its `client` is used.
             login: whose link it came over, for the record.
         """
         for name in names:
@@ -266,7 +266,7 @@ class Dispatcher:
         raise entry.answer or OutcomeUnknown(f"axis {entry.axis}: nobody knows how {entry.verb} went", axis=entry.axis)
 
     def _admit(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:
-        """Refuse what is stale, late or somebody else's; return who sends it, if it says so."""
+        """Refuse a command that is stale, late or sent by another client; return its sender, if it names one."""
         if command.effect is Effect.REST:
             return None
         self._refuse_rival(axis)
@@ -412,7 +412,7 @@ def _reply(lease: Lease) -> LeaseReply:
 
 
 Execute = Callable[[str, AxisCommand[CommandReply]], Awaitable[CommandReply]]
-"""Carries out a command of an axis, with whatever the daemon asks before it does."""
+"""Carries out a command of an axis, after all checks of the daemon."""
 
 
 async def move_together(
@@ -436,7 +436,7 @@ async def move_together(
         UnknownAxis: there is no such axis.
         NotSupported: the axes are on different lines, or are no group.
         RequestRefused: a member cannot move, or they would leave the line; nothing was started.
-        BusError: the line failed; `OutcomeUnknown` when a drive may have started, then all were told to stop.
+        BusError: the line failed; `OutcomeUnknown` when a drive may have started, then all were commanded to stop.
     """
     line = _line_of(rig, moves)
     meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)

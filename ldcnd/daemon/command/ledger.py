@@ -1,9 +1,9 @@
-"""What became of every command: the same id is carried out at most once, always answered alike, and told as events.
+"""The outcome of every command: an id is carried out at most once, always answered alike, and published as events.
 
 Two memories, because an answer is large and an id is small. Of each sender the latest commands are kept whole, with
-their answers; nobody else's traffic pushes them out. Of every id that a sender chose, a fingerprint is kept for
-`REPLAYED_WITHIN_S`: a command that comes again when its answer is forgotten is refused. Commands that carry a lease
-and a sequence need no fingerprint: an old sequence is refused as long as the lease lives, and the lease afterwards.
+their answers; other senders' traffic never evicts them. Of every id that a sender chose, a fingerprint is kept for
+`REPLAYED_WITHIN_S`: a command that comes again after its answer was evicted is refused. Commands that carry a lease
+and a sequence need no fingerprint: an old sequence is refused while the lease is valid, and the lease afterwards.
 """
 
 import asyncio
@@ -25,13 +25,13 @@ from ldcnd.model.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, E
 from ldcnd.model.events import FINAL, CommandEvent, CommandStatus, EventList, ReadEvents
 
 ANSWERS_PER_SENDER = 512
-"""Final commands of one sender whose answers are kept; those that are not final are never forgotten."""
+"""Final commands of one sender whose answers are kept; those that are not final are never evicted."""
 SENDERS = 64
-"""Senders whose answers are kept; then those of the sender that was silent longest are forgotten."""
+"""Senders whose answers are kept; beyond this, those of the sender that was silent longest are evicted."""
 LARGEST_MEMORY = 250_000
-"""Ids that are remembered at most; with so many within `REPLAYED_WITHIN_S`, further ones are refused."""
+"""Maximum number of ids kept; when they all fall within `REPLAYED_WITHIN_S`, further ones are refused."""
 RESTING = "\0rest"
-"""Whatever brings an axis to rest is carried out as often as it is asked; its entries have a memory of their own."""
+"""Commands that bring an axis to rest are carried out at every request; their entries are kept separately."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ class Entry:
     """One command.
 
     Attributes:
-        command: what was asked; a repetition must ask the same.
-        client: who asked, as far as that is known.
+        command: the request; a repetition must be equal.
+        client: the requester, as far as that is known.
         login: whose link it came over, if that has a certificate.
         status: how far it has got.
-        reason: why it did not end as asked.
-        answer: what the caller was told, once he was.
+        reason: why it did not end as requested.
+        answer: the reply to the caller, once sent.
         arrival: where its motion has ended.
     """
 
@@ -76,7 +76,7 @@ class Ledger:
         """
         self._entries: dict[str, Entry] = {}
         self._of_senders: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
-        self._until_s: dict[int, float] = {}  # by fingerprint, in the order in which they are forgotten
+        self._until_s: dict[int, float] = {}  # by fingerprint, in the order of expiry
         self._changed = changed
         self._now_s = now_s
 
@@ -84,7 +84,7 @@ class Ledger:
         """Return the entry that this id has already, or None when it is new.
 
         Raises:
-            CommandIdReused: the id belongs to another command, or to one whose answer is forgotten.
+            CommandIdReused: the id belongs to another command, or to one whose answer was evicted.
         """
         entry = self._entries.get(command_id)
         if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
@@ -107,7 +107,7 @@ class Ledger:
         """Return an entry.
 
         Raises:
-            UnknownCommand: there is none, or it was forgotten.
+            UnknownCommand: there is none, or it was evicted.
         """
         entry = self._entries.get(command_id)
         if entry is None:
@@ -137,7 +137,7 @@ class Ledger:
         self._changed(entry, None)
 
     def answered(self, command_id: str, answer: CommandReply | LdcndError, status: CommandStatus) -> None:
-        """Note what the caller was told."""
+        """Record the reply to the caller."""
         entry = self._entries.get(command_id)
         if entry is None:
             return
@@ -209,7 +209,7 @@ class Ledger:
                 return
 
     def _forget_sender(self) -> None:
-        """Forget the answers of the sender that was silent longest, but for what is under way."""
+        """Evict the answers of the sender that was silent longest, except for commands under way."""
         for sender, entries in self._of_senders.items():
             if all(self._entries[command_id].status in FINAL for command_id in entries):
                 for command_id in entries:
@@ -223,7 +223,7 @@ def _fingerprint(command_id: str) -> int:
 
 
 def _content(command: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:
-    """Return what a command asks for, without what only proves that it may."""
+    """Return the request without the fields that only authorise it."""
     proofs = dict.fromkeys(("client", "lease", "sequence", "instance", "not_after"))
     return command.model_copy(update=proofs)
 
@@ -233,7 +233,7 @@ log = get_logger("events")
 TOLD_AFTER_S = 0.005
 """Longer than a command takes that is one exchange at 115200 baud and waits for another one."""
 UNTOLD_EVENTS = 64
-"""With so many they are told at once."""
+"""With this many unpublished events, publish them at once."""
 KEPT_EVENTS = 1000
 PAGE_BYTES = 12_000
 """Events in one reply: with its other fields it stays below what a payload may have."""
@@ -241,7 +241,7 @@ PAGE_BYTES = 12_000
 
 @dataclass(frozen=True, slots=True)
 class _News:
-    """What has happened and is not told yet."""
+    """An event that is not yet published."""
 
     t: int
     seq: int
@@ -253,8 +253,8 @@ class _News:
 class EventLog:
     """Numbers, keeps and publishes what happens to commands.
 
-    An event has its numbers and its instant at once. It is told a little later, because to tell it takes as long as all
-    else that a command waits for on its way to the line, and nobody who waits for the command waits for that.
+    An event has its numbers and its instant at once. It is published a little later, because publishing takes as long
+    as the rest of a command's way to the line, and a caller must not wait for it.
     """
 
     def __init__(self, publisher: Publisher, clock: Clock, run: str) -> None:
@@ -289,7 +289,7 @@ class EventLog:
             self.tell()
 
     def tell(self) -> None:
-        """Publish and log all that has happened so far."""
+        """Publish and log all unpublished events."""
         while self._news:
             self._tell(self._news.popleft())
 
@@ -350,7 +350,7 @@ class EventLog:
         self._kept.append(event)
         try:
             self._publisher.publish_event(event)
-        except SessionError as error:  # who asks for events still finds it
+        except SessionError as error:  # still served to `events` requests
             log.warning("event not published", axis=event.axis, command_id=event.command_id, reason=error.message)
         if event.status is CommandStatus.ACCEPTED:
             return  # what became of it follows
@@ -370,7 +370,7 @@ class EventLog:
         )
 
     def page(self, request: ReadEvents) -> EventList:
-        """Return the events that were asked for, as many as one reply takes."""
+        """Return the requested events, as many as one reply takes."""
         self.tell()
         oldest = self._end - len(self._kept)
         if request.from_number is None:

@@ -34,7 +34,7 @@ class LeaseWatch:
     """Gives control and ends it; what moved under a lease that has ended comes to rest as configured.
 
     Attributes:
-        group: where policies run; None until the daemon runs, and until then nobody has control.
+        group: where policies run; None until the daemon runs, and until then no client has control.
     """
 
     def __init__(self, rig: Rig, authority: Authority, events: EventLog, clock: Clock) -> None:
@@ -53,17 +53,17 @@ class LeaseWatch:
             await asyncio.sleep(min(left_s, SHORTEST_LEASE_S))
 
     def expire(self) -> None:
-        """End what was not renewed in time; called before any command that waited is looked at."""
+        """End leases that were not renewed in time; called before any waiting command is examined."""
         for lease in self._authority.expire(self._clock.now_s()):
             log.warning("lease ended", client=lease.client, axes=sorted(lease.axes))
             self._lost(lease, lease.axes, "its lease was not renewed", ErrorCode.LEASE_EXPIRED)
 
     def acquire(self, request: Acquire) -> Lease:
-        """Give a client control; whoever had it before loses it.
+        """Give a client control; the previous holder loses it.
 
         Raises:
             UnknownAxis: there is no such axis.
-            LeaseHeld: another client holds one of the axes, and `force` was not asked for.
+            LeaseHeld: another client holds one of the axes, and `force` was not requested.
         """
         self.expire()
         wanted = self._rig.members(request.axes)

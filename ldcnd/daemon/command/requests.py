@@ -18,9 +18,9 @@ from ldcnd.model.frozen import Frozen
 log = get_logger("requests")
 
 STOPS_AT_ONCE = 8
-"""So many stops of the same axes are sent one beside the other; more than that join."""
+"""Maximum number of concurrent stops of the same axes; further ones join."""
 PENDING_REQUESTS = 64
-"""So many commands may be under way at once; stops are not counted."""
+"""Maximum number of concurrent commands; stops are not counted."""
 
 
 class EarlyStops:
@@ -127,7 +127,7 @@ class Requests:
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
         """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.
 
-        Hundreds may ask at once, and the lines carry a few stops for all of them. Only a stop whose latches still hold
+        Hundreds of clients may request a stop at once, and a few stops serve all. Only a stop whose latches still hold
         is joined: since they were set nothing has begun to move, so there is nothing that it does not stop. What joins
         leaves no event of its own.
         """
@@ -139,14 +139,14 @@ class Requests:
             # a reset that was under way has taken the latch from this stop
         for axis in (self._rig.axis(name) for name in names):
             if axis.stoppable:
-                axis.tracker.latch_stop()  # at once, for those who ask in this very turn of the loop
+                axis.tracker.latch_stop()  # at once, for requests of this same loop iteration
         own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
         under_way.append(own)
         try:
             confirmed = await self._rig.stop(names)
         except BaseException:
             own.set_exception(InternalError("the stop that this one had joined was cut short"))
-            own.exception()  # perhaps nobody has joined
+            own.exception()  # perhaps no other stop has joined
             raise
         else:
             own.set_result(confirmed)
@@ -156,7 +156,7 @@ class Requests:
             under_way.remove(own)
 
     def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
-        """Tell in the events who has asked for a stop, as far as that can be read; nothing has waited for this."""
+        """Record the requester of a stop in the events, as far as that can be read; nothing has waited for this."""
         try:
             request = decode(Stop, query.payload, query.encoding)
         except LdcndError:

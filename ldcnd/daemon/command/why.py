@@ -1,4 +1,4 @@
-"""Why an axis cannot move now: every guard is asked, not only the first that refuses."""
+"""Why an axis cannot move now: every guard is evaluated, not only the first that refuses."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from ldcnd.model.samples import FaultEntry
 
 
 def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) -> WhyReply:
-    """Ask every guard about a motion.
+    """Evaluate every guard for a motion.
 
     Args:
         tracker: what is known of the axis.

@@ -25,11 +25,11 @@ FIRST_RETRY_S = 0.5
 LONGEST_RETRY_S = 10.0
 FIRST_LOOK_S = 0.25
 LONGEST_LOOK_S = 2.0
-"""Longest pause between two looks for drives that have gone: what powers up must be back within 3 s."""
+"""Longest pause between two scans for lost drives: a drive that powers up must be back within 3 s."""
 CAPTURING = frozenset({Verb.HOME, Verb.PROBE})
 """Commands that wait for a capture in the drive's home register."""
 LOOK_SHARE = 0.01
-"""Of the line's time, for these looks; more where the longest pause is too short for that."""
+"""Share of the line's time for these scans; more where the longest pause requires it."""
 
 
 class BusService:
@@ -89,7 +89,7 @@ class BusService:
         await self._up.wait()
 
     async def wait_down(self) -> None:
-        """Return as soon as the axes know that the line is lost."""
+        """Return as soon as the axes are informed of the line's loss."""
         await self._down.wait()
 
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
@@ -146,7 +146,7 @@ class BusService:
                 self._poll(axis, asyncio.get_running_loop().time())
 
     def asked_hz(self, axis: str) -> Mapping[TelemetryItem, float]:
-        """Return how often the items of an axis are asked for now."""
+        """Return the current rates at which the items of an axis are polled."""
         poller = self._pollers.get(axis)
         return poller.rates_hz if poller else {}
 
@@ -155,7 +155,7 @@ class BusService:
         while True:
             await self.bus.wait_opened()
             if self.bus.baud == (self._baud or self.bus.baud):
-                await self._send_pending_stops()  # before anything else; at another rate the drives would not hear it
+                await self._send_pending_stops()  # first: at another rate the drives would not receive it
             try:
                 report = await self.network.bring_up()
             except LdcndError as error:  # also a stop that took one of its packets off the queue
@@ -212,7 +212,7 @@ class BusService:
             await self._send_pending_stops()
 
     async def _look_after(self) -> None:
-        """Look for drives that have lost power and came back; return when the line is lost."""
+        """Scan for drives that lost power and came back; return when the line is lost."""
         pause_s = FIRST_LOOK_S
         loop = asyncio.get_running_loop()
         while not await self._closed_within(pause_s):
@@ -240,7 +240,7 @@ class BusService:
             await self.wait_up()
             try:
                 await self.bus.probe_stop_wait()
-            except LdcndError as error:  # a lost reply is counted and told by those who look after the drive
+            except LdcndError as error:  # a lost reply is counted and reported by the drive's owner
                 log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
 
     async def _closed_within(self, pause_s: float) -> bool:
@@ -284,7 +284,7 @@ class BusService:
         self._up.set()
 
     def _poll(self, axis: AxisService, now_s: float) -> None:
-        """Ask the axis from now on; a poller that it had is replaced."""
+        """Poll the axis from now on; an existing poller is replaced."""
         if previous := self._pollers.get(axis.config.name):
             self.bus.remove_poller(previous)
         poller: Poller[Any]

@@ -1,4 +1,4 @@
-"""The I/O modules of the lines: their samples on the way out, and commands for them on the way in."""
+"""The I/O modules of the lines: publishes their samples and carries out commands for them."""
 
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher

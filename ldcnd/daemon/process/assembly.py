@@ -1,4 +1,4 @@
-"""The composition root: from a configuration to a daemon that is ready to run. The only place that knows every part."""
+"""The composition root: builds a daemon that is ready to run from a configuration; the only place with all parts."""
 
 import secrets
 import time

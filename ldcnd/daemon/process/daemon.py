@@ -35,11 +35,11 @@ API = 1
 """Version of keys and payloads: within one, fields are only ever added."""
 TOKEN_PERIOD_S = 0.2
 STOP_TIME_S = 2.0
-"""A daemon that is told to end gives its axes so long to confirm what their policies say."""
+"""Time for the axes to confirm their loss policies when the daemon is ended."""
 
 
 class Daemon:
-    """Serves one rig over one session until it is told to end.
+    """Serves one rig over one session until it is ended.
 
     Attributes:
         rig: what it serves.
@@ -88,7 +88,7 @@ class Daemon:
         return self._config
 
     def end(self) -> None:
-        """Ask the daemon to stop its axes and to leave; `run` returns when that is done."""
+        """Request the daemon to stop its axes and to leave; `run` returns when that is done."""
         self._ending.set()
 
     def capture(self, bus: str, cause: str) -> Capture:
@@ -198,7 +198,7 @@ class Daemon:
         await until_end(await session.declare_token(keys.alive(self._run.instance)))
 
     def _load(self) -> Load:
-        """Return how the daemon keeps up with what is asked of it."""
+        """Return how the daemon keeps up with its load."""
         loads = [declaration.load for declaration in self._declarations]
         return Load(sum(load.waiting for load in loads), sum(load.lost for load in loads))
 

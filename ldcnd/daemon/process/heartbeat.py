@@ -24,7 +24,7 @@ from ldcnd.transport.level import GpioLine, LevelFile, ModemLine, Output
 log = get_logger("heartbeat")
 
 HOLDING = frozenset({Kind.NO_ANSWER, Kind.STOP_PENDING})
-"""What of an axis holds the level: faults and latched stops are the drive's own and the machine's business."""
+"""Troubles of an axis that hold the level; faults and latched stops are the drive's own and the machine's business."""
 REOPEN_S = 1.0
 """Pause between two attempts to open an output that is gone."""
 
@@ -69,7 +69,7 @@ class Heartbeat:
 
     @property
     def health(self) -> HeartbeatHealth:
-        """How it is, for those who ask."""
+        """The current state, for status requests."""
         return HeartbeatHealth(beating=not self._why, why=self._why, changes=self._changes)
 
     async def run(self) -> None:

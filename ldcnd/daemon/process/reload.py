@@ -1,6 +1,6 @@
-"""What a changed configuration means for a rig that runs: which changes it takes, which need a restart. Pure.
+"""The effect of a changed configuration on a running rig: which changes it takes, which need a restart. Pure.
 
-Taken is what only later commands and polls look at: limits, velocities and accelerations that requests leave out,
+Taken are changes that affect only later commands and polls: limits, velocities and accelerations that requests omit,
 polling rates and priorities. A motion under way keeps the values that it was started with. All the rest says where
 drives are, what they are, or how the daemon was built.
 """
@@ -18,7 +18,7 @@ from ldcnd.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Reload:
-    """What becomes of a changed configuration.
+    """The effect of a changed configuration.
 
     Attributes:
         config: to run with from now on.

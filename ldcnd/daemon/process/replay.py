@@ -166,7 +166,7 @@ async def play(capture: Capture, config: RigConfig, take: Take) -> Played:
 
 
 async def _ask(clients: MemorySession, key: str, payload: bytes) -> None:
-    """Ask as the client did; what it was told is not in the capture."""
+    """Repeat a client's request; the capture does not contain the reply it got."""
     await clients.query(key, payload, encoding=Encoding.JSON, timeout_s=3600.0)
 
 

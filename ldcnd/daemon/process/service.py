@@ -1,7 +1,7 @@
-"""The daemon as a service: says when it is ready and what works, feeds the watchdog, reloads when asked, ends in order.
+"""The daemon as a service: reports readiness and state, feeds the watchdog, reloads on request, ends in order.
 
 The watchdog is fed only while every bus keeps to its own plan. So it ends a daemon whose loop hangs and one whose loop
-runs while a line does not; a line without adapter or without drives is no reason, and is told in the status instead.
+runs while a line does not; a line without adapter or without drives is no reason, and appears in the status instead.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ from ldcnd.planning.plan import require_plan
 log = get_logger("service")
 
 CPU_LATENCY = Path("/dev/cpu_dma_latency")
-"""Linux: whoever holds it open with a number of microseconds in it bounds how long the processor takes to wake up."""
+"""Linux: while it is held open with a number of microseconds in it, the processor wakes up within that time."""
 
 LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 
@@ -104,7 +104,7 @@ def last_words(speak: Callable[[], object]) -> Iterator[None]:
 
 
 def settle_heap() -> None:
-    """Take what start-up has left behind out of the collector's sight: it lives as long as the process.
+    """Exempt objects left by start-up from garbage collection: they stay as long as the process.
 
     A full collection of it would hold up several polls.
     """
@@ -143,7 +143,7 @@ def _hold(device: Path) -> int | None:
 
 STATUS_PERIOD_S = 1.0
 FEEDINGS = 3
-"""The watchdog is fed so often within its time."""
+"""Number of watchdog notifications within its time-out."""
 TRIES, TRY_PERIOD_S = 50, 0.1
 RELOAD_TIME_S = 10.0
 """A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
@@ -176,7 +176,7 @@ class Service:
         self._remark = ""
 
     def reload(self) -> None:
-        """Ask for the configuration to be read again; requests that come meanwhile are one."""
+        """Request a reload of the configuration; requests that come meanwhile are merged."""
         self._asked.set()
 
     def end(self) -> None:
@@ -212,7 +212,7 @@ class Service:
             await asyncio.sleep(period_s)
 
     async def _assure(self, *messages: str) -> None:
-        """Tell what is told only once, again and again for a while if the service manager is too busy to take it."""
+        """Send a one-time message, repeatedly for a while if the service manager is too busy to take it."""
         for _ in range(TRIES):
             if self._notifier.tell(*messages):
                 return

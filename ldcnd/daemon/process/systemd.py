@@ -42,7 +42,7 @@ class Notifier:
         return bool(self._address)
 
     def tell(self, *messages: str) -> bool:
-        """Send messages as one datagram; return whether it was taken, or nobody is there to take it."""
+        """Send messages as one datagram; return whether it was taken or there is no service manager."""
         if not self._address or not messages:
             return True
         try:
@@ -58,7 +58,7 @@ class Notifier:
 
 
 def _watchdog_s(environment: Mapping[str, str], pid: int) -> float | None:
-    """Return within which time the watchdog must be fed again and again; None when nobody watches this process."""
+    """Return the time-out of the watchdog, seconds; None when there is no watchdog."""
     if environment.get("WATCHDOG_PID", str(pid)) != str(pid):
         return None
     period_us = environment.get("WATCHDOG_USEC", "")

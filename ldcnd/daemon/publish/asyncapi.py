@@ -1,6 +1,6 @@
-"""The AsyncAPI 3 document of the interface, for generators and for people who know no Zenoh.
+"""The AsyncAPI 3 document of the interface, for generators and for readers without Zenoh.
 
-AsyncAPI has no words for Zenoh's queries: they are told as request and reply on one channel, whose address is the key.
+AsyncAPI has no term for Zenoh's queries: they appear as request and reply on one channel, whose address is the key.
 Source: AsyncAPI specification 3.0.0; payloads are the JSON Schemas of the models, dialect 2020-12.
 """
 

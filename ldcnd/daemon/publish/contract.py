@@ -43,7 +43,7 @@ class Kind(StrEnum):
     COMMAND = "command"
     """Answered once it was carried out or refused."""
     STOP = "stop"
-    """Answered; nobody is refused."""
+    """Answered; never refused."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,11 +25,11 @@ from ldcnd.model.samples import TelemetryItem
 
 PERIOD_S = 1.0
 TURNS = 4
-"""A rate is told from so many turns at least: what comes every ten seconds is not there in most seconds."""
+"""Minimum number of periods to measure a rate: an item polled every ten seconds is absent in most seconds."""
 CLOCK_S = 0.1
 """Reports are no more punctual than this."""
 LAG_LOOKS = 10
-"""So many times in a period a timer is looked at for how late it comes."""
+"""Number of measurements of the loop's timer lag per period."""
 LANES: Mapping[Lane, str] = {lane: lane.name.lower() for lane in Lane}
 
 
@@ -37,7 +37,7 @@ class _Rate:
     """How often something comes, from the instants of the samples themselves, over as long as it takes to tell.
 
     Args:
-        now_s: when it was looked at first.
+        now_s: start of the measurement.
         count: samples until then.
         at_ns: when the latest of them was true.
         hz: the rate until there is one to measure.
@@ -55,7 +55,7 @@ class _Rate:
         """Return the rate since at least `least_s` ago; before that the one found last.
 
         Args:
-            count: samples so far.
+            count: samples since the start.
             at_ns: when the latest of them was true.
             now_s: when the report is made.
             least_s: how long it takes to tell.
@@ -76,7 +76,7 @@ class HealthWatch:
     Args:
         rig: what is reported on.
         keys: where.
-        publisher: takes the reports, and knows what else was published.
+        publisher: takes the reports, and has the counts of other publications.
         clock: as everywhere.
         load: returns how the daemon keeps up with its queries.
 
@@ -213,7 +213,7 @@ class HealthWatch:
         return topic
 
     def _granted_hz(self, topic: Topic, asked_hz: float) -> float:
-        """Return how often an item was published lately; as often as asked for until that can be measured."""
+        """Return the recent publishing rate of an item; the configured rate until that can be measured."""
         at_ns, now_s = topic.at_ns, self._clock.now_s()
         rate = self._rates.get(topic)
         if at_ns is None:

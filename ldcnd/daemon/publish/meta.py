@@ -1,4 +1,4 @@
-"""What the rig says about itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
+"""The rig's description of itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -30,7 +30,7 @@ WORK_PER_STEP = 16
 """Payloads that go into an answer in one turn of the loop; to encode a sample counts for 4, a description for 16."""
 SAMPLE_WORK, DESCRIPTION_WORK = 4, 16
 COUNTERS_HZ = 10
-"""So often the counters of a line's description are brought up to date at most."""
+"""Maximum update rate of the counters in a line's description, Hz."""
 REMEMBERED = 1024
 """Encoded samples and reports that are kept at most; more keys than a rig has."""
 LEVELS: Mapping[bool | None, Literal["high", "low"] | None] = {True: "high", False: "low", None: None}
@@ -48,7 +48,7 @@ class _Part:
 
 
 class _Encoded:
-    """The payloads of one key, made anew only when what they are made of has changed."""
+    """The payloads of one key, rebuilt only when their source has changed."""
 
     __slots__ = ("_model", "_payloads", "_source")
 
@@ -69,7 +69,7 @@ class _Encoded:
 
 
 class Describing:
-    """Answers questions about one rig in steps; JSON unless the selector asks for `?enc=msgpack`."""
+    """Answers queries about one rig in steps; JSON unless the selector has `?enc=msgpack`."""
 
     def __init__(
         self,

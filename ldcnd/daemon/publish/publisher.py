@@ -76,7 +76,7 @@ class Topic:
 
     @property
     def sample(self) -> Sample | None:
-        """The last sample; made when it is asked for."""
+        """The last sample; built on first use."""
         if self._sample is None and self.values is not None:
             self._sample = self._model.model_construct(set(self.values), **self.values)
         return self._sample
@@ -109,7 +109,7 @@ class Publisher:
 
     Attributes:
         last: the newest sample of each key.
-        published: samples and events handed to the network so far.
+        published: samples and events handed to the network since the start.
         session: the network.
         encoding: of payloads.
         send: hands a payload to the network.
@@ -168,7 +168,7 @@ class Publisher:
                 self.session.delete(key)
 
     def withdraw(self, axis: str) -> None:
-        """Take an axis off the network: its last values must not look alive."""
+        """Take an axis off the network: its last values must not appear current."""
         keys = [self._keys.telemetry(axis, item) for item in TelemetryItem]
         keys += [self._keys.monitor(axis, name) for name in MonitorName]
         keys.append(self._keys.trace(axis))

@@ -33,7 +33,7 @@ from ldcnd.model.traces import TakeTrace, TraceChannel, TracePhase, TraceSource,
 
 GRACE_S = 10.0
 SLACK = 10.0
-"""A busy line may stretch a trace so much before it is given up."""
+"""Maximum factor by which a busy line may stretch a trace before it is given up."""
 
 
 Raw = tuple[int | float | None, ...]
@@ -42,7 +42,7 @@ Values = tuple[float | None, ...]
 
 @dataclass(frozen=True, slots=True)
 class HostSample:
-    """What one poll said of each channel, and between which instants of the loop's clock that was true."""
+    """The values of each channel in one poll, and the loop-clock instants between which they were true."""
 
     raw: Raw
     values: Values
@@ -62,14 +62,14 @@ class HostSample:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is to be kept.
+    """The samples to keep.
 
     Attributes:
         measure: returns the raw and the scaled values of a reading.
-        fires: told the values of each sample and whether enough precede it, tells whether it is the trigger; None
+        fires: takes the values of each sample and whether enough precede it, returns whether it is the trigger; None
             where the first sample counts.
         samples: how many.
-        pre_trigger: so many of them before the trigger.
+        pre_trigger: number of them before the trigger.
     """
 
     measure: Callable[[AxisReading], tuple[Raw, Values]]
@@ -82,7 +82,7 @@ class HostCapture(Poller[AxisReading]):
     """Polls until there are enough samples.
 
     Attributes:
-        samples: what counts so far; empty before the trigger.
+        samples: the samples kept; empty before the trigger.
         trigger_index: which of them fired the trigger; None without one.
         filled: set once a trigger counts, or never will.
         triggered: set once samples count, or never will.
@@ -165,7 +165,7 @@ class HostChannel:
         channel: as clients see it.
         raw: what the reading says.
         value: the raw value in the channel's unit.
-        item: what must be asked for; None for what every reading says.
+        item: the item to poll; None for what every reading contains.
         signal: 0 or 1.
     """
 

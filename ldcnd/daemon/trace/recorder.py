@@ -56,7 +56,7 @@ class TraceRecorder:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What can be recorded."""
+        """The channels that can be recorded."""
         return self._tracer.channels
 
     async def carry_out(self, command_id: str, command: AxisCommand[CommandReply]) -> CommandReply:
