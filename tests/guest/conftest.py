@@ -46,7 +46,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         steps_end = stack.enter_context(far_end(steps, baud_check=False))
         adapters = (Adapter(USB, ends[0]), Adapter(FAST, ends[1]), Adapter(STEPS, steps_end))
         began_s = time.monotonic()
-        guest = stack.enter_context(booted_guest(deb, adapters, ends[2], (7447, 7448)))
+        guest = stack.enter_context(booted_guest(deb, adapters, ends[2].path, (7447, 7448)))
         FOUND.append(
             f"image made ready and guest booted in {time.monotonic() - began_s:.0f} s, boot {guest.boot_s:.0f} s"
         )

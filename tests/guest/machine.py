@@ -15,11 +15,12 @@ import shutil
 import socket
 import subprocess
 import tempfile
+import termios
 import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ldcnd.sim.chain import Chain
@@ -43,6 +44,8 @@ SECTOR_BYTES = 512
 BOOT_ARGUMENTS = "console=ttyS0 quiet net.ifnames=0 mitigations=off nokaslr audit=0 apparmor=0 selinux=0 no_timer_check"
 TRIAL_S = 15.0
 """A kernel that is truly accelerated has booted without a root by then."""
+TAKEN_WITHIN_S = 0.5
+"""Maximum time in which QEMU reads what waits for an adapter, seconds."""
 Done = subprocess.CompletedProcess[str]
 
 
@@ -77,11 +80,51 @@ def image() -> Path:
 
 
 @dataclass(frozen=True)
+class FarEnd:
+    """The host's end of a line, where the simulated drives are.
+
+    Attributes:
+        path: the terminal that leads to it.
+        serving: held while the drives read and write.
+        door: to be held before `serving` is asked for; the drives wait here.
+    """
+
+    path: Path
+    serving: threading.Lock = field(default_factory=threading.Lock)
+    door: threading.Lock = field(default_factory=threading.Lock)
+
+    def serve(self, line: PtyLine, stopped: threading.Event) -> None:
+        """Let the drives read and write until an event."""
+
+        def stop() -> bool:
+            self.serving.release()
+            with self.door:
+                self.serving.acquire()
+            return stopped.is_set()
+
+        with self.serving:
+            line.run(stop)
+
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """Keep the drives from writing, once QEMU has taken what they have written."""
+        with self.door, self.serving:
+            terminal = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            try:
+                until_s = time.monotonic() + TAKEN_WITHIN_S
+                while fcntl.ioctl(terminal, termios.FIONREAD, bytes(4)) != bytes(4) and time.monotonic() < until_s:
+                    time.sleep(0.001)
+                yield
+            finally:
+                os.close(terminal)
+
+
+@dataclass(frozen=True)
 class Adapter:
     """A USB adapter of the guest, with a far end on the host."""
 
     serial: str
-    line: Path
+    far_end: FarEnd
 
     @property
     def id(self) -> str:
@@ -166,8 +209,13 @@ class Guest:
         return seen
 
     def pull(self, serial: str) -> None:
-        """Unplug an adapter; returns when it is gone."""
-        self._monitor.execute("device_del", {"id": self._adapters[serial].id}, until="DEVICE_DELETED")
+        """Unplug an adapter; returns when it is gone.
+
+        Its far end is silent meanwhile: QEMU 7.2 crashes when a byte arrives for an adapter that has left its bus.
+        """
+        adapter = self._adapters[serial]
+        with adapter.far_end.silent():
+            self._monitor.execute("device_del", {"id": adapter.id}, until="DEVICE_DELETED")
 
     def push(self, serial: str) -> None:
         """Plug it in."""
@@ -202,14 +250,15 @@ def run_in(port: int, command: str, given: str = "", timeout_s: float = 60.0) ->
 
 
 @contextmanager
-def far_end(chain: Chain, *, baud_check: bool = True) -> Iterator[Path]:
-    """Run a simulated line in a thread; yields the terminal that leads to it."""
+def far_end(chain: Chain, *, baud_check: bool = True) -> Iterator[FarEnd]:
+    """Run a simulated line in a thread."""
     stopped = threading.Event()
     with PtyLine(chain, baud_check=baud_check) as line:
-        thread = threading.Thread(target=line.run, args=(stopped.is_set,), name=f"line {line.path}")
+        end = FarEnd(line.path)
+        thread = threading.Thread(target=end.serve, args=(line, stopped), name=f"line {line.path}")
         thread.start()
         try:
-            yield line.path
+            yield end
         finally:
             stopped.set()
             thread.join(5)
@@ -251,7 +300,7 @@ def booted_guest(
             *("-qmp", f"unix:{place / 'monitor'},server=on,wait=off"),
         ]
         for adapter in adapters:
-            command += ["-chardev", f"serial,id=far-{adapter.id},path={adapter.line}"]
+            command += ["-chardev", f"serial,id=far-{adapter.id},path={adapter.far_end.path}"]
             command += ["-device", json.dumps(adapter.device)]
         errors = stack.enter_context((place / "errors").open("w+"))
         qemu = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=errors, stderr=errors)  # noqa: S603
