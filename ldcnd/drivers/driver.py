@@ -54,7 +54,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class AxisReading:
-    """What one poll said; position, velocity and state always, other items None where it did not ask.
+    """The values of one poll; position, velocity and state always, other items None when they were not polled.
 
     Attributes:
         position_counts: actual position.
@@ -70,7 +70,7 @@ class AxisReading:
         index: level of the encoder's index; None while it is not shown.
         stop_input: the drive's stop input is open; None while it is not shown.
         amplifier_enable: what the drive holds; None while that is not known.
-        asked: the items that this poll was for; the line may have asked for others since.
+        asked: the items of this poll; the line may have requested others since.
         cut_short: why the drive ended the motion before its end, by itself; empty when it did not.
     """
 
@@ -137,7 +137,7 @@ class PwmOutput:
 
 @dataclass(frozen=True, slots=True)
 class HomeCapture:
-    """What captures the home position on the way, and how the motor stops then.
+    """The signal that captures the home position during the motion, and how the motor stops then.
 
     A drive that cannot stop by itself runs on until it is stopped.
 
@@ -156,7 +156,7 @@ class HomeCapture:
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """What is known of a register that cannot be read back; `value` is None when that is nothing."""
+    """The host's copy of a register that cannot be read back; `value` is None when it is unknown."""
 
     name: str
     value: int | None
@@ -180,14 +180,14 @@ class Gains:
 
 @dataclass(frozen=True, slots=True)
 class AxisSpec:
-    """What the configuration says about one drive.
+    """The configuration of one drive.
 
     Attributes:
         name: of the axis.
         address: node address, 1 to 127.
         model: profile name of the family.
         gains: loaded at power-on; without them the loop stays open.
-        identity: id and version that this drive reports although the family's table does not know them for the model.
+        identity: id and version that this drive reports although the family's table does not list them for the model.
         limit_stop: level of the limit switch inputs at which the drive itself stops a motion towards them; None when
             they are left alone.
     """
@@ -220,7 +220,7 @@ class ReadingListeners:
 class Drive(ABC):
     """One drive, as far as all are alike; what it can do it inherits from the contracts below.
 
-    What can make a motor move says so (`Exchange.moves`): the bus asks for permission when the turn of it has come.
+    An exchange that can make a motor move says so (`Exchange.moves`): the bus checks its permit when its turn has come.
 
     Attributes:
         spec: what the configuration says.
@@ -274,7 +274,7 @@ class Moves(Readable):
 
     @abstractmethod
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
-        """Return what `load` and `start` would send for a motion, for looking at only."""
+        """Return what `load` and `start` would send for a motion; nothing is sent."""
 
     def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
         """Return how far the position counter reaches in a direction, from where the axis was last."""
@@ -303,7 +303,7 @@ class Moves(Readable):
         """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing.
 
         Returns:
-            How: a motor that was switched off, or is being, is switched off again whatever was asked, as a stop that
+            How: a motor that was switched off, or is being, is switched off again whatever the request, as a stop that
             holds would close its loop.
         """
 
@@ -360,8 +360,8 @@ class Homes(ABC):
 
     Attributes:
         home_methods: what can mark the reference position.
-        capture_s: how often the drive looks at the inputs that capture: a shorter pulse can be missed, and what is
-            captured is up to the way of so long behind the edge.
+        capture_s: sampling period of the capture inputs: a shorter pulse can be missed, and the captured position
+            lags by up to the distance moved in this time.
     """
 
     home_methods: frozenset[HomeMethod]
@@ -398,7 +398,7 @@ class HasOutputs(ABC):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a drive shows of the time since its position was last known.
+    """The drive's evidence about the time since its position was last known.
 
     Attributes:
         counts: position, in counts since the drive was reset, as this host counts them.

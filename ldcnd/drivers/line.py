@@ -1,4 +1,4 @@
-"""What a line as a whole is told by the configuration, and what it tells: policies, groups, modules."""
+"""The configuration and the report of a line as a whole: policies, groups, modules."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -32,7 +32,7 @@ class ModuleEntry:
         identity: see `AxisSpec`.
         name: of an I/O module that is served; empty for one that is only watched.
         outputs: its lines that may be driven.
-        rate_hz: how often it is asked.
+        rate_hz: polling rate.
     """
 
     address: int
@@ -60,7 +60,7 @@ class GroupSpec:
 
 @dataclass(frozen=True, slots=True)
 class LineSpec:
-    """What the configuration says about a line as a whole.
+    """The configuration of a line as a whole.
 
     Attributes:
         start: see `StartPolicy`.
@@ -88,7 +88,7 @@ class FoundModule:
     Attributes:
         address: node address.
         title: what it is, for people.
-        model: profile name; None when nobody described this device: then it is never moved.
+        model: profile name; None for an unsupported device: then it is never moved.
         device_id: as it reports.
         version: as it reports.
         name: under which an I/O module is served.

@@ -22,7 +22,7 @@ class BringUpReport:
         baud: the rate in use.
         identities: what was found, by axis name.
         reset: the drives were reset, so their positions count from 0.
-        remarks: what differs from the configuration or deserves a look.
+        remarks: what differs from the configuration or deserves attention.
         placed: axes whose drives were powered on where they stood at that reset, so that 0 is that place.
         open_loops: axes whose drives an earlier host has left with an open loop: nothing in them would end a raw duty.
         restarted: axes whose drives had lost power, on a line that was not reset.
@@ -39,7 +39,7 @@ class BringUpReport:
 
 @dataclass(frozen=True, slots=True)
 class CapturedIo:
-    """What an I/O module has captured together with positions.
+    """Values that an I/O module has captured together with positions.
 
     Attributes:
         name: of the module.
@@ -73,7 +73,7 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class IoReading:
-    """What one poll of an I/O module said, and what it was told.
+    """The values of one poll of an I/O module, and its outputs.
 
     Attributes:
         levels: of its lines, the first is line 1; true is high.
@@ -137,23 +137,23 @@ class Network(ABC):
 
     @property
     def modules(self) -> tuple[FoundModule, ...]:
-        """What was found on the line, by address; empty while that is not known."""
+        """The modules found on the line, by address; empty while they are not known."""
         return ()
 
     @property
     def watches(self) -> tuple[Poller[Any], ...]:
-        """Who asks modules that are no axes how they are; to be added to the bus once the line is up."""
+        """Pollers of modules that are no axes; to be added to the bus once the line is up."""
         return ()
 
     def incomplete(self) -> bool:
         """Tell whether something on the line has stopped answering that `rejoin` may bring back."""
         return False
 
-    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:  # noqa: ARG002 - nobody is lost here
+    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:  # noqa: ARG002 - no drive is lost here
         """Bring back drives that lost power without disturbing the others; moves and resets nothing.
 
         Args:
-            restarted: told the axis whose drive had lost power, before that drive can answer again.
+            restarted: called with the axis whose drive had lost power, before that drive can answer again.
 
         Returns:
             The axes whose drives answer again, restarted or only cut off for a while.
@@ -164,7 +164,7 @@ class Network(ABC):
         return frozenset()
 
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:  # noqa: B027 - optional
-        """Stop axes with as few packets as the family can, before anything else that waits; nobody confirms it.
+        """Stop axes with as few packets as the family can, before anything else that waits; not confirmed.
 
         Args:
             mode: see `StopMode`.
@@ -179,7 +179,7 @@ class Network(ABC):
 
         Args:
             motions: by axis name; exactly the members of one group.
-            still_wanted: raises when a stop has overtaken the motion; asked before anything starts.
+            still_wanted: raises when a stop has overtaken the motion; called before anything starts.
 
         Raises:
             NotSupported: these axes are no group.
@@ -193,7 +193,7 @@ class Network(ABC):
         """Return the positions of all axes at one instant.
 
         Args:
-            still_free: raises while a command needs the registers; asked again directly before the packet that freezes.
+            still_free: raises while a command needs the registers; called again just before the packet that freezes.
 
         Raises:
             NotSupported: the family cannot, or the configuration forbids it.

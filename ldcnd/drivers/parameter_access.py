@@ -20,12 +20,12 @@ from ldcnd.model.samples import MonitorName
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What became of a parameter write.
+    """The outcome of a parameter write.
 
     Attributes:
         value: both memories, read after the write.
-        written: the drive was told to change; false when it had the value already.
-        remarks: what deserves a look.
+        written: a write was sent to the drive; false when it had the value already.
+        remarks: what deserves attention.
     """
 
     value: ParameterValue
@@ -35,11 +35,11 @@ class Written:
 
 @dataclass(frozen=True, slots=True)
 class ClearedCounter:
-    """What became of a counter clear.
+    """The outcome of a counter clear.
 
     Attributes:
         value: what it counts now, signed.
-        remarks: what deserves a look.
+        remarks: what deserves attention.
     """
 
     value: int

@@ -1,4 +1,4 @@
-"""What the exchanges of one drive model are, for reckoning with before there is a line."""
+"""The exchanges of one drive model, to compute the bus budget before there is a line."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ class PriceList:
     """The exchanges of one model at one rate.
 
     Attributes:
-        node_baud: the rate at which the drive answers when it is told to use the nominal one.
+        node_baud: the rate at which the drive answers when it is set to use the nominal one.
         reading: the exchange that reads these telemetry items, and the drive's state with them.
         commands: every other exchange that is made while the line is in use, by name, in its longest form.
-        probe: what is asked in the place of a stop, to see how long one would wait.
+        probe: the exchange in the place of a stop, to measure how long one would wait.
         stop: what brings a motor to rest; None for drives that the line cannot move.
         flush: what clears the line after a loss, `settle_s` the pause behind it.
     """

@@ -18,7 +18,7 @@ from ldcnd.model.traces import (
 SIGNAL_LEVEL = 0.5
 """Between the two values of a signal."""
 Progress = Callable[[TracePhase], None]
-"""Told of each new phase of a trace; does not wait."""
+"""Called with each new phase of a trace; does not wait."""
 
 
 class TraceTimedOut(DriveFault):
@@ -68,7 +68,7 @@ def require_no_full_scale(axis: str, request: TakeTrace, asked: Iterable[str]) -
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """What a trace will be, as far as it can differ from what was asked for.
+    """The properties of a trace, as far as they can differ from the request.
 
     Attributes:
         channels: in the order of the values.
@@ -96,7 +96,7 @@ class Recorded:
         values: a column for each channel.
         raw: a column for each raw column.
         trigger_index: the sample at which the trigger was detected; None without one.
-        trigger_late_s: the condition was met at most so long before.
+        trigger_late_s: maximum time between the condition and its detection, seconds.
         missed: polls that brought no sample.
         drive: settings and assumptions of a drive's own recorder.
         problems: why the values are uncertain; empty when they are good.
@@ -172,7 +172,7 @@ class ArmedTrace(ABC):
 
 
 class Tracer(ABC):
-    """What can trace one axis, one trace at a time.
+    """The interface to trace one axis, one trace at a time.
 
     Attributes:
         source: who takes the samples.
@@ -196,7 +196,7 @@ class Tracer(ABC):
 
     @abstractmethod
     async def disarm(self) -> bool:
-        """End a trace that somebody else has left armed; return whether there was one.
+        """End a trace that another host has left armed; return whether there was one.
 
         Raises:
             BusError: the line failed.

@@ -47,7 +47,7 @@ def dissector() -> str:
 
 
 def install(home: Path) -> Path:
-    """Write the plugin to where Wireshark and tshark of a user look for it; return the file."""
+    """Write the plugin to the directory that a user's Wireshark and tshark search; return the file."""
     file = home / PERSONAL_PLUGINS / FILE
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(dissector(), encoding="utf-8")

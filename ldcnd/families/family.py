@@ -1,4 +1,4 @@
-"""What a drive family is to the rest of the house: one object that knows its configuration, its lines and its tools.
+"""The contract of a drive family: one object with its configuration, its lines and its tools.
 
 A family is a folder with a subclass of `Family`, listed in `known.py`. Nothing outside the folder names it.
 """
@@ -39,11 +39,11 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What a line is asked to carry, and how fast it is.
+    """The load of a line, and how fast the line is.
 
     Attributes:
         timing: of the line.
-        polls: what is asked periodically.
+        polls: the periodic exchanges.
         urgent: what goes before them.
         by_deadline: the earliest deadline goes first; otherwise axes take turns, exchange by exchange.
         cycle: of the drives, where polls with the same deadline are ordered by it.
@@ -74,7 +74,7 @@ class Demand:
 
 @dataclass(frozen=True, slots=True)
 class TrialMove:
-    """What a drive may be asked to move while it is tried.
+    """The limits of a drive's trial move.
 
     Attributes:
         address: of the drive.
@@ -102,11 +102,11 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class ScannedDrive:
-    """What a scan found at an address.
+    """A module that a scan found at an address.
 
     Attributes:
         address: of it.
-        model: as in the configuration; None for a device that ldcnd does not know.
+        model: as in the configuration; None for a device without a profile.
         is_axis: ldcnd can move it.
         baud: the rate at which it answers.
         text: what it is and does, for a person.
@@ -121,11 +121,11 @@ class ScannedDrive:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A look at a line of which nothing is known.
+    """A scan of an unknown line.
 
     Attributes:
         bus: of the line, not open yet.
-        findings: looks, while the line is open.
+        findings: runs the scan, while the line is open.
         drives: what was found, in the order of addresses; complete when `findings` has ended.
     """
 
@@ -197,7 +197,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
 
     @abstractmethod
     def plan(self, settings: BusT) -> Demand:
-        """Return what a line is asked to carry."""
+        """Return the load of a line."""
 
     @abstractmethod
     def describe(self, models: Mapping[int, str]) -> Describe:
@@ -217,7 +217,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
 
 @dataclass(frozen=True, slots=True)
 class ConfigFiles:
-    """What tools do with files of the configuration.
+    """Operations of tools on files of the configuration.
 
     Attributes:
         lines: reads one and returns its lines.
@@ -302,7 +302,7 @@ class HasParameters(ABC):
 
     @abstractmethod
     def check_parameters(self, values: Mapping[str, int]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return what is wrong with the parameters of a file, and what deserves attention; asks no drive."""
+        """Return what is wrong with the parameters of a file, and what deserves attention; sends nothing to a drive."""
 
     @abstractmethod
     def parameter(self, name: str, value: int) -> tuple[str, str, Sequence[str]]:

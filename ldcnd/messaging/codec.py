@@ -29,7 +29,7 @@ MAX_RECEIVED_BYTES = 512 * 1024
 """No answer of a daemon is longer: the plan of a hundred axes has a tenth of it."""
 
 ECHO_CHARACTERS = 80
-"""An error repeats so much of what it complains about."""
+"""Maximum length of a quoted value in an error, characters."""
 
 _WHITE_SPACE = b" \t\r\n"
 
@@ -91,7 +91,7 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
 
 
 def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
-    """Return the model that a daemon's answer or sample stands for, without the fields that only a newer daemon knows.
+    """Return the model that a daemon's answer or sample stands for, without the fields that only a newer daemon has.
 
     For clients: within one version of the interface fields are only ever added, so what is unknown may be ignored.
     Control and formatting characters in texts become escapes: what the daemon says may end on a terminal.
@@ -147,7 +147,7 @@ def reply_encoding(encoding: str) -> Encoding:
 
 
 def error_reply(error: LdcndError) -> ErrorReply:
-    """Return what the network may know of an error."""
+    """Return the part of an error that may be sent over the network."""
     return ErrorReply(
         code=error.code,
         message=error.message,
@@ -246,7 +246,7 @@ def _msgpack_name(model: type[Frozen]) -> str:
 
 
 def _packable(value: object) -> object:
-    """Return what JSON would say of a value that msgpack does not know; fields that it knows need no detour."""
+    """Return the JSON form of a value that msgpack cannot pack; models' fields need no detour."""
     return vars(value) if isinstance(value, Frozen) else pydantic_core.to_jsonable_python(value)
 
 
@@ -277,7 +277,7 @@ def _named(encoding: str) -> Encoding | None:
 
 
 def _told(payload: bytes, encoding: str) -> Encoding:
-    """Look at the payload when the encoding is not named: clients often send bytes and say no more."""
+    """Detect the encoding from the payload when it is not named: clients often send bytes and say no more."""
     if named := _named(encoding):
         return named
     return Encoding.JSON if payload[:1] == b"{" or payload[:1] in _WHITE_SPACE else Encoding.MSGPACK

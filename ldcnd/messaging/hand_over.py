@@ -20,10 +20,10 @@ from ldcnd.messaging.session import (
 ItemT = TypeVar("ItemT")
 
 COMMANDS_PER_TURN = 4
-"""So many commands begin in one turn of the loop; all stops that have arrived do."""
+"""Maximum number of commands that begin in one loop iteration; all stops that have arrived do."""
 
 COLLECTED_ITEMS = 4096
-"""One question collects so many answers at most."""
+"""Maximum number of answers that one query collects."""
 
 
 class HandOver(Generic[ItemT]):
@@ -32,8 +32,8 @@ class HandOver(Generic[ItemT]):
     Args:
         loop: the loop.
         deliver: takes an item.
-        capacity: so many items wait at most.
-        per_turn: so many are delivered in one turn of the loop; all that wait, if missing.
+        capacity: maximum number of waiting items.
+        per_turn: number of items delivered in one loop iteration; all that wait, if missing.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Admission(Protocol):
 
 
 class QueryIntake(Protocol):
-    """The way in to one queryable; no method blocks, and any thread may call all but `close`."""
+    """The admission to one queryable; no method blocks, and any thread may call all but `close`."""
 
     def admit(self, source: str) -> Admission | None:
         """Count a query in, None if there is no room; `source` is the session that it names, empty if it names none."""
@@ -125,7 +125,7 @@ class QueryIntake(Protocol):
 
 
 class Intake:
-    """Hands the queries of one queryable to its callback, so many at a time at most.
+    """Hands the queries of one queryable to its callback, up to a maximum number at a time.
 
     A query counts from its arrival until its answer has left.
     """
@@ -135,7 +135,7 @@ class Intake:
         self._capacity = PENDING_URGENT_QUERIES if urgent else PENDING_QUERIES
         self._pending = 0
         self._refused = 0
-        # re-entrant: a forgotten query may be collected, and so leave, while this very thread counts
+        # re-entrant: an abandoned query may be collected, and so leave, while this very thread counts
         self._lock = threading.RLock()
         # admission bounds it, so nothing ever gives way
         self._queries = HandOver(loop, self._deliver, self._capacity, None if urgent else COMMANDS_PER_TURN)
@@ -216,7 +216,7 @@ class Collector(Generic[ItemT]):
     """Collects items from any thread until their end, for one who waits on the loop.
 
     Attributes:
-        items: what has come so far; beyond `COLLECTED_ITEMS`, nothing more is kept.
+        items: the items received; beyond `COLLECTED_ITEMS`, nothing more is kept.
         done: set when no more will come.
     """
 

@@ -1,7 +1,7 @@
 """Keys: the only place that spells a topic, and how key expressions match.
 
-A key is a path of chunks below `ldcn/<rig>`. Commands and stops live behind the verbatim chunks `@cmd` and `@stop`,
-which no wildcard matches: whoever reads `ldcn/**` can never move anything.
+A key is a path of chunks below `ldcn/<rig>`. Commands and stops are behind the verbatim chunks `@cmd` and `@stop`,
+which no wildcard matches: a reader of `ldcn/**` can never move anything.
 
 Source: Zenoh key expressions: `*` is one chunk, `**` any number of chunks, `$*` any part of a chunk; a chunk that
 starts with `@` is matched by itself only.
@@ -23,7 +23,7 @@ EVENT = "event"
 """Stands in the place of an item where the events of an axis are published."""
 
 ALL_READABLE = (f"{ROOT}/*/tele/**", f"{ROOT}/*/meta/**", f"{ROOT}/*/alive/**")
-"""What may be read, on every rig; for access control, as `ALL_STOPS`, `ALL_COMMANDS` and `ALL_CLIENTS`."""
+"""Readable keys of every rig; for access control, as `ALL_STOPS`, `ALL_COMMANDS` and `ALL_CLIENTS`."""
 ALL_DAEMONS = f"{ROOT}/*/meta/daemon"
 """The description of every daemon, on every rig."""
 ALL_RUNS = f"{ROOT}/*/alive/*"
@@ -56,7 +56,7 @@ class TelemetryAddress:
 
 @dataclass(frozen=True, slots=True)
 class AliveAddress:
-    """What a liveliness token stands for: a daemon, or one of its axes."""
+    """The subject of a liveliness token: a daemon, or one of its axes."""
 
     instance: str
     axis: str | None
@@ -121,12 +121,12 @@ class Keys:
 
     @property
     def budget(self) -> str:
-        """What the lines can carry, and what they promise."""
+        """The bus budget of the lines, and the rates that they promise."""
         return f"{self._root}/meta/budget"
 
     @property
     def configuration(self) -> str:
-        """What the daemon runs with."""
+        """The configuration in use by the daemon."""
         return f"{self._root}/meta/configuration"
 
     @property

@@ -1,6 +1,6 @@
 """Why a connection was refused: Zenoh says "cannot connect" to everything, so its endpoints are tried without it.
 
-Only asked after Zenoh has failed. It looks whether anybody listens, and with TLS whether the other side is who it
+Only used after Zenoh has failed. It checks whether there is a listener, and with TLS whether the other side is who it
 should be; if both are well, it was this program's login that was refused.
 """
 
@@ -24,7 +24,7 @@ async def refusals(endpoints: Sequence[str], root: str | None) -> list[str]:
 
 
 async def _refusal(endpoint: str, root: str | None) -> str | None:
-    """Return why; None when nobody answers there."""
+    """Return why; None when there is no answer at that address."""
     protocol, _, address = endpoint.partition("#")[0].partition("?")[0].partition("/")
     try:
         async with asyncio.timeout(PROBE_TIME_S):

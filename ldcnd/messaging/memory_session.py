@@ -54,7 +54,7 @@ class _TokenWatch:
 
 @dataclass(eq=False, slots=True)
 class _Pending:
-    """A query under way: the answers of those that were asked."""
+    """A query under way: the answers of its queryables."""
 
     awaited: int
     done: asyncio.Future[None]
@@ -153,7 +153,7 @@ class MemorySession(Session):
             self._offer(sample)
 
     def delete(self, key: str) -> None:
-        """Offer the news to every subscription that matches."""
+        """Offer the deletion to every subscription that matches."""
         self._offer(Sample(key, b"", "", SampleKind.DELETE, None))
 
     async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
@@ -201,7 +201,7 @@ class MemorySession(Session):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
     ) -> list[Answer]:
-        """Ask whoever serves the key; nothing is overtaken, because nothing waits on its way."""
+        """Query the queryables of the key; nothing is overtaken, because nothing waits on its way."""
         del urgent
         self._must_be_open()
         asked = self._broker.asked(key)

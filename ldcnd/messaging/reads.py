@@ -1,6 +1,6 @@
 """Reads are answered in the time that nothing else needs: one step for each turn of the loop, clients in turn.
 
-What a daemon says about itself is hundreds of kilobytes, and anyone may ask for it at any rate. A stop or a command
+A daemon's description of itself is hundreds of kilobytes, and any client may query it at any rate. A stop or a command
 that arrives meanwhile waits for one step, not for the reads that came before it.
 """
 
@@ -15,7 +15,7 @@ from ldcnd.messaging.hand_over import Admission, HandOver
 from ldcnd.messaging.session import READS_OF_A_CLIENT, READS_OF_UNNAMED, READS_UNANSWERED, Load, OnRead, Query
 
 LEAVING_AT_ONCE = 2
-"""So many answers leave at a time: more threads would only take the interpreter from the loop."""
+"""Maximum number of answers being sent at a time: more threads would only take the interpreter from the loop."""
 BLOCKED_S = 0.02
 """An answer that takes longer to leave waits for its client; others need not wait for it."""
 
@@ -41,7 +41,7 @@ class _Read:
         self.intake.left(self)
 
     def end(self) -> None:
-        """Forget the query; without an answer by now, it has an internal error."""
+        """Release the query; without an answer by now, it has an internal error."""
         query, self.query, self.steps = self.query, None, iter(())
         if query:
             query.abandon()
@@ -53,7 +53,7 @@ class Reads:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._unanswered: Counter[str] = Counter()
-        # re-entrant: a forgotten query may be collected, and so leave, while this very thread counts
+        # re-entrant: an abandoned query may be collected, and so leave, while this very thread counts
         self._lock = threading.RLock()
         # admission bounds it, so nothing ever gives way
         self._arrived = HandOver(loop, self._queue, READS_UNANSWERED)
@@ -144,7 +144,7 @@ class Reads:
 
 
 class ReadIntake:
-    """The way in to a queryable that is only read; a `QueryIntake`.
+    """The admission to a queryable that is only read; a `QueryIntake`.
 
     Attributes:
         reads: of its session.

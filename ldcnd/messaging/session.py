@@ -14,19 +14,19 @@ from ldcnd.errors import InternalError, LdcndError
 from ldcnd.messaging.codec import Encoding, encode, error_reply
 
 UNDELIVERED_SAMPLES = 64
-"""A subscription keeps so many samples that its callback has not had yet; the oldest gives way."""
+"""Maximum number of samples that a subscription keeps for its callback; the oldest is dropped."""
 
 PENDING_QUERIES = 64
-"""A queryable has so many unanswered queries at most; the next is refused with too_many_requests."""
+"""Maximum number of unanswered queries of a queryable; the next is refused with too_many_requests."""
 
 UNDELIVERED_TOKENS = 1024
-"""A token watch keeps so many changes that its callback has not had yet; the oldest gives way."""
+"""Maximum number of changes that a token watch keeps for its callback; the oldest is dropped."""
 
 PENDING_URGENT_QUERIES = 4096
 """The same for an urgent queryable: a bound on memory, not on clients; a stop is not refused for being one of many."""
 
 READS_OF_A_CLIENT = 64
-"""A client that names its session has so many unanswered reads at most; the next is refused with too_many_requests."""
+"""Maximum number of unanswered reads of a named client session; the next is refused with too_many_requests."""
 
 READS_OF_UNNAMED = 256
 """The same for all clients together that do not name their sessions: Zenoh does not tell whose query it is."""
@@ -35,7 +35,7 @@ READS_UNANSWERED = 1024
 """The same for all clients together."""
 
 QUERY_TIMEOUT_S = 2.0
-"""A client waits so long for the answers to a query unless it says otherwise."""
+"""Default time that a client waits for the answers to a query, seconds."""
 
 NO_PARAMETERS: Mapping[str, str] = MappingProxyType({})
 
@@ -52,7 +52,7 @@ class Qos(StrEnum):
 
 
 class SampleKind(StrEnum):
-    """What happened to a key."""
+    """The kind of a change of a key."""
 
     PUT = "put"
     DELETE = "delete"
@@ -60,14 +60,14 @@ class SampleKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A value that was published, or the news that a key has none any more."""
+    """A value that was published, or the deletion of a key."""
 
     key: str
     payload: bytes
     encoding: str
     kind: SampleKind
     measured_at_ns: int | None
-    """When the value was true, UTC in ns since 1970; when it was sent if nobody said; None if nobody stamped it."""
+    """When the value was true, UTC in ns since 1970; when it was sent if not given; None without a time stamp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Query:
     then `finish`. A query that is dropped without an answer is answered with an internal error.
 
     Attributes:
-        key: as it was asked; may be an expression with wildcards.
+        key: of the query; may be an expression with wildcards.
         parameters: what followed the `?` of the selector, not percent-decoded.
         payload: empty when there was none.
         encoding: of the payload, as the client named it; empty when it did not.
@@ -126,13 +126,13 @@ class Query:
     def login(self) -> str | None:
         """The certificate of the link that its sender says it comes from, by common name; for the record only.
 
-        None when the sender does not say, when it is behind a router, and on links without certificates. Whoever may
-        command can name another one's session, so this finds mistakes, not forgers.
+        None when the sender does not say, when it is behind a router, and on links without certificates. A login that
+        may command can name another one's session, so this finds mistakes, not forgers.
         """
         return self._login()
 
     def reply(self, payload: bytes, encoding: str, key: str | None = None, measured_at_ns: int | None = None) -> None:
-        """Answer; for good without a key, with one value of several when a key is given.
+        """Answer; finally without a key, with one value of several when a key is given.
 
         Args:
             payload: the value.
@@ -149,7 +149,7 @@ class Query:
             self.finish()
 
     def reply_error(self, payload: bytes, encoding: str) -> None:
-        """Answer with an encoded `ErrorReply`, for good; values given before are not sent.
+        """Answer finally with an encoded `ErrorReply`; values given before are not sent.
 
         Raises:
             InternalError: the query was answered already.
@@ -159,7 +159,7 @@ class Query:
         self.finish()
 
     def refuse(self, error: LdcndError) -> None:
-        """Answer with an error, for good, as JSON.
+        """Answer finally with an error, as JSON.
 
         Raises:
             InternalError: the query was answered already.
@@ -177,7 +177,7 @@ class Query:
         self._send(tuple(self._answers))
 
     def abandon(self) -> None:
-        """Answer with an internal error unless the query was answered; for whoever gives a query up."""
+        """Answer with an internal error unless the query was answered; for a caller that gives a query up."""
         if not self._answered:
             self.refuse(InternalError(f"{self.key}: the query was dropped without an answer; the log has more"))
 
@@ -186,7 +186,7 @@ class Query:
             raise InternalError(f"{self.key}: the query was answered already")
 
     def __del__(self) -> None:
-        """Leave no client waiting for a query that was forgotten."""
+        """Leave no client waiting for a query that was abandoned."""
         # attributes are missing when the constructor failed
         if not getattr(self, "_answered", True):
             self.abandon()
@@ -206,7 +206,7 @@ class Load:
 
     Attributes:
         waiting: queries that have no answer yet; samples and tokens that the callback has not had.
-        lost: queries that were refused for being too many, samples and tokens that gave way, so far.
+        lost: queries refused for being too many, samples and tokens that were dropped, since the declaration.
     """
 
     waiting: int = 0
@@ -234,7 +234,7 @@ class Declaration:
 
 
 class Session(ABC):
-    """One participant in the network. Closing it takes back everything that it has declared.
+    """One participant in the network. Closing it undeclares everything that it has declared.
 
     After `close` every other method raises `SessionError`.
     """
@@ -272,9 +272,9 @@ class Session(ABC):
         Args:
             key: the expression.
             on_query: takes a query; if it raises, the query is answered with an internal error.
-            complete: this session alone can answer everything below the key, so one such session is asked, not all.
-            urgent: answers do not queue behind the answers of other declarations, and so many queries may be
-                unanswered that none is refused in practice.
+            complete: this session alone can answer everything below the key, so only one such session is queried.
+            urgent: answers do not queue behind the answers of other declarations, and the number of queries that may be
+                unanswered is so large that none is refused in practice.
         """
 
     @abstractmethod
@@ -300,8 +300,8 @@ class Session(ABC):
         Args:
             key: the expression.
             on_sample: takes a sample.
-            kept: so many samples may wait for the loop.
-            linger_s: a sample may wait for so long for others; for those who take very many.
+            kept: maximum number of samples that wait for the loop.
+            linger_s: how long a sample may wait for others; for subscriptions with very many samples.
         """
 
     @abstractmethod
@@ -315,11 +315,11 @@ class Session(ABC):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
     ) -> list[Answer]:
-        """Ask, and return all answers; none at all when nobody serves the key or access control forbids it.
+        """Send a query, and return all answers; none when there is no queryable or access control forbids it.
 
         Args:
             key: a key or an expression with wildcards.
-            payload: what is asked.
+            payload: the request.
             encoding: of the payload.
             parameters: of the selector; neither `;` nor `=` nor `|` in names and values.
             timeout_s: how long to wait for the last answer; what has arrived by then is returned.

@@ -107,7 +107,7 @@ class Workers:
         if future.cancelled() or future.exception() is not None:
             return
         if self._stopping:
-            # nobody takes jobs any more, and this is the worker that has just done the work
+            # no worker takes jobs any more, and this is the worker that has just done the work
             undo(future.result())
         else:
             self.submit(partial(undo, future.result()))

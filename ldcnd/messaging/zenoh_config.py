@@ -21,7 +21,7 @@ FILES = (
     f"{TLS}/connect_private_key",
     "transport/auth/usrpwd/dictionary_file",
 )
-"""Settings that name files; Zenoh itself looks for relative ones where the program was started."""
+"""Settings that name files; Zenoh itself searches for relative ones in the working directory."""
 
 UNIX_SOCKET = "unixsock-stream/"
 FOR_THE_GROUP = 0o660

@@ -1,4 +1,4 @@
-"""What an operator is told when Zenoh cannot start or answer: endpoints and remedies instead of names of Rust sources.
+"""Error messages when Zenoh cannot start or answer: endpoints and remedies instead of names of Rust sources.
 
 Source: the messages of Zenoh 1.10.2, as seen; whatever is not recognised is passed on, without its source locations.
 """
@@ -18,7 +18,7 @@ def is_about_connecting(reason: str) -> bool:
 
 
 def no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
-    """Return the error for a query that nobody has answered in time."""
+    """Return the error for a query without an answer in time."""
     return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
 
 

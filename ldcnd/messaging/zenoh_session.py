@@ -1,9 +1,9 @@
-"""The session on a real Zenoh network; with `zenoh_config` and `zenoh_values`, the only module that knows zenoh.
+"""The session on a real Zenoh network; with `zenoh_config` and `zenoh_values`, the only module that uses zenoh.
 
 Zenoh calls back on its own threads: there, items are handed over to the loop and nothing else happens, because one
 blocked callback holds up everything that comes over the same link. What may block on a peer that does not read runs on
 worker threads; a publication drops instead of blocking. Answers to stops, to commands and to reads have threads of
-their own each, and refusals have a single slow one: who does not read, or asks too much, holds up only its own kind.
+their own each, and refusals have a single slow one: a peer that does not read, or sends too much, delays its own kind.
 
 Source: behaviour of eclipse-zenoh 1.10.2, measured.
 """
@@ -56,20 +56,20 @@ _LOST_ANSWERS = LogLimit()
 OPEN_TIME_S = 10.0
 DECLARE_TIME_S = 5.0
 DRAIN_TIME_S = 1.0
-"""On closing, answers that were given have so long to leave."""
+"""Maximum time for given answers to leave on closing, seconds."""
 CLOSE_TIME_S = 1.5
-"""Then Zenoh has so long to say goodbye; with a frozen, congested peer it can take 12 s, and is left to itself."""
+"""Maximum time for Zenoh's close after that, seconds; with a frozen, congested peer it takes 12 s, and is abandoned."""
 QUERY_GRACE_S = 0.5
-"""Zenoh ends a query at its time-out; it is given up for lost so much later."""
+"""Zenoh ends a query at its time-out; after this further time the query counts as lost, seconds."""
 
 ANSWER_THREADS = 64
 """Threads that may wait at the same time for clients that do not take answers to stops, to commands, to reads."""
 OTHER_THREADS = 16
 """The same for declarations and questions of this session."""
 REFUSALS_WAITING = 4096
-"""Beyond this a query that is too much ends without an answer."""
+"""Maximum number of waiting refusals; beyond this, an excess query ends without an answer."""
 REFUSAL_PAUSE_S = 0.001
-"""Who asks again as soon as it is refused takes no more than this leaves."""
+"""Pause between refusals, seconds; limits the load of a client that repeats a query as soon as it is refused."""
 
 
 class _Undeclarable(Protocol):
@@ -118,7 +118,7 @@ class _Outlet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Declared:
-    """Holds on to what was declared, because Zenoh takes back what is garbage collected."""
+    """Holds references to the declarations, because Zenoh undeclares what is garbage collected."""
 
     entity: _Undeclarable
     stop: Callable[[], object]
@@ -237,7 +237,7 @@ class ZenohSession(Session):
         )
 
     async def _sweep(self, key: str, on_sample: OnSample, kept: int, period_s: float) -> Declaration:
-        """Look for samples now and then: Zenoh's threads then need not run any Python."""
+        """Poll for samples periodically: Zenoh's threads then need not run any Python."""
         found: list[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]] = []
 
         def declare() -> _Undeclarable:
@@ -259,7 +259,7 @@ class ZenohSession(Session):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
     ) -> list[Answer]:
-        """Ask, one answer from one complete queryable or from all the others; repeated answers are kept."""
+        """Send a query, to one complete queryable or to all the others; repeated answers are kept."""
         self._must_be_open()
         if timeout_s <= 0:
             raise ValueOutOfRange(f"{key}: a query needs time; {timeout_s:g} s is none", value=timeout_s, limit=0)
@@ -357,7 +357,7 @@ class ZenohSession(Session):
         try:
             await self._workers.run(declared.entity.undeclare, DECLARE_TIME_S, lambda _: None)
         except (TimeoutError, zenoh.ZError) as error:
-            log.warning("declaration not taken back", reason=str(error) or "a peer takes nothing")
+            log.warning("declaration not undeclared", reason=str(error) or "a peer takes nothing")
         finally:
             declared.stop()
 
@@ -426,7 +426,7 @@ class Sweep(Generic[ItemT]):
         loop: the loop.
         deliver: takes each item.
         period_s: how often the queue is emptied.
-        most: so many items at a time; what is left comes next time, so that others get their turn.
+        most: maximum number of items at a time; the rest comes next time, so that others get their turn.
     """
 
     def __init__(
@@ -448,7 +448,7 @@ class Sweep(Generic[ItemT]):
             self._timer.cancel()
 
     async def end(self, take_back: Callable[[], Awaitable[None]]) -> None:
-        """Deliver no more, then take the queue back: one that is gone cannot be asked."""
+        """Deliver no more, then undeclare the queue: one that is gone cannot be read."""
         self.close()
         await take_back()
 

@@ -1,4 +1,4 @@
-"""Settings of a Zenoh session, as paths into Zenoh's configuration; knows no zenoh.
+"""Settings of a Zenoh session, as paths into Zenoh's configuration; does not import zenoh.
 
 Zenoh's own defaults are not fit for hardware: it listens on every interface, scouts by multicast and shares memory.
 """
@@ -11,10 +11,10 @@ LEASE_MS = 2000
 """The others learn within this time that this process has frozen or that its cable was pulled."""
 
 RETRY_MS = (100, 1000)
-"""Whoever is late or lost is looked for after the first of these times, then less often, but as often as the second."""
+"""First and longest pause between attempts to connect to a peer that is late or lost, milliseconds."""
 
 WAIT_BEFORE_CLOSE_US = 200_000
-"""A peer that takes nothing for so long, while something waits that may not be dropped, loses its link."""
+"""Maximum time that a peer takes nothing while something waits that must not be dropped; then its link is closed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class ZenohSettings:
         mode: peers serve clients without any router; clients talk to one peer or router; None leaves it to the file.
         config_file: a Zenoh configuration to start from, for TLS and access control; its endpoints count when none are
             given here, and scouting is off unless it says otherwise. Relative file names in it count from its folder.
-        instance: names this program to those who look at the network.
+        instance: names this program to observers of the network.
     """
 
     listen: tuple[str, ...] = ()
@@ -47,7 +47,7 @@ class ZenohSettings:
             "timestamping/enabled": True,
             # a receiver that stalls loses queries in it, and opening it needs mlock
             "transport/shared_memory/enabled": False,
-            # with it, asking who is connected ends the program
+            # with it, listing the connected peers ends the program
             "transport/unicast/lowlatency": False,
             "transport/link/tx/lease": LEASE_MS,
             "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE_US,

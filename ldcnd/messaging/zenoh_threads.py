@@ -13,7 +13,7 @@ RUNTIME = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
 """Zenoh's default is one thread that sends. While it closes a link whose peer takes nothing (200 ms), the answers on
 all other links wait; so there are more threads than such links at a time."""
 SENDERS = "tx-"
-"""What the names of Zenoh's sending threads begin with; the first link makes them."""
+"""Prefix of the names of Zenoh's sending threads; the first link makes them."""
 LOOK_S = 1.0
 
 
@@ -26,7 +26,7 @@ async def senders_wait() -> None:
     """Have Zenoh's sending threads wait until the bus loop has nothing to do; return once that is arranged.
 
     Each sample that is published wakes one, and as an equal it takes the processor at once, sends that sample alone and
-    sleeps again. As a batch thread it has its share of the processor, but interrupts nobody: what belongs to one poll
+    sleeps again. As a batch thread it has its share of the processor, but preempts none: what belongs to one poll
     leaves together. Under a real-time policy threads do not interrupt each other anyway.
     """
     while True:

@@ -1,4 +1,4 @@
-"""What travels, in Zenoh's terms and in ours: quality of service, instants, samples and answers."""
+"""Messages in Zenoh's terms and in ours: quality of service, instants, samples and answers."""
 
 from collections.abc import Mapping, Sequence
 from typing import TypedDict
@@ -10,7 +10,7 @@ from ldcnd.messaging.zenoh_failures import no_answer
 
 
 class Travel(TypedDict):
-    """How Zenoh is told to carry something."""
+    """Zenoh's quality of service for a message."""
 
     congestion_control: zenoh.CongestionControl
     priority: zenoh.Priority
@@ -27,7 +27,7 @@ TRAVEL: Mapping[Qos, Travel] = {
 
 
 def to_sample(sample: zenoh.Sample) -> Sample:
-    """Return a sample as the session's users know it."""
+    """Return a sample as the session's users expect it."""
     put = sample.kind == zenoh.SampleKind.PUT
     return Sample(
         key=str(sample.key_expr),
@@ -51,7 +51,7 @@ def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> li
             answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), stamp))
         elif (error := reply.err) is not None:
             answers.append(Answer(key, error.payload.to_bytes(), str(error.encoding), is_error=True))
-    # Zenoh itself says so, in the place of whoever did not answer
+    # Zenoh itself says so, in the place of a queryable that did not answer
     arrived = [answer for answer in answers if not (answer.is_error and answer.payload == b"Timeout")]
     if len(arrived) < len(answers) and not arrived:
         raise no_answer(key, timeout_s)

@@ -1,4 +1,4 @@
-"""What the kernel knows of a serial port's adapter: its driver, how long it keeps bytes back, its errors.
+"""The kernel's data of a serial port's adapter: its driver, how long it keeps bytes back, its errors.
 
 Sources: Linux, Documentation/ABI/testing/sysfs-tty (rx_trig_bytes), drivers/usb/serial/ftdi_sio.c (latency_timer),
 include/uapi/linux/serial.h (struct serial_icounter_struct).
@@ -19,11 +19,11 @@ _FRAME, _OVERRUN, _PARITY, _BREAK, _BUFFER_OVERRUN = range(6, 11)
 
 @dataclass(frozen=True, slots=True)
 class LineErrors:
-    """What a driver has counted since it was loaded.
+    """A driver's counters since it was loaded.
 
     Attributes:
         frame: bytes without a stop bit: another rate, noise, a short circuit, no bias on an idle line.
-        overrun: bytes that the chip lost because nobody fetched them.
+        overrun: bytes that the chip lost because they were not fetched in time.
         parity: bytes of the wrong parity.
         breaks: a line that stays low: a broken wire, no bias.
         buffer_overrun: bytes that the kernel lost because no program read them.
@@ -85,7 +85,7 @@ class Adapter:
 
 
 def adapter_of(path: Path, sys_tty: Path = SYS_TTY, by_id: Path = BY_ID) -> Adapter | None:
-    """Return what is known of the adapter behind a device path; None where the kernel knows no such port.
+    """Return the data of the adapter behind a device path; None where the kernel has no such port.
 
     Args:
         path: a node or a link to one.

@@ -20,7 +20,7 @@ class Incoming(asyncio.Protocol):
         self.reason = ""
         self.ended = asyncio.Event()
         self._name = name
-        self._receiver: Receiver | None = None  # nobody listens before `attach` and after `detach`
+        self._receiver: Receiver | None = None  # no receiver before `attach` and after `detach`
 
     def attach(self, receiver: Receiver) -> None:
         """Deliver to `receiver` from now on; a port that is lost already is reported from the loop, not from here."""

@@ -26,11 +26,11 @@ LONGEST_RTS_DELAY_MS = 100
 
 STANDARD_BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400)
 RATE_TOLERANCE = 0.02
-"""The kernel calls a rate by the name of its neighbour within so much (drivers/tty/tty_baudrate.c); two clocks that
+"""The kernel calls a rate by the name of its neighbour within this share (drivers/tty/tty_baudrate.c); two clocks that
 differ by no more still read each other's bytes."""
 
 PortFault = (OSError, ValueError, OverflowError, termios.error)
-"""What a driver's refusal is raised as; that of `termios` is no OSError."""
+"""Exceptions for a driver's refusal; that of `termios` is no OSError."""
 
 
 def actual_baud(descriptor: int) -> int | None:
@@ -45,12 +45,12 @@ def actual_baud(descriptor: int) -> int | None:
 
 
 def makes(asked: int, made: int | None) -> bool:
-    """Tell whether a port that says it sends at `made` can be heard at `asked`."""
+    """Return whether a port that says it sends at `made` can be received at `asked`."""
     return made is None or abs(made - asked) <= RATE_TOLERANCE * asked
 
 
 def nearest(asked: int, available: Sequence[int]) -> str:
-    """Return the two rates next to the one asked for, in words."""
+    """Return the two rates next to the requested one, in words."""
     below = [baud for baud in available if baud < asked]
     above = [baud for baud in available if baud > asked]
     return " and ".join(str(baud) for baud in (*below[-1:], *above[:1])) or "none"
@@ -64,7 +64,7 @@ class Rs485:
         rts_on_send: RTS is on while sending, and off otherwise; False for the inverse.
         before_ms: from switching the transmitter on to the first bit.
         after_ms: from the last bit to switching the transmitter off.
-        receive_own: the receiver stays on while sending, so that the host hears itself.
+        receive_own: the receiver stays on while sending, so that the host receives its own bytes.
         terminate: switch the port's own terminating resistor on.
     """
 
@@ -85,7 +85,7 @@ class Rs485:
 def switch_direction(descriptor: int, wanted: Rs485) -> str:
     """Have the kernel switch the transmitter; return why it will not as wanted, empty when it does.
 
-    A driver may take less than it was asked for without an error, so what it took is read back.
+    A driver may take less than was requested without an error, so what it took is read back.
     """
     request = SERIAL_RS485.pack(wanted.flags, wanted.before_ms, wanted.after_ms, *bytes(5))
     try:

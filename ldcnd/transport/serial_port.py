@@ -68,7 +68,7 @@ class SerialSettings:
         path: the device, best a stable name below /dev/serial/by-id.
         baud: rate of both directions.
         framing: data bits, parity, stop bits.
-        low_latency: ask the driver to pass bytes on at once; an FTDI adapter otherwise waits for up to 16 ms.
+        low_latency: request the driver to pass bytes on at once; an FTDI adapter otherwise waits for up to 16 ms.
         exclusive: refuse the port to others, and refuse to share a port that is in use.
         working_baud: the rate that the line will be changed to; a port that cannot make it does not open.
         rs485: have the kernel switch the transmitter; None where the adapter does it, or where it stays on.
@@ -84,7 +84,7 @@ class SerialSettings:
 
 
 class _Refused(Exception):
-    """The driver takes the port's settings otherwise than they were asked for.
+    """The driver takes the port's settings otherwise than requested.
 
     Args:
         what: it makes of them.
@@ -171,7 +171,7 @@ class SerialPort(Transport):
         major = os.major(os.fstat(self._descriptor).st_rdev)
         self._is_pseudo, self._is_usb = major in PSEUDO_TERMINALS, major in USB_TERMINALS
         self._least_bytes = 1
-        self._settings: dict[int, bytes] = {}  # what the driver takes for so many bytes at least, at this rate
+        self._settings: dict[int, bytes] = {}  # the driver's settings by minimum number of bytes, at this rate
         self._set_least_bytes()
         self._loop.add_reader(self._descriptor, self._readable)
 
@@ -223,7 +223,7 @@ class SerialPort(Transport):
             os.sched_yield()
 
     def expect(self, reply_bytes: int) -> None:
-        """See `Transport`; an adapter on USB delivers in large pieces anyway and would take a transfer to be told."""
+        """See `Transport`; a USB adapter delivers in large pieces anyway and would need a transfer for the setting."""
         if reply_bytes != self._least_bytes and not self._is_usb:
             self._least_bytes = reply_bytes
             self._set_least_bytes()
@@ -236,8 +236,8 @@ class SerialPort(Transport):
     def _set_least_bytes(self) -> None:
         """Tell the driver how many bytes are worth a wake-up (VMIN).
 
-        At least one, so that an empty read is the end and not just nothing yet. For a number that it was told before
-        with one system call instead of four.
+        At least one, so that an empty read is the end and not just nothing yet. A number that was set before takes
+        one system call instead of four.
         """
         with contextlib.suppress(*PortFault):  # a port that is gone says so to its reader
             if settings := self._settings.get(self._least_bytes):
@@ -331,7 +331,7 @@ def _open(settings: SerialSettings) -> _Serial:
 
 
 def _settle_rates(port: _Serial, settings: SerialSettings) -> None:
-    """Find out which rates the driver makes before a drive is told to change to one, and leave it at the first one.
+    """Find out which rates the driver makes before a drive is set to one, and leave it at the first one.
 
     Raises:
         _Refused: not those that the line needs.
@@ -346,7 +346,7 @@ def _settle_rates(port: _Serial, settings: SerialSettings) -> None:
 
 
 def _settle_direction(port: _Serial, settings: SerialSettings) -> None:
-    """Have the kernel switch the transmitter, where that is asked for.
+    """Have the kernel switch the transmitter, where that is configured.
 
     Raises:
         _Refused: its driver does not, or not so.

@@ -17,7 +17,7 @@ from ldcnd.transport.transport import Receiver, Transport
 
 CLOSE_TIME_S = 1.0
 UNACKNOWLEDGED_MS = 5000
-"""A far end that acknowledges nothing for so long is gone; without it the kernel tries for a quarter of an hour."""
+"""Time without acknowledgement after which the far end is gone; without it the kernel tries for some 15 minutes."""
 BACKLOG_BYTES = 4096
 """More than this unsent means that the far end takes nothing; some dozens of exchanges have timed out by then."""
 READ_BYTES = 4096
@@ -29,7 +29,7 @@ async def open_tcp_port(host: str, port: int, connect_timeout_s: float = 5.0) ->
     """Connect to a serial server.
 
     Raises:
-        TransportLost: the name is unknown, or nobody answers there in time.
+        TransportLost: the name is unknown, or there is no answer in time.
     """
     name = f"socket://{f'[{host}]' if ':' in host else host}:{port}"
     loop = asyncio.get_running_loop()

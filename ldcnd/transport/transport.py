@@ -56,7 +56,7 @@ class Transport(ABC):
 
     @abstractmethod
     def expect(self, reply_bytes: int) -> None:
-        """Hint: less than so many bytes are no news, so one wake-up for all of them is enough. May be ignored."""
+        """Hint: fewer bytes than this are no reply, so one wake-up for all of them is enough. May be ignored."""
 
     def collect(self) -> None:  # noqa: B027 - most keep nothing back
         """Deliver now what has arrived but was kept back because of `expect`."""
@@ -79,4 +79,4 @@ class Transport(ABC):
 
 
 Opener = Callable[[], Awaitable[Transport]]
-"""Opens the pipe anew, raising `TransportLost` with the reason when it cannot."""
+"""Reopens the pipe, raising `TransportLost` with the reason when it cannot."""

@@ -113,7 +113,7 @@ async def test_a_group_whose_start_cannot_be_proven_is_stopped_whole(error):
         pair.bus.instead[Command.READ_STATUS] = fail
 
     pair.bus.after[Command.START_MOTION] = meanwhile
-    with pytest.raises(OutcomeUnknown, match="all were told to stop"):
+    with pytest.raises(OutcomeUnknown, match="all were commanded to stop"):
         await pair.groups.start(MOTIONS, wanted)
 
     pair.host.wait(0.5)

@@ -50,7 +50,7 @@ class Notifier:
                 door.sendto("\n".join(messages).encode(), self._address)
         except OSError as error:
             if not self._failed:
-                log.warning("service manager not told", reason=str(error))
+                log.warning("service manager not notified", reason=str(error))
             self._failed = True
             return False
         self._failed = False

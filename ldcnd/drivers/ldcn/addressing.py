@@ -2,8 +2,8 @@
 
 A module has exactly one group address, so what concerns the whole line goes to all addresses in use. Rates are changed
 by group commands without a leader (PIC-SERVO manual, 5.2 "Set Baud Rate"). What is sent at another rate than a module's
-is noise to it: the bits of the header 0xAA alternate, which no slower sender's byte can look like to a faster receiver,
-and what a faster sender's bytes look like has no header, length and checksum that fit.
+is noise to it: the bits of the header 0xAA alternate, which no slower sender's byte can produce at a faster receiver,
+and the bytes received from a faster sender have no header, length and checksum that fit.
 Sources: LS-182AP manual, "Addressing" with the flow chart of the procedure, "Define Status", item 5; PIC-SERVO manual,
 4.1 "Network initialization", 5.2.
 """
@@ -32,14 +32,14 @@ UNADDRESSED = Node(0, ANY_DIALECT)
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a module says it is; 0 to 255 each."""
+    """A module's identification; 0 to 255 each."""
 
     device_id: int
     version: int
 
     @property
     def profile(self) -> Profile | None:
-        """The dialect of this pair; None for a device that nobody described."""
+        """The dialect of this pair; None for an unsupported device."""
         return identify(self.device_id, self.version)
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What the configuration says is at an address.
+    """The module that the configuration expects at an address.
 
     Attributes:
         address: 1 to 127.
@@ -161,7 +161,7 @@ class GroupPlan:
         return tuple(address for address in self._axes if self.leads(address))
 
     def exactly(self, names: frozenset[str]) -> Group | None:
-        """Return the group with exactly these members: a command to it concerns nobody else."""
+        """Return the group with exactly these members: a command to it concerns no other module."""
         return next((group for group in self.groups if group.members == names), None)
 
     def within(self, names: frozenset[str]) -> tuple[Group, ...]:
@@ -173,7 +173,7 @@ COMMON_CODES = (0x0A, 0x14, 0x81)
 """Of the rates at which a crashed host may have left the drives: 115200, 57600 and 9600 baud with the usual clock."""
 COMMON_BAUDS = (115_200, 57_600, 9600)
 FASTEST_BAUD = 230_400
-"""PIC-SERVO SC only: it looks the code up and sets exactly this rate."""
+"""PIC-SERVO SC only: it has the code in a table and sets exactly this rate."""
 EVERYBODY = 0xFF
 """The group address after power-up."""
 NULLS = bytes(16)
@@ -241,7 +241,7 @@ class LineRate:
         return True
 
     async def everybody_to(self, baud: int) -> None:
-        """Move all modules that hear us, and the host; allowed while motors move.
+        """Move all modules that receive the host, and the host; allowed while motors move.
 
         Only groups without a leader take Set Baud Rate (LS-182AP manual, "Addressing": "must be sent only as a group
         command with no group leader"): `Addressing.without_leaders` sees to that beforehand.
@@ -261,7 +261,7 @@ class LineRate:
         return spaced(packets, self._bus.settings.bits_per_byte / self._bus.baud, self.cycle_s)
 
     async def who_is(self, address: int, *, patient: bool = False) -> Identity | None:
-        """Ask an address who it is at the host's rate; None when nobody answers.
+        """Read the identity at an address at the host's rate; None when no module answers.
 
         Args:
             address: 0 for a module without an address.
@@ -274,7 +274,7 @@ class LineRate:
         return await self._answer(lambda: self._bus.execute(exchange if patient else once(exchange)))
 
     async def who_is_at(self, baud: int, address: int) -> Identity | None:
-        """Ask once at another rate than the others', who hear noise meanwhile; as `who_is` in everything else."""
+        """Read the identity once at another rate than the other modules', which receive noise; otherwise `who_is`."""
         exchange = once(read_identity(address))
         if self._bus.baud == baud:
             return await self._answer(lambda: self._bus.execute(exchange))
@@ -315,8 +315,8 @@ class Addressing:
     async def reset_all(self) -> None:
         """Hard Reset at every rate the drives may be at, twice each, ending at the rate they restart with.
 
-        Time to restart is given at that last rate only: whoever obeyed at another one restarts meanwhile, and hears
-        nothing that it would have to obey.
+        Time to restart is given at that last rate only: a module that obeyed at another one restarts meanwhile, and
+        receives nothing that it would have to obey.
 
         A module that is reset makes the next one deaf, so one that is left at a rate of its own would split the chain:
         all are called to one rate first, which leaves their address outputs as they are. PIC-SERVO version 4 obeys only
@@ -342,7 +342,7 @@ class Addressing:
         """Give the modules addresses 1, 2, ... in the order of the chain; return who is where.
 
         Args:
-            expected: so many modules are configured; those behind them are looked for with less patience.
+            expected: number of configured modules; those behind them are searched for with less patience.
         """
         modules: dict[int, Identity] = {}
         for address in range(1, MOST_MODULES + 1):
@@ -355,9 +355,9 @@ class Addressing:
         return modules
 
     async def let_all_hear(self, expected: int) -> None:
-        """Give away so many addresses, whoever takes them, so that the next reset reaches every module.
+        """Assign this many addresses, to any modules, so that the next reset reaches every module.
 
-        Behind a module that waits for its address one with an address is deaf, and lets those behind it hear: a reset
+        Behind a module that waits for its address one with an address is deaf, and those behind it receive: a reset
         then leaves it as it is, and two modules of the chain at address 0.
         """
         for address in range(1, expected + 1):
@@ -377,7 +377,7 @@ class Addressing:
         return False
 
     async def _address_unexpected(self, address: int) -> bool:
-        """Address a module that nobody described; tell whether there was one."""
+        """Address an unsupported module; return whether there was one."""
         for _ in range(END_ATTEMPTS):
             if await self._set_address(UNADDRESSED, address) or await self.rate.who_is(address):
                 return True

@@ -4,12 +4,12 @@ Adoption finds the line at whatever rate, identifies the modules and touches not
 Status and No Operation. Positions and motions go on; gains cannot be read back and count as those of the configuration.
 
 A module that lost power comes back silent, at 19200 baud and address 0, and keeps those behind it in the chain from
-hearing the host until it has an address again; they go on with what they were doing. A look for it is one exchange at
-19200 baud, on a line that stays at its working rate: modules at that rate hear noise. When it answers, all modules that
-hear are taken down to 19200 baud, which is allowed while motors move, the newcomers get their addresses one after
+receiving the host until it has an address again; they go on with what they were doing. A scan for it is one exchange at
+19200 baud, on a line that stays at its working rate: modules at that rate receive noise. When it answers, all modules
+that receive are taken down to 19200 baud, which is allowed while motors move, the newcomers get addresses one after
 another, and all go back to the working rate. In between every exchange is an ordinary one: stops overtake, healthy
 drives are polled at the lower rate. Some may have missed a change of rate, or have taken part in one before they had an
-address: while a module is missing afterwards, it is looked for, too.
+address: while a module is missing afterwards, it is searched for, too.
 
 A PIC-SERVO SC may have saved its addresses: then it comes back with them, and never answers at address 0. One that
 answers at 19200 baud with its own address, and cannot have missed a change of rate, has restarted. It is reset while it
@@ -34,7 +34,7 @@ log = get_logger("ldcn")
 
 UNADDRESSED = 0
 LOOKS_FOR_STRAYS = 3
-"""How often each that may be where it should not be is looked for there."""
+"""Number of scans for each possible stray at its rate and address."""
 MOTION_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 WATCH_S = 0.5
 """How long positions are watched before drives count as standing: the velocity in a status has no fraction."""
@@ -98,7 +98,7 @@ class Adoption:
         if len(bauds) > 1:
             problems += [f"address {address} is at {found.baud} baud" for address, found in sorted(self.found.items())]
         if problems:
-            await self._rate.host_to(bauds[-1] if bauds else self._rate.working)  # where a stop may still be heard
+            await self._rate.host_to(bauds[-1] if bauds else self._rate.working)  # where a stop may still be received
             raise NetworkMismatch(
                 f"bus {self._bus.settings.name}: not taken over, {len(self.found)} of {len(self._expected)} module(s)"
                 f" answer; {'; '.join(problems)}",
@@ -157,7 +157,7 @@ class Adoption:
         return states
 
     async def search(self) -> None:
-        """Ask every expected address at every rate, the working rate first, until all have answered."""
+        """Probe every expected address at every rate, the working rate first, until all have answered."""
         self.found.clear()
         others = sorted(set(self._rate.candidates) - {self._rate.working}, reverse=True)
         for baud in (self._rate.working, *others):
@@ -177,13 +177,13 @@ class Adoption:
                 return
 
     async def _ask_again(self, baud: int) -> None:
-        """Give those that were asked impatiently, before anybody had answered at this rate, a fair chance."""
+        """Probe again, with patience, those that were probed before any module had answered at this rate."""
         for each in self._expected:
             if each.address not in self.found and (identity := await self._rate.who_is(each.address, patient=True)):
                 self.found[each.address] = Found(baud, identity)
 
     async def _check_default_status(self, each: Expected) -> None:
-        """Prove that the module adds nothing to its replies: what Define Status was told cannot be read back."""
+        """Prove that the module adds nothing to its replies: the setting of Define Status cannot be read back."""
         try:
             await self._bus.execute(commands.no_operation(Node(each.address, each.profile)))
         except BusDown:
@@ -223,41 +223,41 @@ class Rejoin:
         self._rate = rate
         self._addressing = addressing
         self._expected = expected
-        self._strays: deque[tuple[int, int]] = deque()  # rates and addresses at which somebody may be
+        self._strays: deque[tuple[int, int]] = deque()  # rates and addresses at which a stray module may be
         self._kept_addresses: set[int] = set()  # of those that have restarted with them
         self._foreign: Identity | None = None  # complained about already
 
     async def look(self, mute: tuple[Expected, ...], addressing: Callable[[int], None]) -> frozenset[int]:
-        """Look for these modules once, and bring back those that are found; return who is known to answer.
+        """Scan for these modules once, and bring back those that are found; return those known to answer.
 
         Args:
             mute: modules that have stopped answering, in the order of the chain.
-            addressing: told the address of a newcomer before it is given that address.
+            addressing: called with the address of a newcomer before it is given that address.
 
         Raises:
             BusError: the line failed meanwhile.
         """
         if self._bus.baud != self._rate.at_reset and not self._rate.changeable:
-            return frozenset()  # a newcomer could not hear this port
+            return frozenset()  # a newcomer could not receive at this port's rates
         if not mute or not (await self._anybody_there(mute) or await self._anybody_with_saved_address(mute)):
             return frozenset()
         lost = [each for each in mute if await self._rate.who_is(each.address) is None]
         if lost:
             await self._at_reset_baud(lost, addressing)
         heard = [each.address for each in self._expected if await self._rate.who_is(each.address, patient=True)]
-        # those behind a newcomer are heard again, too
+        # those behind a newcomer answer again, too
         self._suspect(each.address for each in self._expected if each.address not in heard)
         return frozenset(each.address for each in mute if each.address in heard)
 
     async def gather(self, found: Mapping[int, Found], addressing: Callable[[int], None]) -> bool:
         """Make a line audible that answers in part; tell whether there was something to do.
 
-        Newcomers get their addresses, which lets those behind them hear again, and modules that a lost host has left
+        Newcomers get their addresses, which reconnects those behind them, and modules that a lost host has left
         at different rates are brought to the working rate. Nothing is moved or reset.
 
         Args:
             found: who answered, at which rate; at least one.
-            addressing: told the address of a newcomer before it is given that address.
+            addressing: called with the address of a newcomer before it is given that address.
 
         Raises:
             BusError: the line failed meanwhile.
@@ -276,7 +276,7 @@ class Rejoin:
         return True
 
     async def _anybody_there(self, mute: tuple[Expected, ...]) -> bool:
-        """Ask for a newcomer at 19200 baud, and for one of those that may have strayed."""
+        """Probe for a newcomer at 19200 baud, and for one of those that may have strayed."""
         found = await self._rate.who_is_at(self._rate.at_reset, UNADDRESSED)
         if found and (found != self._foreign or mute[0].accepts(found)):
             return True
@@ -287,7 +287,7 @@ class Rejoin:
         return False
 
     async def _anybody_with_saved_address(self, mute: tuple[Expected, ...]) -> bool:
-        """Ask whether a mute module has come back at 19200 baud with an address that it has saved."""
+        """Return whether a mute module has come back at 19200 baud with an address that it has saved."""
         at_reset = self._rate.at_reset
         if self._bus.baud == at_reset:
             return False
@@ -309,7 +309,7 @@ class Rejoin:
         self._strays = deque([(self._rate.working, UNADDRESSED), *strays] * LOOKS_FOR_STRAYS if strays else [])
 
     async def _at_reset_baud(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
-        """Address newcomers at the rate of power-up; everybody who hears is at the working rate again afterwards."""
+        """Address newcomers at the rate of power-up; all modules that receive are at the working rate afterwards."""
         self._suspect(each.address for each in self._expected)
         await self._addressing.without_leaders()
         await self._rate.everybody_to(self._rate.at_reset)
@@ -337,7 +337,7 @@ class Rejoin:
                 continue  # it has its address, and had only missed a change of rate
             found = await self._rate.who_is(UNADDRESSED)
             if found is None:
-                break  # whoever comes next is dark, or keeps those behind it from hearing
+                break  # the next one has no power, or keeps those behind it from receiving
             if not each.accepts(found):
                 if found != self._foreign:
                     log.error("foreign newcomer", bus=self._bus.settings.name, place=each.what, found=str(found))

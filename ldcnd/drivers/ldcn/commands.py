@@ -1,7 +1,7 @@
 """LDCN/NMC commands as the host sends them: for each a function from a destination and values to an `Exchange`.
 
-A destination is one answering module (`Node`) or a silent `Group`. Nothing here remembers what a module was told: what
-it sends by default travels with its `Node`. The other direction is in received.py. Commands that not every dialect has
+A destination is one answering module (`Node`) or a silent `Group`. No state of a module is kept here: its default
+status items travel with its `Node`. The other direction is in received.py. Commands that not every dialect has
 are refused for the others, and so is everything that could move a module which ldcnd only identifies.
 Sources: LS-182AP manual, "Addressing", "Command Description"; PIC-SERVO manual, 4.1, 5.2; for PIC-SERVO SC later vendor
 data sheets.
@@ -73,7 +73,7 @@ class Node(Destination[Status]):
 
     Attributes:
         address: 0 (no address yet) to 127; 128 to 255 for a group with a leader.
-        profile: the dialect of whoever answers; in a group the others share it as far as the command depends on it.
+        profile: the dialect of the answering module; in a group the others share it where the command depends on it.
         items: what it adds to every reply, that is, the mask of the last Define Status.
     """
 
@@ -117,7 +117,7 @@ class Node(Destination[Status]):
 
 @dataclass(frozen=True, slots=True)
 class Group(Destination[None]):
-    """All modules of a group without a leader: nobody answers, and the line rests until the command is executed.
+    """All modules of a group without a leader: none answers, and the line rests until the command is executed.
 
     Attributes:
         address: 0x80 to 0xFF.
@@ -136,17 +136,17 @@ class Group(Destination[None]):
     def exchange(
         self,
         request: bytes,
-        items: StatusItem | None,  # noqa: ARG002 - nobody answers
+        items: StatusItem | None,  # noqa: ARG002 - no module answers
         *,
         repeatable: bool,
         moves: bool = False,
     ) -> Exchange[None]:
-        """See `Destination`; the manuals ask for 0.51 ms of quiet."""
+        """See `Destination`; the manuals require 0.51 ms of quiet."""
         return unanswered(self.address, request, group_quiet_s(self.cycle_s), repeatable=repeatable, moves=moves)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
-    """A module that rejects a packet has not read which items it asked for: it answers with those of its default."""
+    """A module that rejects a packet has not read its status mask: it answers with the default items."""
     return rejected_bytes if data[0] & 0x02 else reply_bytes  # StatusFlag.CHECKSUM_ERROR
 
 
@@ -194,11 +194,11 @@ def group_quiet_s(cycle_s: float = SERVO_CYCLE_S) -> float:
 
 
 RESET_SETTLE_S = 0.1
-"""What a module gets to restart after Hard Reset; the manuals name no time."""
+"""Time for a module to restart after Hard Reset, seconds; the manuals name no time."""
 COMMON_TOP_BAUD = 125_000
 """The rate that every dialect reaches."""
 EEPROM_SETTLE_S = 0.3
-"""What PIC-SERVO SC gets to write its EEPROM and to restart; the data sheet names no time."""
+"""Time for PIC-SERVO SC to write its EEPROM and to restart, seconds; the data sheet names no time."""
 COMMON_COMMANDS = frozenset(
     {
         Command.SET_ADDRESS,
@@ -209,7 +209,7 @@ COMMON_COMMANDS = frozenset(
         Command.HARD_RESET,
     }
 )
-"""What every module understands, servo or not."""
+"""Commands of every module, servo or not."""
 MOVING_COMMANDS = frozenset(
     {
         Command.LOAD_TRAJECTORY,
@@ -219,7 +219,7 @@ MOVING_COMMANDS = frozenset(
         Command.ADD_PATH_POINTS,
     }
 )
-"""What can make a motor move or change how it does; Stop Motor also closes the loop and leads along set-points."""
+"""Commands that can move a motor or change its motion; Stop Motor also closes the loop and leads along set-points."""
 
 
 def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
@@ -276,7 +276,7 @@ def define_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT
 
 
 def read_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
-    """Ask once for these items instead of the default ones.
+    """Request these items once instead of the default ones.
 
     Raises:
         NotSupported: the layout of these items is not known for this module.
@@ -311,16 +311,16 @@ def set_gain(to: Destination[ReplyT], gains: Gains) -> Exchange[ReplyT]:
 
 
 def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | None = None) -> Exchange[ReplyT]:
-    """Stop in one manner, or only switch the amplifier; always safe to repeat.
+    """Stop in one stop mode, or only switch the amplifier; always safe to repeat.
 
     Args:
         to: who stops.
-        control: amplifier enable and at most one manner of stopping.
+        control: amplifier enable and at most one stop mode.
         position: in counts, where HERE goes without a profile; absolute.
 
     Raises:
         ValueOutOfRange: a bad combination of bits, or the position is missing, superfluous or does not fit.
-        NotSupported: the module lacks this manner of stopping.
+        NotSupported: the module lacks this stop mode.
     """
     check_stop(control, to.profile)
     if (position is not None) != bool(control & StopControl.HERE):
@@ -370,7 +370,7 @@ def add_path_points(
 
 
 def start_path(to: Destination[ReplyT]) -> Exchange[ReplyT]:
-    """Start walking through the points loaded so far.
+    """Start the path through the points loaded until now.
 
     Raises:
         NotSupported: the module has no path mode.
@@ -421,7 +421,7 @@ def no_operation(to: Destination[ReplyT]) -> Exchange[ReplyT]:
 
 
 def hard_reset(to: Node | Group) -> Exchange[None]:
-    """Put modules back into the state after power-up: 19200 baud, address 0, motor off; nobody answers."""
+    """Put modules back into the state after power-up: 19200 baud, address 0, motor off; not answered."""
     request = encode_packet(Packet(to.address, Command.HARD_RESET))
     return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False)
 

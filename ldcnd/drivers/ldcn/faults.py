@@ -1,11 +1,11 @@
-"""What an LDCN/NMC status packet says, decided from what the host knows of the drive, and what to do about it.
+"""Faults in LDCN/NMC status packets, interpreted with the host's record of the drive, and their remedies.
 
 On Logosol drives status bits 3, 5, 6 and aux bit 0 form a code whose meaning depends on the power driver enable bit
 Pic_ae: while it is 0 they show what is wrong at present, while it is 1 what switched the power driver off. Bit 3 stays
 0 after that until Pic_ae is 0 and Clear Sticky Bits has found nothing wrong any more (footnote of the table): with
 Pic_ae = 0 it means overvoltage only if nothing can be latched. PIC-SERVO has a power bit, a sticky position error and a
-sticky current limit. Neither tells the host what Pic_ae is, so the host remembers what it has told the drive and which
-cause it has seen, and where it does not know it says so: `FaultCode.LATCHED_FAULT`.
+sticky current limit. Neither reports Pic_ae, so the host records what it has sent to the drive and which
+cause it has seen, and where the cause is unknown it says so: `FaultCode.LATCHED_FAULT`.
 Sources: LS-182AP manual, "Diagnostic bits" and "Status byte and auxiliary status byte definitions"; PIC-SERVO manual,
 4.5 and 5.3. The position error flag is also set whenever the servo is off: alone it is no fault.
 """
@@ -46,12 +46,12 @@ class FaultCode(StrEnum):
 
     @property
     def remedy(self) -> str:
-        """What it means and what to do, for an operator."""
+        """Meaning and remedy, for an operator."""
         return _REMEDIES[self]
 
 
 WARNINGS = frozenset({FaultCode.CURRENT_LIMIT, FaultCode.POSITION_WRAP, FaultCode.SERVO_OVERRUN})
-"""What does not switch the motor off: current limiting only lowers the PWM value (PIC-SERVO manual, 4.3)."""
+"""Conditions that do not switch the motor off: current limiting only lowers the PWM value (PIC-SERVO manual, 4.3)."""
 
 _REMEDIES = MappingProxyType(
     {
@@ -102,7 +102,7 @@ class Fault:
 
     @property
     def remedy(self) -> str:
-        """What it means and what to do, for an operator."""
+        """Meaning and remedy, for an operator."""
         return self.code.remedy
 
     @property
@@ -116,7 +116,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """What the host knows of a drive that its status does not say.
+    """The host's record of a drive beyond its status.
 
     Attributes:
         pic_ae: bit 0 of the last Stop Motor that the drive executed; None while that is not known.
@@ -143,13 +143,13 @@ AFTER_RESET = Knowledge(pic_ae=False, nothing_latched=True, absolute=False)
 def diagnose(profile: Profile, status: Status, known: Knowledge) -> tuple[Fault, ...]:
     """List what is wrong, worst first; empty when nothing is, or nothing is known to be.
 
-    A servo that was switched off on purpose with the amplifier left on looks like one that a position error switched
+    A servo that was switched off on purpose with the amplifier left on appears like one that a position error switched
     off: the drive makes no difference, so it is reported.
 
     Args:
         profile: the dialect.
         status: needs the auxiliary byte, and the A/D value for sensor faults. Without it the servo counts as off, and a
-            stop input cannot be told from a lost encoder.
+            stop input cannot be distinguished from a lost encoder.
         known: what the host remembers.
     """
     if not profile.pic_ae_diagnostics:
@@ -289,7 +289,7 @@ _SERVO_ON, _MOTION_LOCKED, _INDEX = map(int, (AuxFlag.SERVO_ON, AuxFlag.MOTION_L
 
 
 class DriveState:
-    """The memory of one drive: what it was told, and what it has shown.
+    """The record of one drive: what was sent to it, and what it has shown.
 
     Attributes:
         known: what decides on the meaning of its status.
@@ -301,7 +301,7 @@ class DriveState:
         guard: the limit switch at which the drive stops the present motion by itself; empty without one.
         guard_hit: it has.
         offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
-            set it back so far.
+            set it back by this amount.
         setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
         counts: the latest position, in counts since the reset of the drive.
     """
@@ -352,7 +352,7 @@ class DriveState:
             self.known = replace(self.known, latched=Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=loses))
 
     def cleared(self) -> None:
-        """The drive acknowledged Clear Sticky Bits; it forgets what switched it off only with Pic_ae = 0."""
+        """The drive acknowledged Clear Sticky Bits; it discards the cause of a switch-off only with Pic_ae = 0."""
         if self.known.pic_ae is False:
             self.known = replace(self.known, latched=None, nothing_latched=True)
 
@@ -364,7 +364,7 @@ class DriveState:
     # -- what it shows -----------------------------------------------------------------------------------------------
 
     def reading(self, status: Status, asked: frozenset[TelemetryItem] = frozenset()) -> AxisReading:
-        """Interpret a status packet that was asked for because of these items.
+        """Interpret a status packet that was requested for these items.
 
         Raises:
             BadReply: position, velocity or the auxiliary byte is missing.
@@ -410,7 +410,7 @@ class DriveState:
         )
 
     def faults(self, status: Status) -> tuple[driver.Fault, ...]:
-        """Return what the drive complains about; worked out anew only when something that it depends on has changed."""
+        """Return the drive's complaints; recomputed only when something that they depend on has changed."""
         adc = status.adc if self.known.absolute is not False else None
         question = (status.flags, status.aux, adc, self.known, self.loop_may_open)
         if question != self._diagnosed[0]:

@@ -1,4 +1,4 @@
-"""What axes of one LDCN/NMC line do together: start in the same servo cycle, stop by one packet, show one instant.
+"""Joint operations of axes of one LDCN/NMC line: start in the same servo cycle, stop by one packet, show one instant.
 
 A group without a leader does not answer: whatever was done is proven afterwards by each drive's own status.
 Source: LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1 "Group Commands", 5.2 "Start Motion", "Save Current
@@ -118,13 +118,13 @@ class Groups:
             await self._stop_all(group)
             raise OutcomeUnknown(
                 f"group of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
-                " were told to stop",
+                " were commanded to stop",
                 remedy="read the axis states before anything else",
             ) from error
         if stuck:
             await self._stop_all(group)
             raise OutcomeUnknown(
-                f"group of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were told to stop",
+                f"group of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were commanded to stop",
                 remedy="read the axis states before anything else",
             )
 
@@ -172,7 +172,7 @@ class Groups:
         return group.address != EVERYBODY or self.servos_only
 
     def _quiet_s(self, groups: list[Group]) -> float:
-        """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which nobody reads."""
+        """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which are not read."""
         leaders = sum(group.leader is not None for group in groups)
         return (
             commands.group_quiet_s(self._rate.cycle_s) + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud

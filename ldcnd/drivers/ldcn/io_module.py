@@ -1,7 +1,7 @@
-"""One PIC-I/O of a line: polled for its inputs, told its outputs; what it was told is remembered, as it cannot be read.
+"""One PIC-I/O of a line: polls its inputs, sets its outputs, and records them, as they cannot be read back.
 
 Nothing is written at start-up, after a reset or when the module comes back after a loss of power: its lines are inputs
-then and stay so until somebody asks for something else. Source: PIC-I/O data sheet, 2.2, 3.1.
+then and stay so until a request changes them. Source: PIC-I/O data sheet, 2.2, 3.1.
 """
 
 import asyncio
@@ -138,7 +138,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         return self._reading(await self._bus.execute(self._exchange))
 
     def _pwm_after(self, pwm: tuple[float | None, float | None]) -> tuple[int, int] | None:
-        """Return what both PWM outputs shall be; None when nothing was asked of them."""
+        """Return the new values of both PWM outputs; None when the request leaves them alone."""
         if pwm == (None, None):
             return None
         known = self._pwm or (0, 0)
@@ -148,7 +148,7 @@ class IoModule(Poller[IoStatus], IoDriver):
     async def _switch_together(self, latch: int, pwm1: int, pwm2: int) -> None:
         """Let lines and PWM outputs change in the same cycle of the module.
 
-        Only this module is told: in a group with servos Synch Output is Start Motion.
+        Only this module is addressed: in a group with servos Synch Output is Start Motion.
         """
         self._pwm = None
         await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, pwm1, pwm2)))

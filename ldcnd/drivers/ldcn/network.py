@@ -86,7 +86,7 @@ log = get_logger("ldcn")
 MISSES_UNTIL_MUTE = 3
 PLACE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY
 RATE_ATTEMPTS = 2
-"""Set Baud to everybody is not answered: one packet that was lost must not decide on the rate for good."""
+"""Attempts at Set Baud to the whole line: it is not answered, and one lost packet must not decide on the rate."""
 
 
 class LdcnNetwork(Network):
@@ -192,7 +192,7 @@ class LdcnNetwork(Network):
             address: self._io.get(address) or ModuleWatch(address) for address in modules if address not in self._drives
         }
         self._groups.proven = reset
-        self._groups.servos_only = reset and not self._watches  # an adoption asks only for what it expects
+        self._groups.servos_only = reset and not self._watches  # an adoption probes only for expected modules
         known = (identity.profile for identity in modules.values())
         self._groups.all_capture = reset and all(
             each is PIC_IO or (each is not None and each.support is Support.FULL) for each in known
@@ -290,8 +290,8 @@ class LdcnNetwork(Network):
         """Tell, before a reset, whether all modules wait for an address, and so stand where they were powered on.
 
         What has an address of an earlier host may have been moved by it. The first module tells: while it waits it
-        keeps the next one from hearing. If only some wait, modules meet at one address, the attempt fails, and the next
-        one is not the first at which something was heard.
+        keeps the next one from receiving. If only some wait, modules meet at one address, the attempt fails, and the
+        next one is not the first at which a module answered.
         """
         if (
             not await self._rate.host_to(self._rate.at_reset)
@@ -379,7 +379,7 @@ class LdcnNetwork(Network):
         return any(self._bus.misses(each.address) >= MISSES_UNTIL_MUTE for each in self._expected)
 
     async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:
-        """See `Network`: one look of `Rejoin`."""
+        """See `Network`: one scan of `Rejoin`."""
 
         def addressing(address: int) -> None:
             if address in self._drives:

@@ -1,6 +1,6 @@
 """LDCN/NMC command packets: header, address, command byte, data, checksum; and the fields that data consist of.
 
-Knows bytes only; what the data mean is in commands.py and received.py. Replies have no such frame: see status.py.
+Handles bytes only; the meaning of the data is in commands.py and received.py. Replies have no such frame: status.py.
 Sources: LS-182AP manual, "Serial Command Interface", "Command Description"; PIC-SERVO manual, 4.1, 5.2.
 """
 
@@ -107,7 +107,7 @@ class ReceivedPacket:
 
 
 class PacketReader:
-    """The receiver of a module: finds packets in the bytes of the line, whoever they are for.
+    """The receiver of a module: finds packets in the bytes of the line, for any address.
 
     Outside a packet everything but the header is skipped; inside, the count in the command byte rules, so that 16 nulls
     complete any half-received packet (PIC-SERVO manual, 4.1).
@@ -129,7 +129,7 @@ class PacketReader:
         return byte == HEADER and not self._missing
 
     def reset(self) -> None:
-        """Forget a half-received packet."""
+        """Discard a half-received packet."""
         self._body.clear()
         self._missing = 0
 
@@ -197,7 +197,7 @@ class Field:
 
 
 ADDRESS = Field("individual address", 1, 0x01, 0x7F)
-"""PIC-SERVO takes 0 to 255 [manual, 5.2], but above 127 an individual address could not be told from a group's."""
+"""PIC-SERVO takes 0 to 255 [manual, 5.2], but above 127 an individual address could be taken for a group's."""
 GROUP_ADDRESS = Field("group address", 1, 0x80, 0xFF)
 GROUP_MEMBER = 0x80
 """This bit of the group address, cleared in the data of Set Address, makes the module the leader of its group."""

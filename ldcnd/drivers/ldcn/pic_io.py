@@ -53,7 +53,7 @@ ITEM_BYTES = (2, 1, 1, 1, 4, 2, 2, 4)
 
 @dataclass(frozen=True, slots=True)
 class IoStatus:
-    """One status packet; None where the mask did not ask for the item.
+    """One status packet; None where the mask did not request the item.
 
     Attributes:
         rejected: the module found a wrong checksum and did not execute the command.
@@ -302,7 +302,7 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
         ValueOutOfRange: see `encode_io_command`.
     """
     repeatable = not isinstance(command, SynchOutput | SynchInput)
-    moves = not isinstance(command, SetTimerMode | SynchInput)  # what an output switches, nobody here knows
+    moves = not isinstance(command, SetTimerMode | SynchInput)  # what an output switches is unknown here
     return to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable, moves=moves)
 
 
@@ -314,7 +314,7 @@ def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
 
 
 def read_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
-    """Ask once for these items instead of the default ones."""
+    """Request these items once instead of the default ones."""
     request = encode_packet(Packet(to.address, Command.READ_STATUS, bytes((items,))))
     return to.exchange(request, items, repeatable=True)
 

@@ -1,6 +1,6 @@
 """The dialects of LDCN and NMC: one row per device, chosen by (device id, version).
 
-A profile is the only place that knows how devices differ: status layout, field widths, registers, homing sources.
+A profile is the only place for differences between devices: status layout, field widths, registers, homing sources.
 Sources: LS-182AP manual (712182023 rev. C) and PIC-SERVO manual (version 4), "Command description"; for devices these
 do not cover, later vendor data sheets.
 """
@@ -18,7 +18,7 @@ class Support(StrEnum):
 
 
 class DeviceKind(StrEnum):
-    """What a module is; the same command codes mean other things to the next kind."""
+    """The kind of a module; the same command codes have other meanings for another kind."""
 
     SERVO = "servo"
     IO = "io"
@@ -66,7 +66,7 @@ class Profile:
         offset_on_the_fly: a trapezoidal position loaded in mid-move is added as an offset; elsewhere it is erratic.
         current_limit: Set Gain's CL byte works.
         top_baud: the highest rate of Set Baud Rate.
-        baud_keys: Set Baud Rate looks its byte up in a table of rates; elsewhere the byte divides the clock.
+        baud_keys: Set Baud Rate finds its byte in a table of rates; elsewhere the byte divides the clock.
         encoder_counts_per_s: the highest rate of encoder transitions that is counted without loss.
         most_velocity: the largest programmed velocity, 16.16 counts per tick.
         most_error_limit: the largest EL of Set Gain, counts.
@@ -160,7 +160,7 @@ PIC_SERVO_V3 = replace(
     title="PIC-SERVO version 3",
     versions=range(3, 4),
     gain_bytes=13,
-    limit_outputs=False,  # the manual describes version 4; for older ones nobody vouches for it, nor for the next
+    limit_outputs=False,  # the manual describes version 4; not verified for older ones, nor for the next
 )
 PIC_SERVO_V2 = replace(
     PIC_SERVO_V3,
@@ -208,7 +208,7 @@ PIC_SERVO_CMC = replace(
 PIC_SERVO_CMC_ADVANCED = replace(PIC_SERVO_CMC, position_error_bytes=2, bit7_bytes=1)
 """The same device after Stop Motor with bit 5, which adds two status items and path mode; it has the same identity.
 
-Before that it works as a version 4. Whether it already sends the two items is not known, so hosts do not ask for them.
+Before that it works as a version 4. Whether it already sends the two items is not known, so hosts do not request them.
 """
 LS_173AP = Profile(
     "ls-173ap",
@@ -262,7 +262,7 @@ PROFILES: dict[str, Profile] = {
 
 
 def identify(device_id: int, version: int) -> Profile | None:
-    """Return the dialect of a device, or None for one that nobody described: never guess a layout.
+    """Return the dialect of a device, or None for an unsupported one: never guess a layout.
 
     Args:
         device_id: 0 to 255, status item 5, first byte.

@@ -27,7 +27,7 @@ from ldcnd.errors import BadReply
 
 POSITION_BYTES = POSITION.width
 OLDEST_GAIN_BYTES = 13
-"""What PIC-SERVO versions 1 to 3 take."""
+"""Length of Set Gain's data for PIC-SERVO versions 1 to 3, bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ ReceivedCommand = (
 
 @dataclass(frozen=True, slots=True)
 class Interpretation:
-    """What a module makes of a packet, and what is odd about it.
+    """A module's interpretation of a packet, and what is odd about it.
 
     Attributes:
         address: who is meant.

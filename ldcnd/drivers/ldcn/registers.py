@@ -1,4 +1,4 @@
-"""LDCN/NMC registers: codes of baud rates, the data of Set Gain, and what the host knows of what it cannot read back.
+"""LDCN/NMC registers: codes of baud rates, the data of Set Gain, and the host's record of what it cannot read back.
 
 Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Conditions", "Set Baud Rate" and the
 calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
@@ -48,7 +48,7 @@ BAUD_DIVISORS = MappingProxyType(
 )
 """The divisor of each rate; 230400 exists on PIC-SERVO SC only."""
 BAUD_KEYS = MappingProxyType({code: baud for rates in BAUD_DIVISORS.values() for baud, code in rates.items()})
-"""What PIC-SERVO SC looks the byte up in: it knows both families and sets its clock to the rate itself."""
+"""The table of PIC-SERVO SC for the byte: it has the codes of both families and sets its clock to the rate itself."""
 
 
 def baud_divisor(baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> int:
@@ -84,7 +84,7 @@ def baud_at_reset(clock_hz: int) -> int:
 
 
 def module_baud(profile: Profile, code: int) -> float | None:
-    """Return the rate that a device takes at this code of Set Baud Rate, 0 to 255; None when it knows no such code."""
+    """Return the rate that a device takes at this code of Set Baud Rate, 0 to 255; None when it has no such code."""
     return BAUD_KEYS.get(code) if profile.baud_keys else actual_baud(code, profile.clock_hz)
 
 
@@ -225,7 +225,7 @@ class RegisterBook:
         self._set(dict.fromkeys(self._registers, 0) | {"sr": 1, LIMIT_PINS: INPUTS}, Provenance.ASSUMED)
 
     def assume(self, values: Mapping[str, int]) -> None:
-        """The drive was taken over as it is: these are what somebody must have written, nothing else is known."""
+        """The drive was taken over as it is: these values are assumed to be written, nothing else is known."""
         self.doubt(self._registers)
         self._set(values, Provenance.ASSUMED)
 

@@ -29,7 +29,7 @@ class StatusItem(IntFlag):
 
 
 STATUS_BYTE_ONLY = StatusItem(0)
-"""What every module sends after power-up."""
+"""The status items that every module sends after power-up."""
 
 
 class StatusFlag(IntFlag):
@@ -60,7 +60,7 @@ class AuxFlag(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """One decoded status packet; None where the mask did not ask for the item.
+    """One decoded status packet; None where the mask did not request the item.
 
     Attributes:
         position: counts, signed 32 bit.

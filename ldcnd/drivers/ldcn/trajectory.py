@@ -23,7 +23,7 @@ MOST_PWM = 0xFF
 
 
 class ProfileMode(StrEnum):
-    """What the profile generator does while the position servo is on."""
+    """The operation of the profile generator while the position servo is on."""
 
     TRAPEZOIDAL = "trapezoidal"
     VELOCITY = "velocity"
@@ -44,7 +44,7 @@ class TrajectoryControl(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """What is loaded; None leaves a register as it is.
+    """The values to load; None leaves a register as it is.
 
     Attributes:
         position: counts, -0x7FFFFFFF to 0x7FFFFFFF; the goal in trapezoidal mode.
@@ -204,7 +204,7 @@ def trajectory_of(motion: Motion | AnalogMotion | PwmOutput, servo_divisor: int,
     """Return what Load Trajectory takes for a motion; it waits for Start Motion.
 
     Raises:
-        ValueOutOfRange: a value does not fit its register, or is an analog target that looks like a broken sensor.
+        ValueOutOfRange: a value does not fit its register, or is an analog target in the range of a broken sensor.
         NotSupported: an analog target on a drive without absolute positioning.
     """
     if not isinstance(motion, PwmOutput):

@@ -46,7 +46,7 @@ class Register(IntEnum):
 
 
 class TraceRegister(IntEnum):
-    """What may be set for a trace: all of it before Data Trace Mode is entered.
+    """Settings for a trace: all of them are written before Data Trace Mode is entered.
 
     The manual speaks of MAXTRQC and OSVELCC as settings that raise the resolution of a trace, and lists them among
     constants: whether a drive takes them is an assumption.
@@ -63,7 +63,7 @@ class TraceRegister(IntEnum):
 
 
 class OperatingMode(IntEnum):
-    """What the drive is doing beside its normal work."""
+    """The drive's activity beside its normal work."""
 
     NORMAL = 0x0000
     DATA_TRACE = 0x2000

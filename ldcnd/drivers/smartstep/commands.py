@@ -1,4 +1,4 @@
-"""Every command as an exchange: what to send, how to know its answer, whether it may be sent again.
+"""Every command as an exchange: what to send, how to recognise its answer, whether it may be sent again.
 
 Bytes that do not pass the checks are not the answer: they are FOREIGN, and reading goes on until the deadline. An error
 reply is an answer and becomes a `Refusal`. There is no way to set an arbitrary address: each kind of setting has its
@@ -51,7 +51,7 @@ class Refusal:
     """An intact reply by which the drive declines; nothing was changed, and the same again will be declined again.
 
     Attributes:
-        data: as echoed; the value or the number of bytes that was asked for.
+        data: as echoed; the value or the requested number of bytes.
     """
 
     unit: int
@@ -141,7 +141,7 @@ def write_ram(unit: int, parameter: Parameter, value: int) -> Exchange[int | Ref
 
 
 def write_eeprom(unit: int, parameter: Parameter, value: int) -> Exchange[int | Refusal]:
-    """Change a parameter for good; costs one of 10,000 writes even when the value stays the same.
+    """Change a parameter permanently; costs one of 10,000 writes even when the value stays the same.
 
     Read first and skip if equal; when the reply is lost, read back before sending again. Whether the value in use
     changes too is not known: read both addresses afterwards.
@@ -176,7 +176,7 @@ def set_operating_mode(unit: int, mode: OperatingMode) -> Exchange[int | Refusal
 
 
 def execute(unit: int) -> Exchange[int | Refusal]:
-    """Start what the operating mode stands for; ask 2000H, not 2001H, when it has finished.
+    """Start the operation of the operating mode; read 2000H, not 2001H, to see when it has finished.
 
     Source: manual 4, settings 2; 5 (2); 6 (2).
     """
@@ -184,9 +184,9 @@ def execute(unit: int) -> Exchange[int | Refusal]:
 
 
 def probe(unit: int) -> Exchange[None]:
-    """Ask for an address that never exists: the error reply proves that the unit is alive and the line in step.
+    """Request an address that never exists: the error reply proves that the unit is alive and the line in step.
 
-    Safe on any wiring: a drive that hears an error reply does not take it for a command. No other command's reply
+    Safe on any wiring: a drive that receives an error reply does not take it for a command. No other command's reply
     carries this address, so none can pass for it. `decode` raises `BadReply` for any other answer.
 
     Source: manual 2.2, example 3.
@@ -404,7 +404,7 @@ def _string_checker(command: Command, allowed: tuple[StringChecksum, ...]) -> Ca
 
 
 def _fitting(packet: bytes, allowed: tuple[StringChecksum, ...], byte_count: int | None) -> dict[StringChecksum, bytes]:
-    """Return the data digits by variant; with `byte_count`, only variants that make the data so long."""
+    """Return the data digits by variant; with `byte_count`, only variants that give the data this length."""
     header, body = packet[1:HEADER_CHARACTERS], packet[HEADER_CHARACTERS:-1]
     if len(body) % 2 or not is_upper_hex(header) or not is_upper_hex(body) or not body:
         return {}
@@ -443,7 +443,7 @@ def _string_decoder(
 
 
 def _count_unit(command: Command, digits: int) -> CountUnit | None:
-    """Return what the drive must have counted to send so many data characters; None when nothing explains them."""
+    """Return the unit of the count that explains this number of data characters; None when nothing explains it."""
     for extra in (0, TRAILER_CHARACTERS):
         for unit, length in (
             (CountUnit.BYTES, 2 * command.data),

@@ -1,7 +1,7 @@
 """Examining one drive before it is used: is it alive, what is it, how are its wires, which assumptions can be verified.
 
 Reads at even addresses and even counts only: what a drive does with odd ones is not known. Run it with RUN off.
-Source: manual 2 to 6; the order goes from what no drive can take amiss to what asks most of it.
+Source: manual 2 to 6; the order goes from what is safe with any drive to what requires most of it.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ from ldcnd.wirelog.recorder import WireEvent, WireRecord
 async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
     """Examine one drive on an open line that no other program uses; yields each finding as it comes.
 
-    It reads only. Ends early when the drive does not answer or hears itself.
+    It reads only. Ends early when the drive does not answer or receives its own replies.
     """
     examination = Examination(bus, unit)
     alive = await examination.alive()
@@ -73,7 +73,7 @@ class Examination:
         return Finding(axis=self._unit.spec.name, what=what, verdict=verdict, text=text, verifies=verifies)
 
     async def alive(self) -> Finding:
-        """Ask for an address that never exists: the known error reply proves drive, line and unit number."""
+        """Read an address that never exists: the known error reply proves drive, line and unit number."""
         number = self._unit.spec.address
         try:
             await self._bus.execute(commands.with_response_time(commands.probe(number), self._unit.profile))
@@ -180,7 +180,7 @@ class Examination:
 async def scan(
     bus: Bus, profile: SmartStepProfile, found: Callable[[int, str], None] = lambda *_: None
 ) -> AsyncIterator[Finding]:
-    """Ask every unit number from 0 to F whether a drive has it; yields each drive, or why there is none.
+    """Probe every unit number from 0 to F for a drive; yields each drive, or why there is none.
 
     Works best on a line that makes parity in software: then characters with wrong parity are seen as such.
 

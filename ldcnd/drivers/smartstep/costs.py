@@ -25,7 +25,7 @@ ANY_UNIT = 1
 
 
 def price_list(profile: SmartStepProfile = SMARTSTEP) -> PriceList:
-    """Return the exchanges of a drive; a reading is one word, whatever is asked for."""
+    """Return the exchanges of a drive; a reading is one word, for any item."""
     chunk = string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.trace_chunk_bytes, profile)
     exchanges: dict[str, Exchange[Any]] = {
         "read word": commands.reference(ANY_UNIT, 0),

@@ -58,7 +58,7 @@ log = get_logger("smartstep")
 
 @dataclass(frozen=True, slots=True)
 class UnitSpec:
-    """What the configuration says about one unit.
+    """The configuration of one unit.
 
     Attributes:
         axis: name, unit number 0 to 15, model.
@@ -83,7 +83,7 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
     """
 
     def __init__(self, spec: UnitSpec, bus: Bus, others: Mapping[int, str] = MappingProxyType({})) -> None:
-        """Prepare the axis; asks nothing.
+        """Prepare the axis; sends nothing.
 
         Args:
             spec: what the configuration says.

@@ -16,7 +16,7 @@ from ldcnd.errors import ConfigError, EepromBudgetSpent, Remedy, step
 
 EEPROM_LIFE = 10_000
 WARNING_WRITES = 1000
-"""From so many writes on, every further one is remarked upon."""
+"""From this number of writes on, every further one is remarked upon."""
 EARLIER = "earlier"
 """Stands for the parameters of writes that a replaced drive had taken before it was counted here."""
 
@@ -67,11 +67,11 @@ class EepromLedger:
         await self._set(axis, parameter, self.writes(axis, parameter) + 1)
 
     async def withdraw(self, axis: str, parameter: str) -> None:
-        """Forget a write that the drive has not carried out."""
+        """Remove a write that the drive has not carried out."""
         await self._set(axis, parameter, max(0, self.writes(axis, parameter) - 1))
 
     async def restart(self, axis: str, writes: int) -> int:
-        """Begin the count of an axis anew, because its drive was replaced; return what the old drive had taken.
+        """Restart the count of an axis, because its drive was replaced; return the old drive's count.
 
         Args:
             axis: whose drive.

@@ -2,7 +2,7 @@
 
 None of the three commands is repeated blindly. Entering and leaving are known by reading 2000H. A lost execute cannot
 be distinguished from a lost reply while a trace waits for its trigger, so the mode is left, entered again and executed
-anew: what ran before has ended then, and nothing is executed twice in one stay.
+again: what ran before has ended then, and nothing is executed twice in one stay.
 Source: manual 2.1 (resending), 4, settings 1 and 2; 5 and 6.
 """
 
@@ -111,7 +111,7 @@ class Execution:
 
 
 async def execute_mode(words: Words, mode: OperatingMode) -> Execution:
-    """Execute a mode that was entered; when the reply is lost, leave it, enter it again and execute it anew.
+    """Execute a mode that was entered; when the reply is lost, leave it, enter it again and execute it again.
 
     Raises:
         OutcomeUnknown: every attempt got lost; the caller leaves the mode.

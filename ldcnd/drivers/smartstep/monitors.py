@@ -1,4 +1,4 @@
-"""What a drive shows: monitors Un, signal bits, switches, alarm codes, and the two 32-bit counters.
+"""The values that a drive shows: monitors Un, signal bits, switches, alarm codes, and the two 32-bit counters.
 
 Signal bits are electrical levels: 1 is high, 0 is low, whatever a signal means; bits that the manual calls not used
 are dropped.
@@ -145,12 +145,12 @@ def driver_type(word: int) -> DriverType | int:
 
 
 def run_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
-    """Tell whether RUN asks for servo-on; which level does is an assumption of the profile."""
+    """Return whether RUN requests servo-on; which level does is an assumption of the profile."""
     return bool(levels & InputSignal.RUN) is not profile.run_active_low
 
 
 def reset_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
-    """Tell whether RESET asks for an alarm reset; which level does is an assumption of the profile."""
+    """Return whether RESET requests an alarm reset; which level does is an assumption of the profile."""
     return bool(levels & InputSignal.RESET) is not profile.reset_active_low
 
 
@@ -165,7 +165,7 @@ HISTORY_LENGTH = 10
 
 
 class AlarmKind(StrEnum):
-    """What a code means for the drive."""
+    """The meaning of an alarm code for the drive."""
 
     NONE = "none"
     ALARM = "alarm"
@@ -216,7 +216,7 @@ def alarm(word: int) -> Alarm:
 
 
 class AlarmHistory:
-    """What a drive adds to its alarm history, from one complete reading of it to the next.
+    """Entries that a drive adds to its alarm history, from one complete reading of it to the next.
 
     Entry 0 is the newest (INFERRED_MEDIUM); a drive that adds at the other end shows that by its first new alarm. The
     ten words are read one after the other, so an alarm that comes meanwhile may tear them: what cannot follow from the
@@ -300,7 +300,7 @@ class CounterValue:
 
 
 class CounterReading:
-    """Asks for one word at a time until it can tell the value, or gives up.
+    """Requests one word at a time until the value is certain, or gives up.
 
     Right while the counter moves less than 32768 between two reads; faster even motion is noticed and read again.
 

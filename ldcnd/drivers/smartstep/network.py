@@ -1,8 +1,8 @@
-"""One SmartStep line: its port, who answers on it, what each unit is, whether one hears itself.
+"""One SmartStep line: its port, which units answer on it, their models, whether one receives its own replies.
 
 The port pauses before each packet, so that a drive has time to release its transmitter (the manual gives no time, the
 profile does), and makes parity in software where the adapter cannot. Units have no addressing procedure: their numbers
-are set in Pn000.2. A silent unit does not keep the others from being served; it is asked again, more and more seldom.
+are set in Pn000.2. A silent unit does not keep the others from being served; it is probed at increasing intervals.
 Source: manual 2.1, 2.2.
 """
 
@@ -38,7 +38,7 @@ BAUD = 9600
 
 
 class SmartStepPort(Transport):
-    """An open port with manners; also the receiver of the port that it wraps."""
+    """An open port with the SmartStep's framing and pauses; also the receiver of the port that it wraps."""
 
     def __init__(self, port: Transport, framing: Framing, quiet_s: float) -> None:
         self._port = port
@@ -150,7 +150,7 @@ class SmartStepNetwork(Network):
         self.resync = Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=self._probe)
 
     async def bring_up(self) -> BringUpReport:
-        """See `Network`: ask every unit what it is; only reads.
+        """See `Network`: read the identity of every unit; only reads.
 
         Raises:
             NetworkMismatch: no unit answers at all, or one takes its own replies for commands.
@@ -188,7 +188,7 @@ class SmartStepNetwork(Network):
         )
 
     async def _check_wires(self, unit: SmartStepAxis) -> None:
-        """Refuse a line on which a drive hears itself, before a word is read that may be zero.
+        """Refuse a line on which a drive receives its own replies, before a word is read that may be zero.
 
         Raises:
             NetworkMismatch: it does.

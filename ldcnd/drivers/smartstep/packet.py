@@ -1,6 +1,6 @@
 """SmartStep packets: 14 characters each way, their checksum, their parity, and where one ends in a stream.
 
-Knows characters only; what an address or its data mean is in addresses.py and commands.py. Where the manual prints a
+Handles characters only; the meaning of addresses and data is in addresses.py, commands.py. Where the manual prints a
 format one or two letters short, its rule of 14 characters decides.
 Source: "Serial communications with Smart Step servodriver" (OMRON Barcelona), 2.1 "Basic specifications", 2.2
 "Communication mode".
@@ -23,7 +23,7 @@ HIGHEST_WORD = 0xFFFF
 
 
 class Function(IntEnum):
-    """What a command asks for; its third character."""
+    """The function of a command; its third character."""
 
     REFERENCE = 0
     SETTING = 1
@@ -56,7 +56,7 @@ class ResponseStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What the host sends.
+    """A packet of the host.
 
     Attributes:
         unit: 0 to 15; 0 reaches only a drive in single-axis mode, there is no broadcast.
@@ -90,7 +90,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What a drive sends: every reply but that of a successful string reference."""
+    """A packet of a drive: every reply but that of a successful string reference."""
 
     unit: int
     status: ResponseStatus
@@ -209,7 +209,7 @@ class ReplyReader:
     """Cuts a stream into packet candidates; the cuts do not depend on how the stream arrives.
 
     Attributes:
-        skipped: bytes so far that belonged to no candidate.
+        skipped: number of bytes that belonged to no candidate.
     """
 
     def __init__(self, longest: int) -> None:

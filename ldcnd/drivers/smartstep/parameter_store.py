@@ -1,4 +1,4 @@
-"""Parameters, counters and alarms of one drive as the daemon asks for them; RAM by default, EEPROM rarely.
+"""Parameters, counters and alarms of one drive on request of the daemon; RAM by default, EEPROM rarely.
 
 EEPROM: the value is read first and nothing is sent if it is there already; each write is entered in the ledger before
 it is sent; when its reply is lost, the memory is read back, and only a value that is still the old one lets the write
@@ -71,7 +71,7 @@ from ldcnd.model.samples import MonitorName
 log = get_logger("smartstep")
 
 EEPROM_ATTEMPTS = 3
-"""So many writes at most for one request, each after a read-back that shows the old value."""
+"""Maximum number of writes for one request, each after a read-back that shows the old value."""
 DEFAULT_BUDGET = 9000
 
 
@@ -102,7 +102,7 @@ class UnitParameters(ParameterAccess):
         others: Mapping[int, str],
         cleared: Callable[[], None],
     ) -> None:
-        """Prepare the access; asks nothing.
+        """Prepare the access; sends nothing.
 
         Args:
             words: the drive.
@@ -125,7 +125,7 @@ class UnitParameters(ParameterAccess):
         """Return the parameter with this number or name.
 
         Raises:
-            ValueOutOfRange: there is none, or the manual does not list it and that was not asked for.
+            ValueOutOfRange: there is none, or the manual does not list it and unlisted ones were not requested.
         """
         found = find_parameter(text)
         if found and (unlisted or found in PARAMETERS):
@@ -242,7 +242,7 @@ class UnitParameters(ParameterAccess):
     @override
     async def restart_eeprom_count(self, writes: int) -> int:
         previous = await self._ledger().restart(self._axis, writes)
-        log.warning("EEPROM count begun anew", axis=self._axis, previous=previous, total=writes)
+        log.warning("EEPROM count restarted", axis=self._axis, previous=previous, total=writes)
         return previous
 
     @property

@@ -1,7 +1,7 @@
 """Polling one drive word by word: which item is due, which words it takes, what they say together.
 
-Another node's turn fits between any two words. A drive that does not answer is asked for one word only, more and more
-seldom, because each question costs the others of its line a third of a second.
+Another node's turn fits between any two words. A drive that does not answer is polled for one word only, more and more
+seldom, because each exchange costs the others of its line a third of a second.
 """
 
 import asyncio
@@ -44,7 +44,7 @@ FIRST_BACKOFF_S = 1.0
 LONGEST_BACKOFF_S = 10.0
 NEVER_S = float("inf")
 STRAY_WAIT_S = 0.3
-"""A drive that heard itself has answered by then: its longest response time and some margin."""
+"""A drive that received its own reply has answered by then: its longest response time and some margin."""
 HURRIED_S = 0.5
 """Between two words of an alarm history that is wanted now: others of the line hardly notice."""
 PUT_OFF_S = 1.0
@@ -52,7 +52,7 @@ PUT_OFF_S = 1.0
 
 
 class Basic(Enum):
-    """What is polled beside monitors."""
+    """Items polled beside monitors."""
 
     IDENTITY = "identity"
     STATE = "state"
@@ -125,7 +125,7 @@ class UnitPoller(Poller[int | Refusal]):
         *,
         wires_checked: bool = True,
     ) -> None:
-        """Prepare the polls; asks nothing.
+        """Prepare the polls; sends nothing.
 
         Args:
             bus: the owner of the line.
@@ -134,7 +134,7 @@ class UnitPoller(Poller[int | Refusal]):
             rates_hz: how often each item is read.
             start_at_s: from when on, in loop time.
             listeners: its callbacks.
-            wires_checked: that the drive does not hear itself is known; otherwise it is looked for before a word is
+            wires_checked: the drive is known not to receive its own replies; otherwise that is checked before a word is
                 read that may be zero.
         """
         self.node = unit
@@ -221,7 +221,7 @@ class UnitPoller(Poller[int | Refusal]):
             self._next_turn(now_s + min(LONGEST_BACKOFF_S, FIRST_BACKOFF_S * 2.0**doublings))
 
     def _next_turn(self, at_s: float) -> None:
-        """Ask for the next turn; the line may take it before this returns."""
+        """Request the next turn; the line may take it before this returns."""
         self.due_at_s = at_s
         if self._bus.is_open:
             self._bus.add_poller(self)
@@ -231,7 +231,7 @@ class UnitPoller(Poller[int | Refusal]):
     def _begin(self, now_s: float, queued_at_s: float) -> None:
         """Take up the item that is due and has the earliest deadline: its next turn.
 
-        What has become due since the turn was asked for waits for another one, or it would pass over a late item at the
+        What has become due since the turn was requested waits for another one, or it would pass over a late item at the
         last moment.
         """
 
@@ -263,7 +263,7 @@ class UnitPoller(Poller[int | Refusal]):
         self._left = []
 
     def _give_up(self, item: Item, refusal: Refusal) -> None:
-        """Ask no more for what the drive does not have."""
+        """Stop polling an item that the drive does not have."""
         log.warning("item not there", unit=self.node, item=item.value, reason=str(refusal))
         self._abandon()
         if item is not Basic.STATE:
@@ -278,15 +278,15 @@ class UnitPoller(Poller[int | Refusal]):
                 self._due_s[item] = now_s
         self._due_s[Basic.IDENTITY] = now_s
         self._read_history(now_s)
-        # The word that it was asked for is never zero, so a drive that takes its own replies for commands shows now.
+        # The word of this poll is never zero, so a drive that takes its own replies for commands shows now.
         self._one_word_only = True
         self._next_turn(now_s + LONGEST_BACKOFF_S)
         self._loop.call_later(STRAY_WAIT_S, self._heard, now_s)
 
     def _heard(self, answered_at_s: float) -> None:
-        """Go on with a drive that has come back, unless it hears itself: then nothing more is asked of it."""
+        """Resume polls of a drive that has come back, unless it receives its own replies: then nothing more is sent."""
         if self._hears_itself(answered_at_s):
-            log.error("drive takes its own replies for commands; nothing is asked any more", unit=self.node)
+            log.error("drive takes its own replies for commands; nothing more is sent to it", unit=self.node)
             self._listeners.self_hearing()
         else:
             self._one_word_only = False

@@ -1,4 +1,4 @@
-"""What the manual leaves open about a SmartStep: assumptions as switches, with the confidence of each default.
+"""Open questions of the SmartStep manual: assumptions as switches, with the confidence of each default.
 
 The manual lost its figures and has misprints. A profile says how one drive is taken to behave; each switch that rests
 on inference is an assumption with a name, a default, and a way to verify it on the drive.
@@ -30,7 +30,7 @@ class Confidence(Enum):
 
 
 class Verification(StrEnum):
-    """What a test on the drive has said about an assumption."""
+    """The result of a test of an assumption on the drive."""
 
     ASSUMED = "assumed"
     VERIFIED = "verified"
@@ -66,7 +66,7 @@ class EepromWrite(StrEnum):
 
 
 class StringChecksum(StrEnum):
-    """What the checksum of a string reply covers; it stands before the data."""
+    """The range of a string reply's checksum; it stands before the data."""
 
     AUTO = "auto"
     HEADER = "header"
@@ -76,7 +76,7 @@ class StringChecksum(StrEnum):
 
 
 class CountUnit(StrEnum):
-    """What the count of a string reference counts."""
+    """The unit of the count of a string reference."""
 
     BYTES = "bytes"
     WORDS = "words"

@@ -103,7 +103,7 @@ SLACK = 1.2
 """A drive's clock may be off, and its recorder may begin late."""
 LARGEST_CYCLEC_US = 0xFFFF
 COMPARED_EACH = 6
-"""So many times a trace is compared with the monitors, unless it is longer than as many seconds."""
+"""Number of comparisons of a trace with the monitors; a longer trace is compared at `LONGEST_UNCOMPARED_S`."""
 LONGEST_UNCOMPARED_S = 1.0
 MOST_SHOWN = 120
 """Newest readings of monitors that are kept while a trace waits for its trigger."""
@@ -137,7 +137,7 @@ class _Setup:
 
     @property
     def trigger(self) -> TraceTrigger | None:
-        """What the drive itself waits for."""
+        """The trigger that the drive itself waits for."""
         return self.request.trigger if self.source is TriggerWordSource.CONFIGURED else None
 
 
@@ -167,7 +167,7 @@ class SmartStepTracer(Tracer):
         return judgement
 
     async def arm(self, request: TakeTrace) -> ArmedTrace:
-        """See `Tracer`. Nothing is asked of the drive before everything that it need not say is in order."""
+        """See `Tracer`. Checks everything that needs no reply before the first exchange with the drive."""
         words, profile = self._words, self._profile
         require_channels(words.axis, request, self.channels)
         require_no_full_scale(words.axis, request, [name for name in request.full_scale if not self._scales(name)])
@@ -227,7 +227,7 @@ class SmartStepTracer(Tracer):
         """Refuse what no drive of this family can do.
 
         Raises:
-            ValueOutOfRange: so many samples, such an interval, or points before a trigger that the host watches.
+            ValueOutOfRange: the number of samples, the interval, or points before a trigger that the host watches.
         """
         axis, interval_s = self._words.axis, request.interval_s
         if request.samples > POINTS:
@@ -258,7 +258,7 @@ class SmartStepTracer(Tracer):
             )
 
     async def _set_full_scale(self, request: TakeTrace, originals: dict[TraceRegister, int]) -> None:
-        """Set the full scale of what was asked for; what was there before goes into `originals`.
+        """Set the full scale of the requested channels; the previous values go into `originals`.
 
         Raises:
             NotSupported: the drive does not take it.

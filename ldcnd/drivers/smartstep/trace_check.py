@@ -105,7 +105,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What a monitor said while the trace was recorded, at an instant between two of the loop's clock."""
+    """A monitor's value while the trace was recorded, at an instant between two of the loop's clock."""
 
     comparison: Comparison
     value: float
@@ -139,13 +139,13 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What the monitors say about a trace.
+    """The result of comparing a trace with the monitors.
 
     Attributes:
         problems: why its values are uncertain; none when they are right.
         verified: assumptions that this trace, with those before it, has verified.
         contradicted: assumptions that it has contradicted.
-        possible: the readings of the drive's words that are left by all traces so far; None for any.
+        possible: the readings of the drive's words that all traces until now leave; None for any.
     """
 
     problems: tuple[str, ...] = ()
@@ -155,7 +155,7 @@ class Judgement:
 
 
 def comparisons(assignment: Assignment) -> tuple[Comparison, ...]:
-    """Return what can be read beside a trace: a monitor for each channel that was asked for."""
+    """Return the monitors that can be read beside a trace: one for each requested channel."""
     found = []
     for name in assignment.channels:
         if name in DATA:

@@ -144,7 +144,7 @@ def first_point(trigger_address: int, pre_trigger: int) -> int:
 
     Raises:
         BadReply: the trigger address is outside the ring.
-        ValueOutOfRange: so many pre-trigger points leave nothing for the trigger.
+        ValueOutOfRange: this number of pre-trigger points leaves nothing for the trigger.
     """
     if trigger_address >= POINTS:
         raise BadReply(f"trigger address {trigger_address} is outside the {POINTS} points")
@@ -233,7 +233,7 @@ _US_PER_MINUTE = 60_000_000
 
 @dataclass(frozen=True, slots=True)
 class TraceConstants:
-    """What scales a trace; read from the drive for each one.
+    """The scale of a trace; read from the drive for each one.
 
     Attributes:
         cyclec_us: 8700H.

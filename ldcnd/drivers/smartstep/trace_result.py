@@ -43,7 +43,7 @@ DATA: Mapping[str, DataObject] = MappingProxyType({each.name.lower(): each for e
 SIGNALS: Mapping[str, IoObject] = MappingProxyType({each.name.lower(): each for each in IoObject})
 CHANNELS = (*DATA, *SIGNALS)
 EDGES = frozenset({TriggerKind.RISING, TriggerKind.FALLING, TriggerKind.EITHER, TriggerKind.CHANGE})
-"""What a drive can wait for; with both edges it is any change (manual 4 (7))."""
+"""Trigger kinds that a drive has; with both edges it is any change (manual 4 (7))."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +51,9 @@ class Assignment:
     """Which channel is in which memory.
 
     Attributes:
-        channels: as asked for.
-        data: the values of memory 1 and 2, `io` their bits; what was not asked for is filled in.
-        used: how many memories hold something that was asked for: 1 or 2.
+        channels: as requested.
+        data: the values of memory 1 and 2, `io` their bits; what was not requested is filled in.
+        used: how many memories hold something that was requested: 1 or 2.
     """
 
     channels: tuple[str, ...]
@@ -77,7 +77,7 @@ def assign(axis: str, channels: tuple[str, ...]) -> Assignment:
     """Find room for channels that exist.
 
     Raises:
-        ValueOutOfRange: there is no room for so many.
+        ValueOutOfRange: there is no room for this number.
     """
     data = [DATA[channel] for channel in channels if channel in DATA]
     io = [SIGNALS[channel] for channel in channels if channel in SIGNALS]
@@ -165,7 +165,7 @@ BEARING = (
 
 @dataclass(frozen=True, slots=True)
 class TraceMemory:
-    """What was read after a trace.
+    """The drive's words read after a trace.
 
     Attributes:
         rings: the words of each memory that was used, in the order of the memory.

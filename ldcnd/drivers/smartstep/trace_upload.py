@@ -21,11 +21,11 @@ from ldcnd.errors import BadReply, ByteCountRefused, ReplyTimeout
 from ldcnd.exchange import Exchange
 
 ROUNDS = 4
-"""So often a piece is read until two readings agree, and so often the bus's own attempts may fail."""
+"""Maximum readings of a piece until two agree, and maximum time-outs of one reading."""
 
 IDLE_LOOK_S = 0.005
 LONGEST_REST_S = 5.0
-"""On a line that is never idle a piece goes so often; some 700 characters in between are for others."""
+"""Maximum pause between two pieces on a line that is never idle, seconds; in it others send some 700 characters."""
 
 
 class TraceUpload:
@@ -58,7 +58,7 @@ class TraceUpload:
         return split_words(data, self._profile.trace_byte_order)
 
     async def _fetch(self, chunk: Chunk) -> bytes:
-        """Return the bytes of a chunk, in smaller pieces when the drive refuses so many at once."""
+        """Return the bytes of a chunk, in smaller pieces when the drive refuses that length."""
         try:
             return await self._agreed(chunk)
         except ByteCountRefused:

@@ -2,7 +2,7 @@
 
 The unit number stays: of Pn000 only the third digit from the right is the unit number (manual 2.2 (6)), the others are
 settings of the machine and move. What takes effect at power-on goes to EEPROM, because RAM is lost then; the rest goes
-to EEPROM for good and to RAM to be in use at once. Whether a write to EEPROM changes RAM is not stated, so both are
+to EEPROM permanently and to RAM to be in use at once. Whether a write to EEPROM changes RAM is not stated, so both are
 written where both differ. Ranges are hints and refuse nothing. Pure.
 Source: manual 2.2, note on EEPROM, (6); 3.
 """

@@ -28,7 +28,7 @@ EDGES = 2
 
 
 class Stimulus(StrEnum):
-    """What a person is to do while the drive waits."""
+    """The action of a person while the drive waits."""
 
     TURN = "turn the shaft by hand, RUN off, until the next message"
     PRESS = "press RESET and keep it pressed"

@@ -32,7 +32,7 @@ Setting = str | int
 
 
 class Stimulus(StrEnum):
-    """What a person is to do while a trace is recorded."""
+    """The action of a person while a trace is recorded."""
 
     REST = "leave the drive alone, RUN off and RESET not pressed"
     TURN = "turn the shaft by hand, RUN off, to and fro, until the next message"
@@ -45,7 +45,7 @@ Act = Callable[[Stimulus], Awaitable[None]]
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What the drive has shown of one assumption.
+    """The drive's evidence on one assumption.
 
     Attributes:
         key: the field of the profile.

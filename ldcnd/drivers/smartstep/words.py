@@ -71,7 +71,7 @@ class Words:
 
     Attributes:
         self_hearing: the drive takes its own replies for commands. A zero word, or the reply to a setting, makes it
-            answer itself without end, so nothing is asked any more.
+            answer itself without end, so nothing more is sent.
     """
 
     def __init__(self, bus: Bus, axis: str, unit: int, profile: SmartStepProfile) -> None:
@@ -85,13 +85,13 @@ class Words:
         """Run one exchange, in the response time of the profile.
 
         Raises:
-            WrongState: the drive hears itself.
+            WrongState: the drive receives its own replies.
             DriveFault: the drive declined; a setting's address error is distinguished from "busy tracing" by the mode.
             BusError: the line failed.
         """
         if self.self_hearing:
             raise WrongState(
-                f"axis {self.axis}: the drive takes its own replies for commands; nothing is asked on these wires",
+                f"axis {self.axis}: the drive takes its own replies for commands; nothing is sent on these wires",
                 axis=self.axis,
                 value="self_hearing",
                 remedy="use four wires",
@@ -103,7 +103,7 @@ class Words:
         return answer
 
     async def answers(self, unit: int) -> bool:
-        """Tell whether any drive of the line has this unit number; what it asks changes nothing."""
+        """Return whether any drive of the line has this unit number; the exchange changes nothing."""
         try:
             await self._bus.execute(commands.with_response_time(commands.probe(unit), self._profile), Lane.COMMAND)
         except ReplyTimeout:

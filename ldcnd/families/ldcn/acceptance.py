@@ -1,7 +1,7 @@
 """Trying real drives: a bounded sequence that says for each assumption of the documents whether this drive confirms it.
 
-It reads, and changes nothing, unless a move is asked for; then one drive makes one short move and back, for as long as
-somebody holds the dead-man. What was on the wire is kept as a capture that can be played to the same sequence again.
+It reads, and changes nothing, unless a move is requested; then one drive makes one short move and back, for as long as
+the operator holds the dead-man. The exchanges are kept as a capture that can be replayed to the same sequence.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ from ldcnd.model.health import Finding, Verdict
 from ldcnd.transport.transport import Opener
 
 MARGIN_S = 0.05
-"""An adapter that nobody has examined yet may keep replies back for 16 ms."""
+"""Margin for an adapter that is not examined yet: it may keep replies back for 16 ms."""
 EXCHANGES = 100
 READINGS = 20
 MOST_ADDRESS = 32
@@ -45,14 +45,14 @@ MOST_COUNTS = 100_000
 LONGEST_MOVE_S = 10.0
 LOOK_S = 0.02
 STILL_COUNTS = 2
-"""A servo that holds stays within so much."""
+"""Maximum deviation of a servo that holds, counts."""
 EVERYTHING = StatusItem(0xFF)
 MOTION = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 
 
 @dataclass(frozen=True, slots=True)
 class LdcnAssumption:
-    """What the documents say or leave open about LDCN and NMC drives, and what would confirm it.
+    """An open or stated point of the documents on LDCN and NMC drives, and what would confirm it.
 
     Attributes:
         key: for reports.
@@ -98,7 +98,7 @@ ASSUMPTIONS = (
         "PIC-SERVO 4.1",
         "half a packet, nulls, and an identity that is read at the first attempt",
     ),
-    LdcnAssumption("silence", "an address that no drive has draws no reply", "PIC-SERVO 4.1", "address 127 is asked"),
+    LdcnAssumption("silence", "an address that no drive has draws no reply", "PIC-SERVO 4.1", "address 127 is probed"),
     LdcnAssumption(
         "rest",
         "a drive at rest says so: velocity 0, a position that stays",
@@ -134,7 +134,7 @@ Part = Callable[[], Awaitable[Finding]]
 
 
 class DeadManReleased(LdcndError):
-    """Nobody holds the dead-man any more."""
+    """The dead-man is not held any more."""
 
 
 def trial_bus(opener: Opener) -> Bus:
@@ -150,7 +150,7 @@ async def accept(
     Args:
         bus: of `trial_bus`, run by the caller.
         move: what may move; nothing does without.
-        held: tells whether the dead-man is held; asked all the time while something moves.
+        held: returns whether the dead-man is held; called all the time while something moves.
     """
     line = _Line(bus)
     found = await line.find()
@@ -204,7 +204,7 @@ class _Line:
 
 
 class _Drive:
-    """What is tried at one drive; each part is named for the assumption that it verifies."""
+    """The trials of one drive; each part is named for the assumption that it verifies."""
 
     def __init__(self, bus: Bus, address: int, identity: Identity) -> None:
         self.address = address
@@ -278,7 +278,7 @@ class _Drive:
         await self._bus.execute(unanswered(EVERYBODY, NULLS, NULLS_SETTLE_S, repeatable=False))
         await self._bus.execute(once(read_identity(self.address, self._known)))
         return self._finding(
-            "nulls", "no reply to half a packet and 16 nulls; the next packet was heard", confirmed=True
+            "nulls", "no reply to half a packet and 16 nulls; the next packet was answered", confirmed=True
         )
 
     async def silence(self) -> Finding:
@@ -286,8 +286,8 @@ class _Drive:
         try:
             await self._bus.execute(once(read_identity(NOBODY)))
         except (ReplyTimeout, OutcomeUnknown):
-            return self._finding("silence", f"nobody answered for address {NOBODY}", confirmed=True)
-        return self._finding("silence", f"somebody answers for address {NOBODY}", confirmed=False)
+            return self._finding("silence", f"no drive answered at address {NOBODY}", confirmed=True)
+        return self._finding("silence", f"a drive answers at address {NOBODY}", confirmed=False)
 
 
 # -- moving ----------------------------------------------------------------------------------------------------------
@@ -316,7 +316,7 @@ async def _moved(
 
 
 class _Trial:
-    """One drive's trial move; everything that waits looks at the dead-man."""
+    """One drive's trial move; every wait checks the dead-man."""
 
     def __init__(self, bus: Bus, axis: LdcnAxis, node: Node, move: TrialMove, held: Callable[[], bool]) -> None:
         self._bus = bus
@@ -332,7 +332,7 @@ class _Trial:
         return Finding(axis=str(self._move.address), what=key, verdict=verdict, text=text, verifies=key)
 
     async def off(self) -> None:
-        """Stop, and open the loop; tried again until the drive has heard it or the line is gone."""
+        """Stop, and open the loop; repeated until the drive has acknowledged it or the line is gone."""
         for mode in (StopMode.SMOOTH, StopMode.OFF):
             for _ in range(3):
                 try:
@@ -380,7 +380,7 @@ class _Trial:
         return (self.finding("smooth_stop", text, confirmed=still),)
 
     async def _run_to(self, target: int, until: Callable[[Status], bool]) -> list[Status]:
-        """Move until told that it is enough, and return what was seen.
+        """Move until the condition is met, and return what was seen.
 
         Raises:
             DeadManReleased: the drive is stopped by the caller.

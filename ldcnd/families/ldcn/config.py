@@ -1,4 +1,4 @@
-"""What the configuration file says about LDCN and NMC lines, beside what every line and axis has."""
+"""The configuration of LDCN and NMC lines, beside what every line and axis has."""
 
 from typing import Annotated, Literal, Self
 
@@ -48,7 +48,7 @@ class LdcnAxisConfig(MovedAxisConfig):
         return self
 
     def spec(self) -> AxisSpec:
-        """Return what the driver needs to know."""
+        """Return the driver's settings."""
         gains = Gains(**self.gains.model_dump()) if self.gains else None
         limit_stop = self.switch_active == "high" if self.limit_switches == "stop" else None
         return AxisSpec(self.name, self.address, self.model, gains, self.identity, limit_stop)
@@ -66,16 +66,16 @@ class ModuleConfig(Frozen):
     name: Name | None = None
     """Of a PIC-I/O: its inputs are published and its outputs can be set under this name; unique among the axes."""
     outputs: tuple[Annotated[int, Field(ge=1, le=12)], ...] = ()
-    """Lines of a PIC-I/O that may be driven; all others stay inputs. Nothing is driven before it is asked for."""
+    """Lines of a PIC-I/O that may be driven; all others stay inputs. None is driven before a request sets it."""
     rate: float = Field(default=5.0, gt=0, le=500)
-    """How often a PIC-I/O is asked, in Hz."""
+    """Polling rate of a PIC-I/O, in Hz."""
 
     @model_validator(mode="after")
     def _has_terminals(self) -> Self:
         if (self.name or self.outputs) and self.model != PIC_IO.name:
             raise ValueError(f"name and outputs: a {self.model} has no lines to serve")
         if self.outputs and not self.name:
-            raise ValueError("outputs: nobody can set them without a name of the module")
+            raise ValueError("outputs: they can only be set with a name of the module")
         return self
 
 
@@ -94,7 +94,7 @@ None where polls would miss their turns for it."""
     start: StartPolicy = StartPolicy.RESET
     """Whether the drives are reset at start, or taken over as they are; a line that was lost is always taken over."""
     adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
-    """What happens to a line that cannot be taken over when `start` asks for it."""
+    """What happens to a line that cannot be taken over when `start` requires it."""
     divisors: Literal["manual", "alternate"] = "manual"
     """The family of baud rate divisors: 57600 is 3.3 % fast with the manual's, 1.4 % slow with the alternate ones."""
     snapshot: bool = False
@@ -147,7 +147,7 @@ None where polls would miss their turns for it."""
             if self.baud > top:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {top} at most")
             if profile.baud_keys and self.baud not in BAUDS:
-                raise ValueError(f"baud {self.baud}: {model} at address {address} knows {', '.join(map(str, BAUDS))}")
+                raise ValueError(f"baud {self.baud}: {model} at address {address} has {', '.join(map(str, BAUDS))}")
         if self.baud not in BAUDS:
             try:
                 baud_divisor(self.baud, clock_hz=self.clock_hz)
@@ -156,7 +156,7 @@ None where polls would miss their turns for it."""
         return self
 
     def spec(self) -> LineSpec:
-        """Return what the network needs to know."""
+        """Return the network's settings."""
         return LineSpec(
             start=self.start,
             adopt_fallback=self.adopt_fallback,

@@ -28,20 +28,20 @@ from ldcnd.transport.adapter import Adapter, adapter_of
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 EXCHANGES = 100
-"""So many at each drive: the shortest and the longest wait for the end of a servo cycle are among them."""
+"""Number of exchanges with each drive: they include the shortest and the longest wait for a servo cycle's end."""
 ALMOST_ALL = 0.99
 """One reply of a hundred may be late for other reasons: the host was busy."""
 STEP_MS = 0.1
 CLOSE_MS = 0.3
 """The plan and what was measured differ by no more than what hosts differ from one run to the next."""
 MARGIN_FACTOR = 3
-"""A deadline is so many times what the slowest reply took beyond its plan."""
-RULES = "for good: the udev rules of the package (deploy/udev/71-ldcnd.rules)"
+"""Factor from the slowest reply's time beyond its plan to the deadline."""
+RULES = "permanently: the udev rules of the package (deploy/udev/71-ldcnd.rules)"
 
 
 @dataclass(frozen=True, slots=True)
 class LineAsConfigured:
-    """What the configuration says of the line.
+    """The configuration of the line.
 
     Attributes:
         port: device path, or another kind of port.
@@ -69,12 +69,12 @@ class Held:
 
     @property
     def longest_s(self) -> float:
-        """What nearly all stay below."""
+        """The reply time that nearly all replies stay below."""
         return self.times_s[min(len(self.times_s) - 1, int(ALMOST_ALL * len(self.times_s)))]
 
     @property
     def adapter_ms(self) -> float:
-        """What of it the adapter and the kernel make, rounded up."""
+        """The part of it due to the adapter and the kernel, rounded up."""
         beyond_s = max(0.0, self.longest_s - SERVO_CYCLE_S)
         return math.ceil(beyond_s * 1000 / STEP_MS - 1e-9) * STEP_MS
 
@@ -97,13 +97,13 @@ class Held:
 async def examine(
     bus: Bus, network: LdcnNetwork, line: LineAsConfigured, look: Callable[[Path], Adapter | None] = adapter_of
 ) -> AsyncIterator[Finding]:
-    """Examine an open line that nobody else uses; yields each finding as it comes.
+    """Examine an open line that has no other user; yields each finding as it comes.
 
     Args:
         bus: open.
         network: whose drives are expected.
         line: what the configuration says of it.
-        look: returns what the kernel knows of an adapter.
+        look: returns the kernel's data of an adapter.
     """
     for finding in adapter_findings(line, look(Path(line.port)) if line.port.startswith("/") else None):
         yield finding
@@ -169,14 +169,14 @@ def _drives(line: str, network: LdcnNetwork, found: Mapping[int, Found]) -> Find
 
 
 async def _unaddressed(bus: Bus, line: str) -> Finding:
-    """Ask for a drive that has just been powered up: it is at address 0, and the first one hears us."""
+    """Probe for a drive that has just been powered up: it is at address 0, and the first one receives the host."""
     try:
         await bus.execute(read_identity(UNADDRESSED.address))
     except LdcndError:
         text = "no drive answers, addressed or not"
         remedy = "check power, the transmit and receive pairs (swapped?), and the ground between host and drives"
         return Finding(axis=line, what="line", verdict=Verdict.WRONG, text=text, remedy=remedy)
-    text = "the first drive answers and has no address yet: nobody has used the line since power-up"
+    text = "the first drive answers and has no address yet: the line was not used since power-up"
     remedy = "start the daemon once, which gives addresses, end it, and examine the line again"
     return Finding(axis=line, what="line", verdict=Verdict.LOOK, text=text, remedy=remedy)
 
@@ -185,7 +185,7 @@ async def _unaddressed(bus: Bus, line: str) -> Finding:
 
 
 async def measured(bus: Bus, found: Mapping[int, Found]) -> Held:
-    """Ask every drive at the host's rate again and again; nothing is sent twice when a reply is lost.
+    """Poll every drive at the host's rate repeatedly; nothing is sent twice when a reply is lost.
 
     Raises:
         BusError: the line failed.
@@ -204,7 +204,7 @@ async def measured(bus: Bus, found: Mapping[int, Found]) -> Held:
 
 def _timing(line: LineAsConfigured, bus: Bus, held: Held) -> list[Finding]:
     if not held.times_s:
-        text = "no drive answers at the rate of the first one, so nothing can be told of how long replies take"
+        text = "no drive answers at the rate of the first one, so the response time cannot be measured"
         return [Finding(axis=line.name, what="turn-around", verdict=Verdict.LOOK, text=text)]
     shortest, middle, longest = (1000 * time_s for time_s in (held.times_s[0], median(held.times_s), held.longest_s))
     text = (

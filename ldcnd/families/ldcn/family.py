@@ -201,7 +201,7 @@ def _written(file: Path, seed: int | None) -> ChainSpec:
     return config.spec(baud_check=config.baud_check, delivery=config.delivery)
 
 
-# -- what a line is asked to carry -----------------------------------------------------------------------------------
+# -- the load of a line ----------------------------------------------------------------------------------------------
 
 
 def servo_cycle(bus: LdcnBusConfig) -> ServoCycle | None:
@@ -236,7 +236,7 @@ def _polls(bus: LdcnBusConfig, timing: LineTiming, prices: Mapping[str, PriceLis
 
 
 def _module_polls(bus: LdcnBusConfig, timing: LineTiming) -> list[Poll]:
-    """Return what is asked of modules that are no axes: a PIC-I/O with a name for all its inputs, others for a byte."""
+    """Return the polls of modules that are no axes: of all inputs for a PIC-I/O with a name, of one byte for others."""
     polls = []
     for module in bus.module:
         exchange: Exchange[Any]
@@ -267,7 +267,7 @@ def _urgent(bus: LdcnBusConfig, timing: LineTiming, prices: Mapping[str, PriceLi
 
 
 def _slowest(prices: Mapping[str, PriceList]) -> PriceList:
-    return next(iter(prices.values()))  # asking who somebody is costs the same whoever it is
+    return next(iter(prices.values()))  # reading an identity costs the same at every module
 
 
 def _probe(bus: LdcnBusConfig, timing: LineTiming, prices: Mapping[str, PriceList]) -> PeriodicTask | None:

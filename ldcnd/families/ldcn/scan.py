@@ -1,7 +1,7 @@
-"""Looking for the modules of an LDCN/NMC line of which nothing is known: who is there, at which rate, in which state.
+"""Scan of an unknown LDCN/NMC line: which modules are there, at which rate, in which state.
 
-Listens first, then sends nulls and Read Status: nothing moves, nothing forgets, no module gets an address. Only when
-that is asked for, a line on which nothing can be moving is reset and addressed.
+Listens first, then sends nulls and Read Status: nothing moves, no module loses its state or gets an address. Only on
+request, a line on which nothing can be moving is reset and addressed.
 """
 
 import asyncio
@@ -37,19 +37,19 @@ from ldcnd.transport.adapter import Adapter, adapter_of
 LISTENED_S = 0.5
 """A host that polls a line does so more often."""
 MARGIN_MS = 50.0
-"""An adapter that nobody has examined yet may keep replies back for 16 ms."""
+"""Margin for an adapter that is not examined yet: it may keep replies back for 16 ms."""
 USUAL_BAUD = 115_200
-"""What every drive of the manuals reaches."""
+"""The rate that every drive of the manuals reaches."""
 CLOSE_BY = 3
-"""So far behind the last one that answered, an address is asked with patience: chains are numbered without gaps."""
+"""Addresses after the last answer that are probed with patience: chains are numbered without gaps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What one module showed.
+    """The state of one module.
 
     Attributes:
-        at_rest: it stands with its loop open; None where that cannot be told.
+        at_rest: it stands with its loop open; None where that is unknown.
         words: its state, for a person.
     """
 
@@ -58,7 +58,7 @@ class Seen:
 
 
 class LineScan:
-    """A look at one line, open and used by nobody else.
+    """A scan of one line, open and without other users.
 
     Attributes:
         drives: what was found; complete when `findings` has ended.
@@ -76,7 +76,7 @@ class LineScan:
         self._waiting: list[int] = []  # rates at which a module without an address answers
 
     async def findings(self) -> AsyncIterator[Finding]:
-        """Look; yields each finding as it comes."""
+        """Run the scan; yields each finding as it comes."""
         line = LineAsConfigured(self._port, self._port, 0.0, MARGIN_MS, ANY_DIALECT.name)
         for finding in adapter_findings(line, self._look(Path(self._port)) if self._port.startswith("/") else None):
             yield finding
@@ -85,7 +85,7 @@ class LineScan:
             await asyncio.sleep(LISTENED_S)
             if heard := self._bus.statistics.stray_bytes:
                 yield self._wrong(
-                    f"{heard} bytes came within {LISTENED_S:g} s without a question: another host uses the line",
+                    f"{heard} bytes came within {LISTENED_S:g} s without a request: another host uses the line",
                     "end that program, then scan again",
                 )
                 return
@@ -116,7 +116,7 @@ class LineScan:
     # -- who is there ------------------------------------------------------------------------------------------------
 
     async def _find_all(self) -> dict[int, Found]:
-        """Ask every address that a chain gives at every rate, with patience where others of the chain answer."""
+        """Probe every address that a chain gives at every rate, with patience where others of the chain answer."""
         found: dict[int, Found] = {}
         for baud in reversed(self._rate.candidates):
             if not await self._rate.host_to(baud):
@@ -141,7 +141,7 @@ class LineScan:
         return dict(sorted(found.items()))
 
     async def _watch(self, found: dict[int, Found]) -> dict[int, Seen]:
-        """Look at every module twice; what moves in between moves."""
+        """Read every module twice; what moves in between moves."""
         before = await self._states(found)
         await asyncio.sleep(WATCH_S)
         after = await self._states(found)
@@ -169,7 +169,7 @@ class LineScan:
         """Return what keeps a line that answers from being reset; None when nothing on it can be moving."""
         obstacles = [f"address {address}: {seen[address].words}" for address in found if not seen[address].at_rest]
         if found and self._waiting:
-            obstacles.append("modules behind the one without an address cannot be heard, and may move")
+            obstacles.append("modules behind the one without an address cannot be reached, and may move")
         if not obstacles:
             return None
         text = f"not reset, no addresses given: {'; '.join(obstacles)}"
@@ -205,7 +205,7 @@ class LineScan:
             self._finding(
                 "addresses",
                 Verdict.LOOK,
-                f"a module without an address waits at {baud} baud; those behind it in the chain cannot be heard",
+                f"a module without an address waits at {baud} baud; those behind it in the chain cannot be reached",
                 "`ldcnd scan PORT --address` gives addresses on a line where nothing moves; so does a daemon",
             )
             for baud in self._waiting

@@ -1,4 +1,4 @@
-"""What a simulated LDCN/NMC line consists of and what happens to it, as it is written in TOML.
+"""The configuration of a simulated LDCN/NMC line and its events, as it is written in TOML.
 
 Shared by `[[sim]]` of a rig and by the files of `ldcnd sim`. Defaults are those of `MODELS` and of `MotorPlant`: what
 is left out here is left to them.
@@ -76,7 +76,7 @@ class PlantConfig(Frozen):
     friction_nm: float | None = Field(default=None, ge=0)
     """Coulomb friction, also at standstill; 0.004."""
     stop_margin_counts: int | None = Field(default=None, ge=0)
-    """The hard stops lie so far behind the limit switches; 2000."""
+    """Distance of the hard stops behind the limit switches; 2000."""
     index_at_counts: int | None = None
     """Where an index pulse begins; 700."""
     index_spacing_counts: int | None = Field(default=None, gt=0)
@@ -111,9 +111,9 @@ class Quirks(Frozen):
     command_buffer: CommandBuffer | None = None
     """What becomes of a command that has not been executed yet when another packet begins."""
     address_in_latched: bool | None = None
-    """Whether it hears the host once it has an address, whatever the level of its address input."""
+    """Whether it receives the host's packets once it has an address, whatever the level of its address input."""
     unknown_baud: UnknownBaud | None = None
-    """What PIC-SERVO SC does with a code of Set Baud Rate that it does not know."""
+    """What PIC-SERVO SC does with an unknown code of Set Baud Rate."""
     undefined_status_bits: int | None = Field(default=None, ge=0, le=255)
     """Set in a PIC-I/O's status byte, of which only bit 1 is defined."""
     undefined_level_bits: int | None = Field(default=None, ge=0, le=15)
@@ -135,7 +135,7 @@ class Quirks(Frozen):
     peak_current_a: float | None = Field(default=None, ge=0)
     """The motor current cannot exceed it, Logosol; 0 for no limit."""
     overload_s: float | None = Field(default=None, gt=0)
-    """Limited for so long without a pause, a Logosol drive trips."""
+    """How long a Logosol drive limits its current without a pause before it trips."""
     deadband_at_zero: bool | None = None
     """Whether deadband compensation is also added to an output of 0."""
     il_times_256: bool | None = None

@@ -1,4 +1,4 @@
-"""What the configuration file says about SmartStep lines and units, beside what every line and axis has."""
+"""The configuration of SmartStep lines and units, beside what every line and axis has."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

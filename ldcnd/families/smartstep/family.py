@@ -274,7 +274,7 @@ def _described(text: str) -> SimulatedSmartStepsConfig:
     return SimulatedSmartStepsConfig(unit=tuple(SimulatedUnitConfig(number=number) for number in numbers))
 
 
-# -- what a line is asked to carry: items are read word by word, and the words of all its units take turns -------------
+# -- the load of a line: items are read word by word, and the words of all its units take turns -------------
 
 
 def rates_hz(axis: SmartStepAxisConfig) -> Mapping[Item, float]:

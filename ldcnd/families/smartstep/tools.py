@@ -48,7 +48,7 @@ def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
     @_one_drive
     @click.option("--write", is_flag=True, help="Write the bits into the configuration.")
     def trigger_bits(config: Path, name: str, axis: str, *, write: bool) -> None:
-        """Find the trigger bits of a SmartStep by trying words; asks to turn the shaft and to press RESET."""
+        """Find the trigger bits of a SmartStep by trying words; prompts to turn the shaft and to press RESET."""
         settings = _line_of(files.lines(config), config, name, axis)
         found = asyncio.run(
             _with_drive(
@@ -68,7 +68,7 @@ def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
     @_one_drive
     @click.option("--write", is_flag=True, help="Write what was verified into the configuration.")
     def verify(config: Path, name: str, axis: str, *, write: bool) -> None:
-        """Verify what a SmartStep's traces look like; asks to turn the shaft and to send pulses.
+        """Verify the layout of a SmartStep's traces; prompts to turn the shaft and to send pulses.
 
         Exits with 1 when something stays open.
         """
