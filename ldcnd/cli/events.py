@@ -8,7 +8,7 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.events import ALARM_HISTORY, REFERENCE, UNSETTLED, CommandEvent
+from ldcnd.model.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
 
 
 @click.command()
@@ -37,7 +37,7 @@ def command(target: Target, axis: str | None, count: int, *, follow: bool) -> No
 
 def _show(target: Target, event: CommandEvent) -> None:
     at = datetime.fromtimestamp(event.t / 1e9, UTC).isoformat(timespec="milliseconds")
-    if event.verb in (ALARM_HISTORY, UNSETTLED, REFERENCE):
+    if event.verb in (ALARM_HISTORY, DRIVE_CHANGED, UNSETTLED, REFERENCE):
         code = f"{event.code}: " if event.code else ""
         target.show(event, f"{at} {event.axis:8} {event.verb:14} {code}{event.reason}")
         return

@@ -72,6 +72,8 @@ class AxisReading:
         amplifier_enable: what the drive holds; None while that is not known.
         asked: the items of this poll; the line may have requested others since.
         cut_short: why the drive ended the motion before its end, by itself; empty when it did not.
+        begun_anew: its own counter reads about 0, as after a reset.
+        altered: what this host has not done to it and yet shows; empty when nothing does.
     """
 
     position_counts: int
@@ -90,6 +92,8 @@ class AxisReading:
     amplifier_enable: bool | None = None
     asked: frozenset[TelemetryItem] = frozenset()
     cut_short: str = ""
+    begun_anew: bool = False
+    altered: str = ""
 
 
 @dataclass(frozen=True, slots=True)

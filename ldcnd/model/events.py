@@ -11,6 +11,8 @@ ALARM_HISTORY = "alarm_history"
 """The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
 REFERENCE = "reference"
 """The verb of an event of the start: the reference that an earlier daemon has kept holds, or was refused."""
+DRIVE_CHANGED = "drive_changed"
+"""The verb of an event that no command has caused: a drive was reset, or changed by another program."""
 UNSETTLED = "unsettled"
 """The verb of an event beside that of a motion that did not settle in its time."""
 
@@ -62,7 +64,8 @@ class CommandEvent(Frozen):
     """Which command."""
     verb: str
     """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
-    motion that did not settle, `reference` for what became of a kept reference: nobody asked for these."""
+    motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
+    reset or that another program has changed: nobody asked for these."""
     client: str | None
     """The client, as it calls itself; not authenticated."""
     login: str | None = None

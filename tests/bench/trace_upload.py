@@ -11,6 +11,7 @@ from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, Function
 from ldcnd.drivers.smartstep.trace_data import chunk_plan
 from ldcnd.families.smartstep import family
+from ldcnd.families.smartstep.config import SmartStepAxisConfig
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.smartstep.unit import CHARACTER_S
 from ldcnd.sim.smartstep.variant import SimulatedVariant
@@ -54,7 +55,7 @@ def share_of_limit(string_bytes: int, *, polled: bool = False) -> float:
         await take_trace(rig.client, "feed", TRACE, within_s=300)
         return limit_s(string_bytes) / _uploading_s(rig)
 
-    # an idle line reads no alarm history either
+    # an idle line reads no alarm history either, and audits no parameters
     history_hz = family.ALARM_HISTORY_HZ if polled else 0.0
     with mock.patch.object(family, "ALARM_HISTORY_HZ", history_hz):
         return on_jumping_clock(_config(string_bytes, polled=polled), work)
@@ -73,7 +74,9 @@ def _config(string_bytes: int, *, polled: bool) -> RigConfig:
         return config
 
     def hardly_polled(axis: AxisConfig) -> AxisConfig:
-        return axis.model_copy(update={"rates": SELDOM})
+        assert isinstance(axis, SmartStepAxisConfig)
+        unaudited = axis.smartstep.model_copy(update={"audit_s": 0.0})
+        return axis.model_copy(update={"rates": SELDOM, "smartstep": unaudited})
 
     *others, steps = config.bus
     steps = steps.model_copy(update={"axis": tuple(hardly_polled(axis) for axis in steps.axis)})

@@ -275,3 +275,46 @@ async def test_a_drive_that_loses_power_is_down_and_comes_back_by_itself(tmp_pat
 
     assert neighbour.link is LinkState.UP
     assert back.state is AxisState.DISCRETE_MOTION
+
+
+async def drive_changes(rig: RunningRig) -> list[tuple[str | None, str | None]]:
+    events = await latest_events(rig.client, 50, "feed")
+    return [(event.code, event.reason) for event in events if event.verb == "drive_changed"]
+
+
+async def test_a_parameter_that_another_program_has_changed_is_found_within_a_minute(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        await asyncio.sleep(60.0)
+        quiet = await drive_changes(rig)
+        before = units[0].drive.memory.active(PN100)
+
+        units[0].drive.memory.write(PN100.ram_address, before + 7)
+        await asyncio.sleep(55.0)
+        fault, said = await rig.client.last("feed", TelemetryItem.FAULT), await drive_changes(rig)
+        held = units[0].drive.memory.active(PN100)
+        await rig.client.command("feed", WriteParameter(parameter="Pn100", value=before, memory=Memory.RAM))
+        await asyncio.sleep(3.0)
+        cleared = await rig.client.last("feed", TelemetryItem.FAULT)
+
+    assert quiet == []
+    assert said == [("drive_changed", f"Pn100 is {before + 7} and was {before}")]
+    assert isinstance(fault, FaultSample)
+    assert [(each.code, each.source, each.stops) for each in fault.active] == [("drive_changed", "daemon", False)]
+    assert held == before + 7
+    assert isinstance(cleared, FaultSample)
+    assert cleared.active == ()
+
+
+async def test_a_smartstep_that_was_reset_has_lost_what_was_written_to_its_ram_and_that_is_said(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        stored = units[0].drive.memory.stored(PN100)
+        await rig.client.command("feed", WriteParameter(parameter="Pn100", value=stored + 5, memory=Memory.RAM))
+        await asyncio.sleep(60.0)
+
+        units[0].drive.memory.power_on()
+        await asyncio.sleep(55.0)
+        said = await drive_changes(rig)
+
+    assert said == [("drive_changed", f"Pn100 is {stored} and was {stored + 5}")]

@@ -70,7 +70,13 @@ async def read_at_s(rates: Rates, starts_s: dict[int, float]) -> dict[tuple[int,
     async with smartstep_line(drives) as line:
         for unit, items in rates.items():
             deaf = Listeners(
-                lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None, lambda: None, lambda _: False
+                lambda *_: None,
+                lambda *_: None,
+                lambda *_: None,
+                lambda *_: None,
+                lambda: None,
+                lambda _: False,
+                lambda *_: False,
             )
             line.bus.add_poller(UnitPoller(line.bus, unit, SMARTSTEP, items, starts_s[unit], deaf))
         await asyncio.sleep(SECONDS)

@@ -251,6 +251,7 @@ async def test_monitors_come_at_their_rates():
             lambda _: None,
             lambda: None,
             lambda _: False,
+            lambda *_: False,
         )
         line.bus.add_poller(UnitPoller(line.bus, 1, axis.profile, rates, 0.0, listeners))
         await asyncio.sleep(20.0)

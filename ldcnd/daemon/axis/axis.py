@@ -24,7 +24,14 @@ from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, ag
 from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.procedures.jog import Hold
 from ldcnd.daemon.axis.reference import ReferenceKeeper
-from ldcnd.daemon.axis.state import REFERENCE_REFUSED, REST_COUNTS, AxisTracker, ObservedTracker
+from ldcnd.daemon.axis.state import (
+    DRIVE_CHANGED,
+    DRIVE_RESET,
+    REFERENCE_REFUSED,
+    REST_COUNTS,
+    AxisTracker,
+    ObservedTracker,
+)
 from ldcnd.daemon.axis.telemetry import Arrivals, AxisTelemetry, EndTold, Note
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
@@ -38,6 +45,7 @@ from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests, WrongState
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
+from ldcnd.model import events
 from ldcnd.model.commands import (
     AxisCommand,
     BufferMode,
@@ -233,6 +241,7 @@ class AxisService:
         self._pending: StopMode | None = None
         self.line_up = False
         self._inherited = False
+        self._altered = ""
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
         self._seen = False
         self._successors = asyncio.Lock()
@@ -315,7 +324,10 @@ class AxisService:
         tracker, gate = self.tracker, self._plausibility
         verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
         if verdict is Verdict.BELIEVED:
-            if gate.jumped and tracker.command is None:
+            if gate.zeroed:
+                self._changed_by_another(DRIVE_RESET, "its position counter has begun anew at 0")
+                tracker.referenced = False
+            elif gate.jumped and tracker.command is None:
                 log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
                 tracker.jumped()
             if gate.confirmed:  # what only the first of two readings was asked for is true as well
@@ -338,6 +350,7 @@ class AxisService:
         was_referenced = tracker.referenced
         if tracker.command:
             arrivals.reading = reading
+        self._audit(reading, timing)
         tracker.observed(reading, timing, self._clock.now_ns())
         if was_away and self.returned:
             self.returned()
@@ -359,6 +372,30 @@ class AxisService:
             arrivals.tell()
             self._ask_in_time(timing.sent_at_s)
             self.reference.woken.set()
+
+    def _audit(self, reading: AxisReading, timing: Timing) -> None:
+        """Say what this daemon has not done to the drive and the reading shows; the tracker has not seen it yet."""
+        tracker = self.tracker
+        if reading.altered != self._altered:
+            self._altered = reading.altered
+            if reading.altered:
+                self._say_changed(DRIVE_CHANGED, reading.altered)
+        elif reading.profile_done or not reading.enabled or not self.stoppable:
+            return
+        elif tracker.at_rest and not tracker.command and self._turns.free and tracker.concerns(timing):
+            self._changed_by_another(DRIVE_CHANGED, "it began to move, and this daemon has not told it to")
+
+    def _changed_by_another(self, fault: Fault, what: str) -> None:
+        self.tracker.changed_by_another(fault)
+        self._say_changed(fault, what)
+
+    def _say_changed(self, fault: Fault, what: str) -> None:
+        log.warning("drive was reset or changed by another program", axis=self.config.name, what=what)
+        self._note(self.config.name, events.DRIVE_CHANGED, CommandStatus.FAILED, what, fault.code)
+
+    def restarted(self) -> None:
+        """Its drive has lost power or was reset, and is about to answer again."""
+        self._say_changed(DRIVE_RESET, "it has lost power or was reset, and gets its address again")
 
     def _ask_soon(self) -> None:
         self._ask_in_time(self._clock.now_s())

@@ -52,6 +52,7 @@ class PlausibilityGate:
 
     Attributes:
         jumped: the reading that was believed last is where no motion can have led since the one before.
+        zeroed: the drive's counter has gone to about 0, and no motion has led there: it was reset.
         foreign: the reading that was judged last, and not believed, is where no motion can have led: it may be another
             drive's.
         confirmed: the reading that the one that was believed last has confirmed, and when; None if it needed no other.
@@ -60,6 +61,7 @@ class PlausibilityGate:
 
     def __init__(self, config: AxisConfig, scale: Scale) -> None:
         self.jumped = False
+        self.zeroed = False
         self.foreign = False
         self.confirmed: tuple[AxisReading, Timing] | None = None
         self.withheld = 0
@@ -90,7 +92,7 @@ class PlausibilityGate:
             standing: the axis was at rest, and nothing was commanded since.
         """
         known = self._known
-        self.jumped, self.confirmed, self.foreign = False, None, False
+        self.jumped, self.zeroed, self.confirmed, self.foreign = False, False, None, False
         if known is None:
             return self._believe(reading, timing)
         if self._follows(known, reading, timing, NOISE_COUNTS if standing else None):
@@ -101,6 +103,7 @@ class PlausibilityGate:
             return Verdict.BELIEVED
         if self._doubtful and self._follows(self._doubtful, reading, timing, None):
             self.jumped = self._sure and self._is_jump(known, reading, timing)
+            self.zeroed = self._sure and self._is_zeroed(known, reading, timing)
             self._sure = True
             self.confirmed = self._doubtful.reading, self._doubtful.timing
             return self._believe(reading, timing)
@@ -142,12 +145,21 @@ class PlausibilityGate:
         changed = abs(velocity - before.velocity_counts_per_s)
         if changed > self._acceleration * passed_s + 2 * resolution:
             return False
-        way = (reading.position_counts - before.position_counts + _HALF) % _COUNTER - _HALF
         if within_counts is not None:
-            return abs(way) <= within_counts
-        expected = (velocity + before.velocity_counts_per_s) / 2 * passed_s
+            return abs(_way(before, reading)) <= within_counts
+        return self._led_there(seen, reading, timing)
+
+    def _led_there(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
+        """Tell whether the velocities lead from the one position to the other."""
+        passed_s = timing.true_until_s - seen.timing.true_from_s
+        velocities = reading.velocity_counts_per_s + seen.reading.velocity_counts_per_s
+        resolution = reading.velocity_resolution_counts_per_s
         reach = NOISE_COUNTS + 2 * resolution * passed_s + self._acceleration * passed_s * passed_s / 4
-        return abs(way - expected) <= reach
+        return abs(_way(seen.reading, reading) - velocities / 2 * passed_s) <= reach
+
+    def _is_zeroed(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
+        """Tell whether the counter has begun anew: a shaft that happens to come to rest at its 0 shows a velocity."""
+        return reading.begun_anew and not seen.reading.begun_anew and not self._led_there(seen, reading, timing)
 
     def _is_jump(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
         """Tell whether an axis cannot have come from the one reading to the other by moving."""

@@ -54,7 +54,27 @@ REFERENCE_REFUSED = Fault(
     "the reference that an earlier daemon has kept was refused",
     stops=False,
 )
-OF_DAEMON = (LINK_LOST, LOOP_OPENED, JUMPED, NOT_SETTLED, REFERENCE_REFUSED, STOP_UNCONFIRMED)
+DRIVE_RESET = Fault(
+    "drive_reset",
+    "the drive's position counter has begun anew at 0: it was reset, or another program has set the counter; keep other"
+    " programs off the line, then send reset and home",
+    loses_position=True,
+)
+DRIVE_CHANGED = Fault(
+    "drive_changed",
+    "the drive is not as this daemon has left it; the events say what differs: undo it, or take it over",
+    stops=False,
+)
+OF_DAEMON = (
+    DRIVE_CHANGED,
+    DRIVE_RESET,
+    LINK_LOST,
+    LOOP_OPENED,
+    JUMPED,
+    NOT_SETTLED,
+    REFERENCE_REFUSED,
+    STOP_UNCONFIRMED,
+)
 """Faults that the daemon finds; the drive tells all others."""
 OF_DAEMON_CODES = frozenset(fault.code for fault in OF_DAEMON)
 
@@ -328,6 +348,8 @@ class AxisTracker:
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
         """Digest a reading; `now_ns` stamps the faults that it brings up."""
         faults = (*reading.faults, *self._own_now()) if self._own else reading.faults
+        if reading.altered and DRIVE_CHANGED not in faults:
+            faults = (*faults, DRIVE_CHANGED)
         self._misses = 0
         self.link = LinkState.UP
         if faults or self.active_faults:
@@ -403,6 +425,11 @@ class AxisTracker:
         self.refused = reason
         text = f"{REFERENCE_REFUSED.text}: {reason}; home the axis, or set its position"
         self._own = (*self._own, replace(REFERENCE_REFUSED, text=text))
+
+    def changed_by_another(self, fault: Fault) -> None:
+        """The next reading shows what this daemon has not done to the drive; until reset."""
+        if fault not in self._own:
+            self._own = (*self._own, fault)
 
     def jumped(self) -> None:
         """The next reading shows a position that no motion has led to: a fault until reset."""
@@ -558,7 +585,7 @@ class ObservedTracker(AxisTracker):
         """Digest a reading."""
         self._misses = 0
         self.link = LinkState.UP
-        self._faults(reading.faults, now_ns)
+        self._faults((*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults, now_ns)
         if not self.active_faults:
             self.first_fault = None
         # such a drive shows the speed in coarse steps, and its position comes from another poll

@@ -258,6 +258,7 @@ class BusService:
         """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
         log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
         axis = next(axis for axis in self.axes if axis.config.name == name)
+        axis.restarted()
         axis.disconnected()
         axis.cannot_move()
         axis.tracker.powered(on=False, now_s=asyncio.get_running_loop().time())

@@ -274,6 +274,9 @@ def sensor_lost(profile: Profile, adc: int | None) -> bool:
     return not SENSOR_LEAST <= adc << (SENSOR_BITS - profile.adc_bits) <= SENSOR_MOST
 
 
+BEGUN_COUNTS = 16
+"""A counter that was reset reads 0, and a shaft that its loop has let go settles near it."""
+FOREIGN_CAPTURE = "a capture is armed that this daemon has not armed"
 _MOVE_DONE, _POWER_ON, _LIMIT1, _LIMIT2, _HOMING = map(
     int,
     (
@@ -407,6 +410,8 @@ class DriveState:
             amplifier_enable=known.pic_ae,
             asked=asked,
             cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
+            begun_anew=-BEGUN_COUNTS <= counter <= BEGUN_COUNTS,
+            altered=FOREIGN_CAPTURE if flags & _HOMING and not self.homing_armed else "",
         )
 
     def faults(self, status: Status) -> tuple[driver.Fault, ...]:

@@ -272,7 +272,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         if not on:
             await self.stop(StopMode.OFF)
             return
-        if self._gains and not self._book.written("kp"):
+        if self._gains and not (self.state.known.closed and self._book.written("kp")):  # it may have been reset unseen
             await self.set_gains(self._gains)
         if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
             await self._check_without_power_driver()

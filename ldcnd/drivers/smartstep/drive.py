@@ -42,6 +42,7 @@ from ldcnd.drivers.smartstep.monitors import (
     run_is_on,
     signed_word,
 )
+from ldcnd.drivers.smartstep.parameter_audit import ParameterAudit
 from ldcnd.drivers.smartstep.parameter_store import EepromRules, UnitParameters
 from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller, UnitWords
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
@@ -96,7 +97,10 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
         self.capabilities = verbs_for(Capability.PARAMETERS, Capability.TRACES)
         self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
         self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
-        self._parameters = UnitParameters(self.words, spec.profile, spec.eeprom, others, self._cleared)
+        self._audit = ParameterAudit()
+        self._parameters = UnitParameters(
+            self.words, spec.profile, spec.eeprom, others, self._cleared, self._audit.wrote
+        )
         self.tracer = self._tracer = SmartStepTracer(bus, self.words, spec.profile)
         self._rates_hz = spec.rates_hz
         self._bus = bus
@@ -133,13 +137,16 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
                 listeners.alarmed(fault_of(known))
             return added is None
 
+        def audited(place: int, value: int) -> bool:
+            return self._audit.read(place, value)
+
         self._poller = UnitPoller(
             self._bus,
             self.spec.address,
             self.profile,
             self._rates_hz,
             start_at_s,
-            Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself, history),
+            Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself, history, audited),
             wires_checked=self.wires_checked,
         )
         return self._poller
@@ -166,6 +173,7 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
             profile_done=speed_rpm == 0,
             homing=False,
             faults=tuple(faults),
+            altered=self._audit.differences,
         )
 
     def _hears_itself(self) -> None:

@@ -101,6 +101,7 @@ class UnitParameters(ParameterAccess):
         rules: EepromRules,
         others: Mapping[int, str],
         cleared: Callable[[], None],
+        wrote: Callable[[ParameterValue, Memory], None] = lambda _value, _memory: None,
     ) -> None:
         """Prepare the access; sends nothing.
 
@@ -110,12 +111,14 @@ class UnitParameters(ParameterAccess):
             rules: when EEPROM may be written.
             others: the other axes of its line, by unit number.
             cleared: called when a counter was cleared.
+            wrote: called with a parameter that was written, or holds what was to be written, and into which memory.
         """
         self._words = words
         self._profile = profile
         self._rules = rules
         self._others = others
         self._cleared = cleared
+        self._wrote = wrote
 
     @property
     def _axis(self) -> str:
@@ -182,6 +185,11 @@ class UnitParameters(ParameterAccess):
     @override
     async def write(self, request: WriteParameter) -> Written:
         parameter = self._find(request.parameter, unlisted=request.unlisted)
+        written = await self._write(parameter, request)
+        self._wrote(written.value, request.memory)
+        return written
+
+    async def _write(self, parameter: Parameter, request: WriteParameter) -> Written:
         before = await self._read(parameter)
         await self._check_unit(parameter, before, request)
         if request.memory is Memory.RAM:

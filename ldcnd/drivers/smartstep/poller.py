@@ -30,6 +30,7 @@ from ldcnd.drivers.smartstep.monitors import (
     counter_value,
     word_value,
 )
+from ldcnd.drivers.smartstep.parameters import PARAMETERS
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
 from ldcnd.drivers.smartstep.words import stray_packets
 from ldcnd.errors import BusError
@@ -59,6 +60,7 @@ class Basic(Enum):
     VELOCITY = "velocity"
     POSITION = "position"
     ALARM_HISTORY = "alarm_history"
+    PARAMETERS = "parameters"
 
 
 Item = Basic | MonitorName
@@ -68,6 +70,7 @@ BASIC_WORDS: Mapping[Basic, tuple[int, ...]] = {
     Basic.STATE: (Register.PRESENT_ALARM, INPUT_SIGNALS.address, OUTPUT_SIGNALS.address),
     Basic.VELOCITY: (SPEED_FEEDBACK.address,),
     Basic.ALARM_HISTORY: (Register.ALARM_HISTORY,),  # and nine more, each in a turn of its own
+    Basic.PARAMETERS: (PARAMETERS[0].ram_address,),  # and all others, likewise
 }
 HISTORY = tuple(Register.ALARM_HISTORY + place for place in range(HISTORY_LENGTH))
 PUBLISHED = {
@@ -101,6 +104,7 @@ class Listeners:
         missed: of a poll that brought nothing.
         self_hearing: of a drive that takes its own replies for commands.
         history: of the alarm history; it returns whether that has to be read again at once.
+        audited: of the place of a parameter in `PARAMETERS` and its value in use; returns as `history`.
     """
 
     read: Callable[[UnitWords, TelemetryItem, Timing], None]
@@ -109,6 +113,7 @@ class Listeners:
     missed: Callable[[BusError], None]
     self_hearing: Callable[[], None]
     history: Callable[[tuple[int, ...]], bool]
+    audited: Callable[[int, int], bool]
 
 
 class UnitPoller(Poller[int | Refusal]):
@@ -159,6 +164,7 @@ class UnitPoller(Poller[int | Refusal]):
         self._one_word_only = False
         self._history_place = 0
         self._hurries_history = True
+        self._audited = list(range(len(PARAMETERS)))  # places; the next one first
         self._misses = 0 if wires_checked else MISSES_BEFORE_BACKOFF
 
     def forget_position(self) -> None:
@@ -254,6 +260,8 @@ class UnitPoller(Poller[int | Refusal]):
             self._left.append(WORDS[item].address)
         elif item is Basic.ALARM_HISTORY:
             self._left.append(HISTORY[self._history_place])
+        elif item is Basic.PARAMETERS:
+            self._left.append(PARAMETERS[self._audited[0]].ram_address)
         else:
             self._left.extend(BASIC_WORDS[item])
 
@@ -264,8 +272,11 @@ class UnitPoller(Poller[int | Refusal]):
 
     def _give_up(self, item: Item, refusal: Refusal) -> None:
         """Stop polling an item that the drive does not have."""
-        log.warning("item not there", unit=self.node, item=item.value, reason=str(refusal))
         self._abandon()
+        if item is Basic.PARAMETERS and len(self._audited) > 1:
+            del self._audited[0]  # this model lacks it
+            return
+        log.warning("item not there", unit=self.node, item=item.value, reason=str(refusal))
         if item is not Basic.STATE:
             self._due_s[item] = NEVER_S
 
@@ -303,6 +314,8 @@ class UnitPoller(Poller[int | Refusal]):
             self._listeners.identified(*(self._words[address] for address in BASIC_WORDS[Basic.IDENTITY]))
         elif item is Basic.ALARM_HISTORY:
             self._take_history(timing.received_at_s)
+        elif item is Basic.PARAMETERS:
+            self._take_parameter(timing.received_at_s)
         else:
             self._tell(item, timing)
 
@@ -334,6 +347,16 @@ class UnitPoller(Poller[int | Refusal]):
         self._hurries_history = False
         if self._listeners.history(tuple(self._words[address] for address in HISTORY)):
             self._read_history(now_s)
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    def _take_parameter(self, now_s: float) -> None:
+        """Tell of a parameter; go on to the next one, unless this one has to be read again."""
+        place = self._audited[0]
+        if self._listeners.audited(place, self._words[PARAMETERS[place].ram_address]):
+            self._due_s[Basic.PARAMETERS] = now_s
+        else:
+            self._audited.append(self._audited.pop(0))
 
     # -- counters ----------------------------------------------------------------------------------------------------
 

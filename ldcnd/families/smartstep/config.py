@@ -138,6 +138,8 @@ class SmartStepUnitConfig(Frozen):
 
     monitors: Mapping[MonitorName, float] = {}
     """Monitors to publish, with their rates in Hz."""
+    audit_s: float = Field(default=45.0, ge=0, le=86_400)
+    """In how many seconds each parameter is read once, to find what another program or a reset has changed; 0 never."""
     eeprom_write: EepromWrite = EepromWrite.ALLOW
     """deny forbids it; allow: EEPROM is written when a request names it."""
     eeprom_budget: int = Field(default=9000, ge=0, le=10_000)

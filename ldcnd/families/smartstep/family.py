@@ -24,7 +24,7 @@ from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
 from ldcnd.drivers.smartstep.network import SmartStepNetwork, smartstep_opener
 from ldcnd.drivers.smartstep.packet import HIGHEST_UNIT, CommandCutter, SmartStepTranscript
 from ldcnd.drivers.smartstep.parameter_store import EepromRules
-from ldcnd.drivers.smartstep.parameters import digit_texts
+from ldcnd.drivers.smartstep.parameters import PARAMETERS, digit_texts
 from ldcnd.drivers.smartstep.poller import Basic, Item
 from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, Echo, Framing, SmartStepProfile
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP as PROFILE
@@ -286,6 +286,8 @@ def rates_hz(axis: SmartStepAxisConfig) -> Mapping[Item, float]:
         Basic.POSITION: rates.position or rates.state / 10,
     }
     wanted[Basic.ALARM_HISTORY] = ALARM_HISTORY_HZ
+    audit_s = axis.smartstep.audit_s
+    wanted[Basic.PARAMETERS] = len(PARAMETERS) / audit_s if audit_s else 0.0
     wanted.update(axis.smartstep.monitors.items())
     return wanted
 
