@@ -238,14 +238,18 @@ class ProfileGenerator:
             self.steady = True
             self.accelerating = False
         else:
-            before = abs(self.velocity)
+            before = self.velocity
             if self.mode is ProfileMode.VELOCITY:
                 self._ramp()
             else:
                 self._approach()
-            speed = abs(self.velocity)
-            self.accelerating = speed > before
-            self.steady = speed == before
+            if self.velocity == before:
+                self.steady = True
+                self.accelerating = False
+            else:
+                faster = abs(self.velocity) - abs(before)
+                self.accelerating = faster > 0
+                self.steady = faster == 0
         self.position += self.velocity
 
     def _ramp(self) -> None:
@@ -269,19 +273,24 @@ class ProfileGenerator:
             return
         direction = 1 if remaining > 0 else -1
         speed = self.velocity * direction
-        allowed = min(self._top_speed, self._stopping_speed(remaining * direction))
-        new = max(speed - acceleration, min(allowed, speed + acceleration))
+        way = remaining * direction
+        new = top = self._top_speed
+        if way < self._braking_way:
+            new = min(top, self._stopping_speed(way))
+        # in every servo tick: min() and max() cost twice as much
+        if new > speed + acceleration:
+            new = speed + acceleration
+        elif new < speed - acceleration:
+            new = speed - acceleration
         if 0 <= new < speed:
             self.accel_done = self.slew_done = True
-        elif new > 0 and new in {self._top_speed, speed}:
+        elif new > 0 and new in (top, speed):
             self.accel_done = True
         self.velocity = new * direction
 
     def _stopping_speed(self, way: int) -> int:
         """Return the highest speed of a tick from which slowing down tick by tick ends within this way."""
         acceleration = self.acceleration
-        if way >= self._braking_way:
-            return self._top_speed
         if not acceleration:
             return way
         ticks = (isqrt(1 + 8 * (way // acceleration)) - 1) // 2
