@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 
 import pytest
 from hypothesis import settings
+from pytest_asyncio import is_async_test
 
 from ldcnd.sim.jumping_loop import JumpingLoop
 
@@ -30,7 +31,14 @@ def pytest_asyncio_loop_factories(
     return {"jumping": JumpingLoop}
 
 
-@pytest.fixture(autouse=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Have every test that runs on a loop looked at; a loop for each of the thousands of others costs ten seconds."""
+    for item in items:
+        if is_async_test(item) and no_task_is_left.__name__ not in item.fixturenames:
+            item.fixturenames.insert(0, no_task_is_left.__name__)
+
+
+@pytest.fixture
 async def no_task_is_left() -> AsyncIterator[None]:
     """Fail the test that leaves a task running."""
     yield
