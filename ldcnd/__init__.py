@@ -40,7 +40,7 @@ __all__ = ["Axis", "LdcndError", "Motion", "Position", "Rig", "State", "Trace", 
 
 
 def __getattr__(name: str) -> object:
-    """Load what is asked for."""
+    """Load an attribute on first use."""
     if name not in _HOME:
         raise AttributeError(f"module 'ldcnd' has no attribute {name!r}")
     module, attribute = _HOME[name]

@@ -92,7 +92,7 @@ def step(verb: str, said: str | None = None, **arguments: Argument) -> Step:
 
 
 class Remedy(str):
-    """What to do about an error: a text that names commands.
+    """The remedy of an error: a text that names commands.
 
     Args:
         text: with `{}` for each step.
@@ -139,11 +139,11 @@ class LdcndError(Exception):
     """
 
     code: ClassVar[ErrorCode] = ErrorCode.INTERNAL
-    """What the wire calls it."""
+    """The class's name on the wire."""
     retryable: ClassVar[bool] = False
     """The same request may be sent again without harm and may then succeed."""
     way_out: ClassVar[str] = "see the message"
-    """What to do about errors of this class; `remedy` is what to do about this very one."""
+    """The remedy for errors of this class; `remedy` is that for one error."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class LdcndError(Exception):
         nearest: float | None = None,
         remedy: str | None = None,
     ) -> None:
-        # a message repeats what strangers have sent, and is printed on terminals and in logs
+        # a message repeats untrusted text, and is printed on terminals and in logs
         self.message = printable(message, keep="\n")
         super().__init__(self.message)
         self.axis = axis if axis is None else printable(axis)
@@ -482,7 +482,7 @@ class UnknownCommand(RequestRefused):
 
 
 class NotPermitted(RequestRefused):
-    """The sender is unknown, or asks from where it may not; the console says so to browsers."""
+    """The sender is unknown, or its origin is not permitted; the console says so to browsers."""
 
     code = ErrorCode.NOT_PERMITTED
     way_out = "open the console with the link that it prints"
@@ -529,7 +529,7 @@ def _classes(root: type[LdcndError] = LdcndError) -> Iterator[type[LdcndError]]:
 ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
     {code: next(error for error in _classes() if vars(error).get("code") is code) for code in ErrorCode}
 )
-"""What an error reply is rebuilt to: the class of each code, the first one where two share a code."""
+"""The class that an error reply is rebuilt to, by code; the first one where two share a code."""
 
 
 def as_markdown() -> str:

@@ -20,7 +20,7 @@ _condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
 class only_while:  # noqa: N801 - read as a statement
     """Let what can move, when queued in this context, be sent only if the condition still holds when its turn comes.
 
-    A queue may be long: the condition is asked between it and the wire. Stops are not subject to any condition.
+    A queue may be long: the condition is checked between it and the wire. Stops are not subject to any condition.
     """
 
     __slots__ = ("_own", "_token")
@@ -41,7 +41,7 @@ def condition_in_force() -> Condition | None:
 
 
 class ReplyVerdict(Enum):
-    """What complete reply bytes are worth, decided before the line is used again."""
+    """The validity of complete reply bytes, decided before the line is used again."""
 
     INTACT = "intact"
     """The reply belongs to this request and may be decoded."""
@@ -55,7 +55,7 @@ class ReplyVerdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Exchange(Generic[ReplyT]):
-    """A request and everything the bus needs to know about its reply.
+    """A request and the properties of its reply that the bus needs.
 
     Attributes:
         node: who answers; back-off and statistics are kept per node. Group addresses count as nodes of their own.
@@ -68,8 +68,8 @@ class Exchange(Generic[ReplyT]):
         repeatable: may the bus send the request again after its reply was lost? Never true for what could move a
             drive twice.
         moves: can make a motor move or change how it does; see `only_while`.
-        total_bytes: for replies whose length depends on their content: given the bytes so far, the total length, or
-            None when it cannot be told yet. When absent the length is `reply_bytes`.
+        total_bytes: for replies whose length depends on their content: given the received bytes, the total length, or
+            None when it is not known yet. When absent the length is `reply_bytes`.
     """
 
     node: int

@@ -22,7 +22,7 @@ class ListenAddress:
 
     @property
     def is_loopback(self) -> bool:
-        """Nobody off this machine can connect to it."""
+        """No other machine can connect to it."""
         if self.host == "localhost":
             return True
         try:

@@ -1,6 +1,6 @@
 """Structured logging: fixed phrases with fields, for a terminal, for another program, or for the journal.
 
-In the journal every field can be asked for, such as EXTRA_BUS, EXTRA_AXIS, EXTRA_COMMAND_ID and EXTRA_CODE, where the
+In the journal every field can be queried, such as EXTRA_BUS, EXTRA_AXIS, EXTRA_COMMAND_ID and EXTRA_CODE, where the
 package logging-journald is installed; without it, records keep their priority and carry the fields in their text.
 Source: sd-daemon(3) for the prefixes of lines, systemd.exec(5) "$JOURNAL_STREAM".
 """
@@ -50,10 +50,10 @@ class _LazyLogger:
 
 
 class LogLimit:
-    """Keeps a record that anyone can cause from filling a disk.
+    """Limits a record that any client can cause, so that it cannot fill a disk.
 
     Args:
-        count: so many records pass in a period.
+        count: maximum number of records in a period.
         period_s: how long it is, s.
         now_s: returns the time, s.
     """
@@ -141,7 +141,7 @@ def _journal_handler(stream: TextIO) -> logging.Handler:
 
 
 def _fit_for_terminals(_logger: object, _method: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-    """Show control characters as escapes: fields repeat what strangers have sent."""
+    """Show control characters as escapes: fields repeat untrusted text."""
     for key, value in event.items():
         if isinstance(value, str):
             event[key] = printable(value, keep="\n\t" if key == "exception" else "")

@@ -1,6 +1,6 @@
-"""Text that strangers have written, made fit for an operator's terminal and for a log.
+"""Untrusted text, made fit for an operator's terminal and for a log.
 
-A control character can move the cursor, change the title or fill the clipboard of whoever looks; a formatting character
+A control character can move the cursor, change the title or fill the clipboard of a reader; a formatting character
 can make a text read otherwise than it is written. So commands that have any are refused, and what is printed shows them
 as escapes.
 """

@@ -9,7 +9,7 @@
         x.power(on=True).wait()
         RE(scan([rig.signal("y", "velocity")], x, 0, 10, 11))
 
-The devices stand on `ldcnd.connect` and live on an event loop in a thread of their own: what a plan, a callback or a
+The devices stand on `ldcnd.connect` and run on an event loop in a thread of their own: what a plan, a callback or a
 plot does with the RunEngine's loop delays no renewal of a lease. They satisfy the protocols structurally, so Bluesky
 itself is not needed to make them.
 """

@@ -35,7 +35,7 @@ FRESH_S = 1.0
 SILENT_S = 10.0
 """Longest wait for such a position, and for an axis to come to rest after a motion that failed, in seconds."""
 PAGE_SAMPLES = 1000
-"""A page of a fly scan has at most so many positions."""
+"""Maximum number of positions on a page of a fly scan."""
 
 ResultT = TypeVar("ResultT")
 

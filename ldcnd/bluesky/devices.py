@@ -30,7 +30,7 @@ class Devices:
 
     Args:
         rig: the rig.
-        loop: where it lives.
+        loop: the loop on which it runs.
     """
 
     def __init__(self, rig: Rig, loop: LoopThread) -> None:

@@ -1,4 +1,4 @@
-"""What a Bluesky plan waits for: the end of work that was begun on the devices' own loop."""
+"""Statuses that a Bluesky plan waits for: the end of work that was begun on the devices' own loop."""
 
 import asyncio
 import concurrent.futures

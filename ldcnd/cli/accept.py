@@ -22,7 +22,7 @@ from ldcnd.version import version
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
 
 HELD_S = 1.0
-"""The dead-man counts as released when Enter was not pressed for so long."""
+"""Time without Enter after which the dead-man counts as released, seconds."""
 GAINS = "kp,kd,ki,il,ol,el"
 
 

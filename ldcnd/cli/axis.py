@@ -1,4 +1,4 @@
-"""`ldcnd axis`: look at axes and move them."""
+"""`ldcnd axis`: show axes and move them."""
 
 import click
 
@@ -78,7 +78,7 @@ def list_axes(target: Target) -> None:
 @command.command()
 @click.argument("axis", type=AXIS, default="*")
 @click.option("--item", type=click.Choice([item.value for item in TelemetryItem]), help="Only this item.")
-@click.option("--count", type=click.IntRange(min=1), help="End after so many samples.")
+@click.option("--count", type=click.IntRange(min=1), help="End after this many samples.")
 @with_target
 def watch(target: Target, axis: str, item: str | None, count: int | None) -> None:
     """Show the telemetry of AXIS (or of all) as it comes."""
@@ -278,7 +278,7 @@ def profile(target: Target, axis: str) -> None:
         return await client.command(axis, ReadProfile())
 
     reply = target.run(work)
-    hearing = ", HEARS ITSELF: nothing is written" if reply.self_hearing else ""
+    hearing = ", RECEIVES ITS OWN REPLIES: nothing is written" if reply.self_hearing else ""
     lines = [f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}"]
     for each in reply.assumptions:
         setting = f" = {each.setting}" if each.setting else ""

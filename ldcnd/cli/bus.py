@@ -1,4 +1,4 @@
-"""`ldcnd bus`: look at the lines of a running daemon."""
+"""`ldcnd bus`: show the lines of a running daemon."""
 
 import json
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ DISSECTOR = click.option(
 
 @click.group()
 def command() -> None:
-    """Look at the lines of a running daemon, and play back what was on them."""
+    """Show the lines of a running daemon, and play back what was on them."""
 
 
 command.add_command(replay.command)

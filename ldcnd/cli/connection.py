@@ -46,7 +46,7 @@ def of_options(model: type[ModelT], **values: object) -> ModelT:
 
 
 class AxisName(click.types.StringParamType):
-    """The name of an axis; the shell completes it with those of the daemon that the line so far names."""
+    """The name of an axis; the shell completes it with those of the daemon that the command line names."""
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002
         """Return the axes that begin so; none when no daemon answers in time."""
@@ -74,7 +74,7 @@ class TargetOption(click.Option):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where to look for the daemon.
+    """The session's connection to the daemon.
 
     Attributes:
         connect: endpoints to connect to.

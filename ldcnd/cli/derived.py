@@ -49,7 +49,7 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
 
 
 class _FieldOption(click.Option):
-    """An option for a field; what it means is read in the source of the class when help asks for it."""
+    """An option for a field; its meaning is read from the source of the class when help is shown."""
 
     def __init__(self, command: type[Sent], field: str, kind: click.ParamType[Any]) -> None:
         super().__init__([f"--{field.replace('_', '-')}"], type=kind)

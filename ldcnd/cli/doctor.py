@@ -1,4 +1,4 @@
-"""`ldcnd doctor`: examine a line before a daemon uses it; opens the port itself, reads unless told otherwise."""
+"""`ldcnd doctor`: examine a line before a daemon uses it; opens the port itself, only reads by default."""
 
 import asyncio
 import sys
@@ -50,7 +50,7 @@ class Examinations(click.Group):
 
 @click.command(cls=Examinations)
 def command() -> None:
-    """Examine a line, by reading unless told otherwise; no daemon may use it meanwhile."""
+    """Examine a line; only reads by default. No daemon may use it meanwhile."""
 
 
 def _examination(family_name: str, family: Examines[Any]) -> click.Command:

@@ -63,7 +63,7 @@ def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> N
 @_moving
 @with_target
 def daemon_stop(target: Target, axis: str, velocity: float) -> None:
-    """Jog, and let the daemon do what it does when it is told to end; it does not end."""
+    """Jog, and let the daemon apply `loss.daemon` as at its shutdown; it does not end."""
     _report(target, axis, "daemon stop", target.run(lambda client: _rehearse(client, axis, velocity, "daemon_stop")))
 
 

@@ -1,4 +1,4 @@
-"""Being told to end: by Ctrl-C, by the service manager, by the end of the terminal."""
+"""Ending a command: by Ctrl-C, by the service manager, by the end of the terminal."""
 
 import asyncio
 import os

@@ -1,4 +1,4 @@
-"""Pictures of quantities against time; the only place that knows matplotlib, which is an extra."""
+"""Pictures of quantities against time; the only place that uses matplotlib, which is an extra."""
 
 import importlib
 from pathlib import Path

@@ -13,7 +13,7 @@ from ldcnd.messaging.session import Session
 
 
 @click.command()
-@click.option("--watch", type=Finite(min=0.5, max=3600), help="Show it again every so many seconds.")
+@click.option("--watch", type=Finite(min=0.5, max=3600), help="Period of updates, seconds.")
 @with_target
 def command(target: Target, watch: float | None) -> None:
     """Show every rig across routers: its daemon, its lines and axes, and what is wrong with them.
@@ -42,7 +42,7 @@ def command(target: Target, watch: float | None) -> None:
 def table(rig: RigReport) -> list[str]:
     """Return a rig as lines of text: itself, what is wrong, its axes."""
     version = f"ldcnd {rig.daemon.version}" if rig.daemon else "version unknown"
-    lines = [f"{rig.rig}  {version}  run {rig.instance}  {'look at it' if rig.problems else 'well'}"]
+    lines = [f"{rig.rig}  {version}  run {rig.instance}  {'needs attention' if rig.problems else 'well'}"]
     lines += [f"  ! {problem}" for problem in rig.problems]
     lines += [f"  {_axis(axis)}" for axis in rig.axes]
     return lines

@@ -28,7 +28,7 @@ LEASE_S = 1.0
 FIRST_REPEAT_S = 0.8
 """A keyboard begins to repeat a key that is held within this time."""
 NEXT_REPEAT_S = 0.25
-"""And repeats it at least so often; after a longer silence the key counts as released."""
+"""Longest time between its repetitions; after a longer silence the key counts as released."""
 HOLD_S = 0.4
 """Longest time between two repetitions of the key that reach the daemon; then it ends the jog."""
 RENEW_EACH_S = 0.1
@@ -37,7 +37,7 @@ RENEW_EACH_S = 0.1
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("axis", type=AXIS)
 @click.argument("velocity", type=Finite())
-@click.option("--for", "for_s", type=Finite(0, 3600, min_open=True), help="Run for so many seconds.")
+@click.option("--for", "for_s", type=Finite(0, 3600, min_open=True), help="Duration, seconds.")
 @click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
 @click.option("--force", is_flag=True, help="Take control from its holder.")
 @with_target

@@ -1,4 +1,4 @@
-"""What commands print, and how they end: nothing from the network steers a terminal, no error shows a traceback."""
+"""Output and endings of commands: nothing from the network steers a terminal, no error shows a traceback."""
 
 import os
 import sys

@@ -18,7 +18,7 @@ FAMILY = next(family for family in FAMILIES.values() if isinstance(family, HasPa
 
 @dataclass(frozen=True, slots=True)
 class ParameterFile:
-    """What a file says.
+    """The contents of a file.
 
     Attributes:
         values: what was stored, by the names of the file.
@@ -35,7 +35,7 @@ class ParameterFile:
         return {FAMILY.parameter(name, value)[0]: value for name, value in self.values.items()}
 
     def check(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return what is wrong with the values, and what deserves attention; asks no drive."""
+        """Return what is wrong with the values, and what deserves attention; sends nothing to a drive."""
         return FAMILY.check_parameters(self.values)
 
 

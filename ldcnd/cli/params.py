@@ -72,7 +72,7 @@ def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
 @click.argument("axis", type=AXIS)
 @click.argument("parameter")
 @click.argument("value", callback=_word)
-@click.option("--eeprom", is_flag=True, help="Write for good; the memory endures 10,000 writes.")
+@click.option("--eeprom", is_flag=True, help="Write permanently; the memory endures 10,000 writes.")
 @click.option("--unlisted", is_flag=True, help="Allow a number that the manual does not list.")
 @click.option("--confirm-unit", type=click.IntRange(0, 15), help="The unit number that writing Pn000 leads to.")
 @with_target
@@ -138,7 +138,7 @@ def diff(target: Target, left: str, right: str | None) -> None:
 @click.option("--ram", is_flag=True, help="Only try out: write RAM, and leave out what takes effect at power-on.")
 @click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
 @click.option("--any-type", is_flag=True, help="Take values of another or of an unknown type of drive.")
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @with_target
 def restore(target: Target, axis: str, file: Path, *, ram: bool, dry_run: bool, any_type: bool, yes: bool) -> None:
     """Make AXIS hold what FILE says; its unit number stays. Lists the writes, asks once, reads them back."""
@@ -154,7 +154,7 @@ def restore(target: Target, axis: str, file: Path, *, ram: bool, dry_run: bool, 
 @click.argument("axis", type=AXIS)
 @click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
 @click.option("--any-type", is_flag=True, help="Take values of another type of drive.")
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @with_target
 def clone(target: Target, source: str, axis: str, *, dry_run: bool, any_type: bool, yes: bool) -> None:
     """Make AXIS hold what SOURCE has stored; its unit number stays. As restore, from drive to drive."""
@@ -167,7 +167,7 @@ def clone(target: Target, source: str, axis: str, *, dry_run: bool, any_type: bo
 @command.command()
 @click.argument("axis", type=AXIS)
 @click.option("--dry-run", is_flag=True, help="List the writes, and send none.")
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @with_target
 def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
     """Write to EEPROM what AXIS has in use, so that it outlives power-off; its unit number stays."""
@@ -181,10 +181,10 @@ def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
 @click.option(
     "--writes", type=click.IntRange(0, 10_000), default=0, help="Writes that the new drive has taken already."
 )
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @with_target
 def restart_count(target: Target, axis: str, writes: int, *, yes: bool) -> None:
-    """Count EEPROM writes of AXIS anew, because its drive was replaced; nothing is sent to the drive."""
+    """Restart the count of EEPROM writes of AXIS, because its drive was replaced; nothing is sent to the drive."""
     if not yes and not click.confirm(f"Was the drive of {axis} replaced?", err=True):
         raise click.Abort
     reply = target.run(lambda client: client.command(axis, RestartEepromCount(writes=writes)))

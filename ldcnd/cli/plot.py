@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 NS_PER_S = 1e9
 MOST_LABELS = 40
-"""Beyond so many events, their names would only hide each other."""
+"""Maximum number of event labels; the names of more would overlap."""
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""What the commands on recordings have in common."""
+"""Common parts of the commands on recordings."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime

@@ -1,4 +1,4 @@
-"""What concerns a whole rig: stop, reset and power, several axes at once, and who controls what."""
+"""Commands for a whole rig: stop, reset and power, several axes at once, and who controls what."""
 
 import asyncio
 import os
@@ -38,7 +38,7 @@ def stop_rig(target: Target, axis: str | None) -> None:
     async def work(client: RigClient) -> StopReply:
         return await client.stop(axis, client=NAME)
 
-    # a rig that is named is not looked for first: the stop is what reaches it first
+    # a rig that is named is not searched for first: the stop is what reaches it first
     rig = target.rig
     reply = target.run_session(lambda session: work(RigClient(session, rig))) if rig else target.run(work)
     unconfirmed = sorted(set(reply.axes) - set(reply.confirmed))

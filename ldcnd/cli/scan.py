@@ -29,7 +29,7 @@ rig = "rig"
 
 @click.command()
 @click.argument("port")
-@click.option("--family", type=click.Choice(list(SCANNED)), help="Look for drives of this family only.")
+@click.option("--family", type=click.Choice(list(SCANNED)), help="Search for drives of this family only.")
 @click.option(
     "--address",
     "give_addresses",
@@ -61,7 +61,7 @@ def command(port: str, family: str | None, file: Path | None, *, give_addresses:
 
     for name in (family,) if family else SCANNED:
         if not as_json:
-            print(f"looking for {name} drives", file=sys.stderr, flush=True)
+            print(f"searching for {name} drives", file=sys.stderr, flush=True)
         wrong = False
         drives = asyncio.run(scan_port(SCANNED[name], port, show, give_addresses=give_addresses))
         if drives:
@@ -74,7 +74,7 @@ def command(port: str, family: str | None, file: Path | None, *, give_addresses:
 async def scan_port(
     family: Scans, port: str, show: Callable[[Finding], None], *, give_addresses: bool = False
 ) -> Sequence[ScannedDrive]:
-    """Open a port, look for drives of a family on it, and close it.
+    """Open a port, scan it for drives of a family, and close it.
 
     Raises:
         BusDown: the port does not open.

@@ -99,7 +99,7 @@ def client_methods(folder: Path) -> None:
 @click.argument("page", type=click.Path(path_type=Path), default=Path("docs/reference/python.md"))
 def python_client(page: Path) -> None:
     """Write the reference of the Python client to PAGE."""
-    # not above: the client's methods can be made anew also when those that there are cannot be loaded
+    # not above: the client's methods can be regenerated also when those that there are cannot be loaded
     from ldcnd.cli.client_reference import client_reference  # noqa: PLC0415
 
     page.write_text(client_reference(), encoding="utf-8")

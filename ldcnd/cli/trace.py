@@ -1,4 +1,4 @@
-"""`ldcnd trace`: record an axis against time, look at the result, draw it."""
+"""`ldcnd trace`: record an axis against time, show the result, draw it."""
 
 import sys
 from datetime import UTC, datetime
@@ -77,7 +77,7 @@ out_option = click.option(
 
 @click.group()
 def command() -> None:
-    """Record an axis against time, and look at what was recorded."""
+    """Record an axis against time, and show the result."""
 
 
 @command.command()
@@ -85,7 +85,7 @@ def command() -> None:
 @click.option("--channel", "-c", "channels", multiple=True, required=True, help="What to record; may be repeated.")
 @click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
 @click.option("--samples", type=click.IntRange(2, MOST_SAMPLES), default=500, help="How many samples [500].")
-@click.option("--pre", type=click.IntRange(0), default=0, help="So many of them before the trigger [0].")
+@click.option("--pre", type=click.IntRange(0), default=0, help="Number of them before the trigger [0].")
 @click.option("--trigger", callback=_trigger, help=f"CHANNEL:KIND:LEVEL; kinds: {', '.join(TriggerKind)}.")
 @click.option("--full-scale", multiple=True, callback=_full_scale, help="CHANNEL:LARGEST, to resolve it finer.")
 @click.option("--timeout", type=Finite(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")

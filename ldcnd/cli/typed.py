@@ -1,4 +1,4 @@
-"""What people type: names with the nearest right one, finite numbers, addresses to serve at."""
+"""Typed input: names with the nearest right one, finite numbers, addresses to serve at."""
 
 import math
 from collections.abc import Callable, Iterable

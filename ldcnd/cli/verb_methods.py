@@ -64,7 +64,7 @@ def verb_methods() -> str:
 
 
 def with_blocking_methods(module: str) -> str:
-    """Return the text of `ldcnd/client/blocking.py` with the methods of its `Axis` made anew."""
+    """Return the text of `ldcnd/client/blocking.py` with the methods of its `Axis` regenerated."""
     before, _, rest = module.partition(BEGIN)
     _, _, after = rest.partition(END)
     lines = [

@@ -1,1 +1,1 @@
-"""Typed access to a running daemon; knows the contract, not the machine."""
+"""Typed access to a running daemon; contains the contract, not the machine."""

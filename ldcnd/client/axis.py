@@ -26,9 +26,9 @@ from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
 from ldcnd.model.traces import TakeTrace, TraceTrigger
 
 LINGER_S = 0.03
-"""A position may wait for so long for others: to wake a program up for each costs more than all else."""
+"""Time that a position may wait for others, seconds: waking a program for each one costs more than all else."""
 KEPT_SAMPLES = 256
-"""A reader that is too slow keeps so many samples; the oldest give way."""
+"""Maximum number of samples kept for a slow reader; the oldest are dropped."""
 HALT_S = 2.0
 """Longest time that a cancelled wait takes to halt its axis, in seconds."""
 
@@ -190,7 +190,7 @@ class Axis(AxisVerbs, Watched):
             channels: what to record; `meta/axes/<axis>` lists what the axis has.
             samples: how many.
             interval_s: time between two of them; as fast as the line allows when missing.
-            pre_trigger: so many of them before the trigger.
+            pre_trigger: number of samples before the trigger.
             trigger: what to wait for; starts at once when missing.
             within_s: longest time from its arming to its end.
         """
@@ -207,7 +207,7 @@ class Axis(AxisVerbs, Watched):
         return await take_trace(self._client, self.name, stamped, within_s)
 
     async def outcome(self, command_id: str) -> CommandOutcome:
-        """Ask the daemon what became of a command."""
+        """Query the daemon for the outcome of a command."""
         return await self._client.ask(ReadOutcome(command_id=command_id))
 
     async def halt_now(self) -> None:

@@ -27,7 +27,7 @@ WrappedT = TypeVar("WrappedT")
 
 
 class Facade(Generic[WrappedT]):
-    """What the facades have in common: an object of the asyncio client, and the loop that it lives on."""
+    """Base of the facades: an object of the asyncio client, and the loop on which it runs."""
 
     def __init__(self, loop: LoopThread, wrapped: WrappedT) -> None:
         self._loop = loop

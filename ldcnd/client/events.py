@@ -1,6 +1,6 @@
 """The events of a rig without gaps: what the network drops is fetched from the daemon's memory.
 
-An event has a number, so a gap is seen when the next one comes, and at the latest when the daemon is asked again.
+An event has a number, so a gap is seen when the next one comes, and at the latest at the next query of the daemon.
 """
 
 import asyncio
@@ -13,19 +13,19 @@ from ldcnd.errors import OutcomeUnknown, SessionError
 from ldcnd.model.events import CommandEvent, EventList, ReadEvents
 
 LOOK_PERIOD_S = 2.0
-"""So often the daemon is asked whether the last event was missed, while none comes."""
+"""Period of queries for a missed last event, while none comes, seconds."""
 RETRY_S = 0.5
-"""A daemon out of reach is asked again after so long."""
+"""Pause before the next query of a daemon out of reach, seconds."""
 UNREAD_EVENTS = 1024
-"""A reader that is slower keeps so many events that have come; what is beyond is fetched when it gets there."""
+"""Maximum number of events kept for a slow reader; further ones are fetched when it gets there."""
 
 
 class Events:
     """An endless iterator over the events of a rig, in their order, each once; made by `follow_events`.
 
     Attributes:
-        lost: how many events the daemon had forgotten before they could be fetched.
-        restarts: how often the daemon was started anew meanwhile; what its former run said last may be missing.
+        lost: how many events the daemon had discarded before they could be fetched.
+        restarts: how often the daemon was restarted meanwhile; the last events of its former run may be missing.
     """
 
     def __init__(self, client: RigClient, axis: str | None, at: EventList) -> None:
@@ -75,7 +75,7 @@ class Events:
         return self._behind or bool(self._ready)
 
     async def _fetch(self) -> None:
-        """Ask for the next page from where this reader is; try again for as long as nobody answers."""
+        """Query the next page from where this reader is; retry while there is no answer."""
         while True:
             try:
                 page = await self._client.ask(ReadEvents(from_number=self._next))
@@ -109,7 +109,7 @@ async def follow_events(client: RigClient, axis: str | None = None, *, history: 
         history: begin with what the daemon remembers, up to 1000 events, instead of now.
 
     Raises:
-        SessionError: nobody serves this rig, or this login may not ask for events.
+        SessionError: no daemon serves this rig, or this login may not query events.
     """
     request = ReadEvents(from_number=0, count=1) if history else ReadEvents(count=1)
     page = await client.ask(request)
@@ -124,7 +124,7 @@ async def latest_events(client: RigClient, count: int, axis: str | None = None) 
 
     Args:
         client: the rig.
-        count: at most so many, 1 to 1000.
+        count: maximum number, 1 to 1000.
         axis: only this one.
 
     Raises:

@@ -13,7 +13,7 @@ from ldcnd.model.samples import FaultSample, StateSample
 from ldcnd.model.trouble import axis_troubles, line_troubles
 
 ASKED_AT_ONCE = 8
-"""So many rigs are asked one beside the other."""
+"""Maximum number of concurrent queries of rigs."""
 LATE_S = 0.25
 """A daemon whose timers come later than this has too much to do."""
 
@@ -22,7 +22,7 @@ class AxisReport(Frozen):
     """One axis of a fleet."""
 
     info: AxisInfo
-    """What it is."""
+    """The description of the axis."""
     state: StateSample | None
     """Its last state; null before the first."""
     fault: FaultSample | None
@@ -51,7 +51,7 @@ class RigReport(Frozen):
 
 
 async def survey(session: Session, rig: str | None = None) -> tuple[RigReport, ...]:
-    """Ask every rig how it is, and return them by name; what one of them does not answer keeps nobody waiting.
+    """Query the state of every rig, and return the reports by name; a rig that does not answer delays no other.
 
     A daemon that shows its liveliness token and answers nothing is in the list, with that as its problem.
 
@@ -83,12 +83,12 @@ async def survey(session: Session, rig: str | None = None) -> tuple[RigReport, .
 async def _daemons(session: Session) -> list[DaemonInfo]:
     try:
         return await find_rigs(session)
-    except OutcomeUnknown:  # there is somebody, and none of them answers
+    except OutcomeUnknown:  # there are daemons, and none of them answers
         return []
 
 
 async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, *, rival: bool) -> RigReport:
-    """Ask one rig; what it does not answer is a problem of its own."""
+    """Query one rig; a query without answer is a problem of its own."""
     view = RigReport(rig=daemon.rig, instance=daemon.instance, daemon=daemon, health=None)
     client = RigClient(session, daemon.rig)
     try:

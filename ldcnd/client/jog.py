@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from ldcnd.model.commands import CommandReply, Jog
 
 RENEWALS_PER_HOLD = 4
-"""So many renewals may be lost before a jog ends."""
+"""Number of consecutive renewals that may be lost before a jog ends."""
 
 
 class Jogging:

@@ -15,7 +15,7 @@ ReplyT = TypeVar("ReplyT", bound=CommandReply)
 RequestT = TypeVar("RequestT", bound=AxisCommand[CommandReply])
 
 RENEWALS_PER_LEASE = 4
-"""So many renewals may be lost before a lease ends."""
+"""Number of consecutive renewals that may be lost before a lease ends."""
 
 
 class Control:
@@ -76,7 +76,7 @@ class Control:
         self.over.set()
 
     async def release(self, *, leave_running: bool = False) -> None:
-        """Give control back; it may have been taken away meanwhile, or end by itself when nobody can be told.
+        """Give control back; it may have been taken away meanwhile, or end by itself when the daemon is out of reach.
 
         An axis that moves then does what its `loss.client` says, unless it is left running on purpose.
         """
@@ -100,8 +100,8 @@ async def control(
         name: who this is, for people.
         axes: what to control.
         lease_s: how soon the daemon shall act when this program disappears, 0.2 to 60 s.
-        force: take control away from whoever has it.
-        leave_running: let what still moves at the end go on, with nobody in control; otherwise it does what its
+        force: take control away from the present holder.
+        leave_running: let what still moves at the end go on, without a holder of control; otherwise it does what its
             `loss.client` says.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What an axis is doing, as a program sees it: its last values with their age, and a motion from start to end."""
+"""The state of an axis for a program: its last values with their age, and a motion from start to end."""
 
 import asyncio
 from abc import ABC, abstractmethod
@@ -11,9 +11,9 @@ from ldcnd.model.events import FINAL, CommandOutcome, CommandStatus
 from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
 
 SILENT_S = 10.0
-"""A motion whose axis is not heard of for so long has an unknown outcome, in seconds."""
+"""Time without samples after which the outcome of a motion is unknown, seconds."""
 LOOK_S = 0.2
-"""Longest time between two looks at the outcome of a command that its axis does not name any more, in seconds."""
+"""Longest time between two queries for the outcome of a command that its axis does not name any more, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ class Watched(ABC):
 
     @abstractmethod
     async def outcome(self, command_id: str) -> CommandOutcome:
-        """Ask the daemon what became of a command."""
+        """Query the daemon for the outcome of the command."""
 
     @abstractmethod
     async def halt_now(self) -> None:
@@ -157,7 +157,7 @@ class Motion:
     """A command that the drive has acknowledged and that ends later.
 
     Attributes:
-        reply: what the drive's registers make of what was asked: target, velocity, duration.
+        reply: the request as the drive's registers have it: target, velocity, duration.
         ended: the state after it; None until `done` has returned.
     """
 
@@ -171,7 +171,7 @@ class Motion:
         return self.reply.command_id
 
     async def done(self) -> State:
-        """Wait until the motion has ended as it was asked and has settled; return the state after it, and where.
+        """Wait until the motion has ended as requested and has settled; return the state after it, and where.
 
         A motion that does not settle in time ends with `settled` false, or as a fault: see `settle` of the axis.
 

@@ -1,4 +1,4 @@
-"""What a notebook shows of an axis, a motion, a rig and a trace: small tables, and curves without any library."""
+"""Display in notebooks of an axis, a motion, a rig and a trace: small tables, and curves without any library."""
 
 from collections.abc import Iterable, Sequence
 from html import escape

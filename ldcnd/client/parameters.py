@@ -21,7 +21,7 @@ Progress = Callable[[int, PlannedWrite], None]
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """What became of a plan; every write of it is in exactly one of the three.
+    """The outcome of a plan; every write of it is in exactly one of the three.
 
     Attributes:
         done: writes that were read back with their value.

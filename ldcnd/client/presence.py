@@ -1,4 +1,4 @@
-"""Which daemons are there: told when one comes and when one goes, without asking."""
+"""Presence of daemons: reports each that comes and each that goes, without queries."""
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager

@@ -114,7 +114,7 @@ class Rig:
     def control(
         self, *axes: str, client: str, lease_s: float = 1.0, force: bool = False
     ) -> AbstractAsyncContextManager[Axis] | AbstractAsyncContextManager[tuple[Axis, ...]]:
-        """Control axes until the context ends: nobody else moves them, and they halt when this program disappears.
+        """Control axes until the context ends: no other client moves them, and they halt when this program disappears.
 
         Yields the axis, or a tuple when several are named. When control is lost, `LeaseExpired` is raised where the
         program waits. An exception that leaves the context halts the axes whose motions have not ended.
@@ -200,7 +200,7 @@ class Rig:
         acceleration: float | None = None,
         path: LinePath = LinePath.LINEAR,
     ) -> PreviewTogetherReply:
-        """Ask what `move_together` would do: durations, and how far from a straight line the axes would get."""
+        """Preview `move_together`: durations, and how far from a straight line the axes would get."""
         moves = tuple(
             AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
             for name, position in targets.items()

@@ -43,10 +43,10 @@ ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
 
 KEPT_SAMPLES = 256
-"""A watcher that is too slow keeps so many samples; the oldest give way."""
+"""Maximum number of samples kept for a slow watcher; the oldest are dropped."""
 
 KEPT_PUBLISHED = 4096
-"""Whoever takes all that a rig publishes may be held up for a second of a large one."""
+"""Maximum number of samples kept for a reader of everything on a rig: enough for one second of a large one."""
 
 
 class Samples:
@@ -54,8 +54,8 @@ class Samples:
 
     Attributes:
         dropped: how many samples the reader was too slow for.
-        missed: how many the network dropped, as the numbers of those that came tell. A daemon that is started anew
-            begins with number 0; what its former run said last is not counted.
+        missed: how many the network dropped, by the numbers of those that came. A daemon that is restarted
+            begins with number 0; the last samples of its former run are not counted.
     """
 
     def __init__(self) -> None:
@@ -92,7 +92,7 @@ class Samples:
 
 
 class RigClient:
-    """Asks and commands one rig over an open session."""
+    """Queries and commands one rig over an open session."""
 
     def __init__(self, session: Session, rig: str) -> None:
         self.rig = rig
@@ -175,7 +175,7 @@ class RigClient:
         return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, StateSample) for answer in answers}
 
     async def faults(self) -> dict[str, FaultSample]:
-        """Return what is wrong with every axis that has said so much."""
+        """Return what is wrong with every axis that has published enough to tell."""
         answers = await self._session.query(self._keys.telemetry_pattern("*", TelemetryItem.FAULT))
         return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, FaultSample) for answer in answers}
 
@@ -196,7 +196,7 @@ class RigClient:
             LdcndError: as the daemon refused it, of the same class.
             OutcomeUnknown: no answer came in time, or the daemon has disappeared; the command may be carried out all
                 the same.
-            SessionError: nobody serves this rig, or access control does not let this login command it.
+            SessionError: no daemon serves this rig, or access control does not let this login command it.
         """
         if self._instance is None:
             self._instance = (await self.daemon()).instance
@@ -216,11 +216,11 @@ class RigClient:
         return await self._answer(axis, command, timeout_s)
 
     async def why(self, axis: str, question: Why | None = None) -> WhyReply:
-        """Ask why a motion of an axis would be refused now, and what would clear that."""
+        """Query why a motion of an axis would be refused now, and what would clear that."""
         return await self.ask(question or Why(), axis)
 
     async def preview(self, axis: str, question: Preview) -> PreviewReply:
-        """Ask what a motion would do; no effect."""
+        """Preview a motion; no effect."""
         return await self.ask(question, axis)
 
     async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
@@ -291,8 +291,8 @@ class RigClient:
 
         Args:
             take: takes what was published.
-            kept: so many samples of a kind may wait for it; yields a function that returns how many more gave way.
-            linger_s: a sample may wait for so long for others, which costs less than taking each by itself.
+            kept: maximum number of waiting samples of a kind; yields a function that returns how many were dropped.
+            linger_s: how long a sample may wait for others, which costs less than taking each by itself.
         """
         async with AsyncExitStack() as declared:
             declarations: list[Declaration] = []
@@ -351,7 +351,7 @@ class RigClient:
                 _, sample = await anext(states)
 
     async def _unanswered(self, what: str) -> LdcndError:
-        """Return what it means that nobody answered a command: access control and absence look the same."""
+        """Return the error for a command without an answer: access control and absence cannot be distinguished."""
         try:
             await self.daemon()
         except SessionError:
@@ -364,7 +364,7 @@ class RigClient:
     def _one(self, answers: list[Answer], model: type[ModelT]) -> ModelT:
         if not answers:
             raise SessionError(
-                f"nobody serves rig {self.rig}, or you are not permitted to ask",
+                f"no daemon serves rig {self.rig}, or this login may not query it",
                 remedy="check that the daemon runs and that you connect to it",
             )
         return self._decoded(answers[-1], model)

@@ -12,7 +12,7 @@ from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, T
 
 LOOK_S = 0.1
 ARMING_S = 30.0
-"""A slow drive is told and asked some twenty words before its trace begins."""
+"""Maximum time to arm a trace, seconds: a slow drive needs some twenty exchanges before its trace begins."""
 ENDING_S = 10.0
 UNDER_WAY = frozenset({TracePhase.FILLING, TracePhase.WAITING, TracePhase.RECORDING, TracePhase.UPLOADING})
 

@@ -8,14 +8,14 @@ from ldcnd.model.rig_commands import ReadWireLog
 
 @dataclass(frozen=True, slots=True)
 class FetchedWireLog:
-    """What was on a line.
+    """The records of a line.
 
     Attributes:
         bus: the line.
         family: the drive family on it.
         zero_ns: the wall time at which the records' clock was 0, UTC in ns since 1970.
         started_s: what that clock showed when the daemon was started.
-        now_s: what that clock showed when it was asked for.
+        now_s: the time of that clock at the request.
         first_record: number of the first record, counted since the daemon started.
         lines: one record each.
         lost: how many records were overwritten while the pages were fetched.

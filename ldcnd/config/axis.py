@@ -35,7 +35,7 @@ class GainsConfig(Frozen):
     el: int = Field(gt=0, le=0x3FFF)
     """Position error, in counts, beyond which the drive opens its loop."""
     sr: int = Field(default=1, ge=1, le=0xFF)
-    """Servo rate divisor: the servo cycle is so many times 0.512 ms."""
+    """Servo rate divisor: the servo cycle is this number times 0.512 ms."""
     deadband: int = Field(default=0, ge=0, le=0xFF)
     """Added to the amplifier's output around zero."""
 
@@ -96,7 +96,7 @@ class PwmConfig(Frozen):
 
 
 class AnalogConfig(Frozen):
-    """Bounds of `move_analog` when the request names none; the daemon keeps them, the drive knows none."""
+    """Bounds of `move_analog` when the request names none; the daemon keeps them, the drive has none."""
 
     timeout_s: float = Field(default=10.0, gt=0, le=3600)
     """Longest motion, in seconds."""
@@ -143,7 +143,7 @@ class LossConfig(Frozen):
     bus: LossPolicy = LossPolicy.HALT
     """The line was lost; acts as soon as it is back and the drive still moves."""
     daemon: LossPolicy = LossPolicy.HALT
-    """The daemon is told to end."""
+    """The daemon is shut down."""
 
 
 class RatesConfig(Frozen):
@@ -226,7 +226,7 @@ come now and then."""
     """stop: the drive itself decelerates when a motion runs onto the limit switch ahead, also if the host is dead; \
 moving off a switch stays possible. Not for `track`, nor on drives that do not stop on their limit inputs."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
-    """A motion at constant velocity that no software limit ends is ended by the drive itself after so many seconds."""
+    """Time after which the drive itself ends a motion at constant velocity that no software limit ends, seconds."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
     """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
 daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""
@@ -282,7 +282,7 @@ class MovedAxisConfig(AxisConfig):
     """A drive that takes motion over its line."""
 
     reloadable: ClassVar[tuple[str, ...]] = ("limits", "velocity", "acceleration", "settle", "rates", "priority")
-    """Looked up anew by every command, or by the poller that is made when they change."""
+    """Read by every command, or by the poller that is made when they change."""
 
     velocity: float = Field(gt=0)
     """Velocity of moves that do not name one, units a second."""

@@ -50,7 +50,7 @@ class Rs485Config(Frozen):
     after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
     """From the last bit to switching the transmitter off."""
     receive_own: bool = False
-    """The receiver stays on while sending: on two wires the host then hears itself, see `echo`."""
+    """The receiver stays on while sending: on two wires the host then receives its own bytes, see `echo`."""
     terminate: bool = False
     """Switch on the terminating resistor of a port that has one."""
 
@@ -129,7 +129,7 @@ refuse, and skip where the drives' speed only shows on site."""
 
     @property
     def models(self) -> dict[int, str]:
-        """What is on the line, by address."""
+        """The modules on the line, by address."""
         return {axis.address: axis.model for axis in self.axis}
 
     @model_validator(mode="after")

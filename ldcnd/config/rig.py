@@ -45,14 +45,14 @@ class DaemonConfig(Frozen):
 
 
 class CapturesConfig(Frozen):
-    """What is kept of lines on which something has gone wrong: a drive's fault, a loss, a line that does not turn."""
+    """The captures of lines on which something has gone wrong: a drive's fault, a loss, a line that does not turn."""
 
     directory: Path | None = None
     """Where captures are written; `captures` in `state_dir` if that is set, else nothing is written."""
     files: int = Field(default=20, ge=1, le=10_000)
-    """So many at most; the oldest are deleted."""
+    """Maximum number; the oldest are deleted."""
     total_mb: int = Field(default=200, ge=1, le=100_000)
-    """So much disk space at most."""
+    """Maximum disk space."""
 
 
 class TelemetryConfig(Frozen):
@@ -76,7 +76,7 @@ class HeartbeatConfig(Frozen):
     half_period_ms: float = Field(default=50.0, ge=5.0, le=1000.0)
     """Time between two changes."""
     silence_ms: float = Field(default=500.0, ge=50.0, le=60_000.0)
-    """A line without any reply for so long holds the level; more than the longest pause between two of its polls."""
+    """Maximum time without any reply before a line holds the level; more than the longest pause of its polls."""
     lines: tuple[Name, ...] = ()
     """The lines that must work; all if none is named."""
 
@@ -88,7 +88,7 @@ class HeartbeatConfig(Frozen):
 
 
 class RigConfig(Frozen):
-    """A whole rig: what `ldcnd run` needs to know."""
+    """A whole rig: the configuration of `ldcnd run`."""
 
     rig: Name
     """Second chunk of every key; unique on the site."""

@@ -1,4 +1,4 @@
-"""What every simulated line has: a name, a seed, and what may go wrong on its wires; families add the drives."""
+"""The common part of simulated lines: a name, a seed, and what may go wrong on the wires; families add the drives."""
 
 from dataclasses import replace
 from typing import Self
@@ -14,7 +14,7 @@ class SimulatedFaultConfig(Frozen):
     """Something that may go wrong on the wires."""
 
     kind: FaultKind
-    """What happens."""
+    """The kind of the event."""
     probability: float = Field(default=1.0, ge=0, le=1)
     """Of it happening to one request or reply."""
     from_s: float = Field(default=0.0, ge=0)
@@ -49,7 +49,7 @@ class SimulatedLineConfig(Frozen):
     """One simulated line, used by `port = "sim:NAME"`; its family adds the drives."""
 
     name: Name
-    """What `port = "sim:NAME"` names."""
+    """The name in `port = "sim:NAME"`."""
     seed: int = 1
     """Of everything that is drawn by lot."""
     fault: tuple[SimulatedFaultConfig, ...] = ()

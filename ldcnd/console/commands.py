@@ -37,7 +37,7 @@ LEASE_COMMANDS: frozenset[type[Command[Frozen]]] = frozenset({Acquire, Renew, Re
 
 
 class StopScope(Frozen):
-    """What a page wants stopped."""
+    """The axes that a page stops."""
 
     axis: str | None = None
     """One axis; None means the rig."""
@@ -45,7 +45,7 @@ class StopScope(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """What the console writes on every command.
+    """The fields that the console adds to every command.
 
     Attributes:
         client: who sends it, whatever the page says.

@@ -1,4 +1,4 @@
-"""HTTP connections of the console: bounded in number and in time, so that a stop finds a way in whatever others do.
+"""HTTP connections of the console: bounded in number and in time, so that a stop is accepted whatever others do.
 
 uvicorn bounds the time between two requests only: a request of which half was sent would stay for ever.
 """

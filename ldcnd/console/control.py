@@ -21,7 +21,7 @@ from ldcnd.model.frozen import Frozen
 PAGE_HEADER = "x-ldcnd-page"
 MOST_AXES = 64
 WAITING_MESSAGES = 256
-"""More than a page can lose at once; one that does not read for so long is closed."""
+"""Maximum number of messages that wait for a page; one that does not read them is closed."""
 
 
 class ControlRequest(Frozen):
@@ -41,12 +41,12 @@ class ReleaseRequest(Frozen):
 
 
 class ControlReply(Frozen):
-    """What a page has control of, or has given up."""
+    """The axes that a page controls, or has given up."""
 
     client: str
     """The name under which it controls them."""
     axes: tuple[str, ...]
-    """As asked for."""
+    """As requested."""
 
 
 def control_routes(pages: Pages) -> list[BaseRoute]:

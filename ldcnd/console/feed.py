@@ -1,4 +1,4 @@
-"""Telemetry on its way to pages: those that ask for the same share a channel, and a slow one delays no other."""
+"""Telemetry on its way to pages: those with the same subscription share a channel, and a slow one delays no other."""
 
 import asyncio
 from collections import deque
@@ -14,13 +14,13 @@ from ldcnd.console.latest_values import LatestValues
 from ldcnd.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
 
 MOST_NEWS = 200
-"""A frame carries so many events at most, the latest."""
+"""Maximum number of events in a frame; the latest are kept."""
 
 _TRIPLE = b"\x93"
 
 
 class Batch:
-    """What a frame tells: keys whose values have changed, events, and samples of streams in order.
+    """The contents of a frame: keys whose values have changed, events, and samples of streams in order.
 
     Attributes:
         paths: whose latest values it carries, as they are when it is encoded.
@@ -65,20 +65,20 @@ DEFAULT_RATE_HZ = 10.0
 MOST_STREAMS = 64
 MOST_PAGES = 64
 WAITING_FRAMES = 4
-"""A page that does not read has so many frames waiting; then its oldest streams are dropped."""
+"""Maximum number of frames that wait for a page that does not read; then its oldest streams are dropped."""
 STREAMED_SAMPLES = 4096
-"""One frame carries so many samples of streams at most; the oldest give way."""
+"""Maximum number of streamed samples in a frame; the oldest are dropped."""
 SIGN_OF_LIFE_S = 1.0
-"""A frame comes at least so often, even with nothing in it."""
+"""Maximum time between two frames, even with nothing in them, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What a page wants to see.
+    """A page's subscription.
 
     Attributes:
         rigs: these only; none means all.
-        rate_hz: how often it is told of latest values.
+        rate_hz: rate of the frames with latest values.
         streams: paths of which it wants every sample.
     """
 
@@ -92,7 +92,7 @@ class Wish:
 
 
 def parse_wish(rigs: str, rate: str, stream: str) -> Wish:
-    """Return what a query asks for.
+    """Return the subscription of a query.
 
     Raises:
         MalformedRequest: it cannot be read.
@@ -130,7 +130,7 @@ class Page:
         self._ready.set()
 
     def offer(self, batch: Batch) -> None:
-        """Take what is to be told next."""
+        """Take the next frame."""
         if len(self._waiting) == WAITING_FRAMES:
             oldest = self._waiting.popleft()
             self._waiting[0] = self._waiting[0].after(oldest, streams=False)
@@ -150,7 +150,7 @@ class Page:
 
 
 class Channel:
-    """What all pages with one wish are told, and when."""
+    """Sends the frames to all pages with one subscription."""
 
     def __init__(self, values: LatestValues, wish: Wish) -> None:
         self.pages: list[Page] = []

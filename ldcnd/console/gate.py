@@ -1,6 +1,6 @@
 """The gate before everything else: which hosts, origins and visitors get through, and what every answer says.
 
-Nothing but `/static/` is given to strangers. What changes anything needs the visitor's cookie, a header that only the
+Only `/static/` is served without a visitor's cookie. What changes anything needs the cookie, a header that only the
 console's own pages can set, and the console's own origin; a WebSocket needs cookie and origin, because browsers let any
 page open one.
 """

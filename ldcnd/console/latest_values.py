@@ -28,7 +28,7 @@ _MAPS = frozenset({*range(0x80, 0x90), 0xDE, 0xDF})
 
 
 class Watcher(Protocol):
-    """Who wants to know what has changed; must not block."""
+    """Receives changes; must not block."""
 
     def changed(self, path: str, entry: bytes) -> None:
         """Learn that a key has another value, or none any more."""
@@ -38,7 +38,7 @@ class Watcher(Protocol):
 
 
 class _Kind(Enum):
-    """What a path carries."""
+    """The content of a path."""
 
     VALUE = "value"
     EVENT = "event"
@@ -47,7 +47,7 @@ class _Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """What is known of a path once and for all.
+    """The fixed properties of a path.
 
     Attributes:
         name: the path.
@@ -62,10 +62,10 @@ class _Path:
 
 
 class LatestValues:
-    """What pages show.
+    """The values that pages show.
 
     Attributes:
-        watchers: told of every change, in order.
+        watchers: called with every change, in order.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class LatestValues:
         self._newer: dict[str, set[str]] = {}
 
     def take(self, sample: Sample) -> None:
-        """Take what a daemon has published; samples of traces are left out, pages ask for them."""
+        """Take a published sample; samples of traces are left out, pages fetch them."""
         path = self._paths.get(sample.key) or self._new_path(sample.key)
         if path.kind is _Kind.LEFT_OUT:
             return
@@ -92,7 +92,7 @@ class LatestValues:
             watcher.happened(path.name, path.start + payload)
 
     def tell_of_rig(self, rig: str, told: Mapping[str, bool | str | None]) -> None:
-        """Replace what pages know about a rig itself."""
+        """Replace the state of a rig itself for pages."""
         key = f"{ROOT}/{rig}/{RIG_TOPIC}"
         self._put(self._paths.get(key) or self._new_path(key), msgpack.packb(told))
 
@@ -119,7 +119,7 @@ class LatestValues:
         return frozenset(name for name in self._entries if wanted(name))
 
     def entry(self, name: str) -> bytes:
-        """Return what pages are told of a path now."""
+        """Return the present entry of a path for pages."""
         return self._entries.get(name) or self._paths[f"{ROOT}/{name}"].start + _NIL
 
     def _put(self, path: _Path, payload: bytes) -> None:

@@ -41,12 +41,12 @@ LEASE_S = 3.0
 """The daemon acts so soon when this process dies."""
 HALT_TIME_S = 3.0
 REST_TIME_S = 15.0
-"""An axis that a page leaves behind has so long to come to rest; then its lease ends by itself, and `loss.client` of
+"""Time for an axis that a page leaves behind to come to rest; then its lease ends by itself, and `loss.client` of
 its configuration decides."""
 LOOK_EACH_S = 0.05
 HELD_S = 0.4
-"""A jog ends when the page says for so long nothing of the hand that holds it, and in the daemon when this process says
-nothing; pages say it each tenth of a second."""
+"""A jog ends after this time without a message that its button is held, in the daemon without one of this process;
+pages send one each tenth of a second."""
 MOST_PAGES = 64
 TOKEN_BYTES = 16
 
@@ -88,7 +88,7 @@ class ToPage(Frozen):
     """One message to a page on its web socket; the first has `page` and `client`, the others one of the rest."""
 
     page: str | None = None
-    """What its commands carry as `X-Ldcnd-Page`."""
+    """The value of `X-Ldcnd-Page` on its commands."""
     client: str | None = None
     """The name under which its commands go."""
     lost: Lost | None = None

@@ -1,4 +1,4 @@
-"""What pages may read: the rigs, traces, what faults mean, and telemetry."""
+"""Read access of pages: the rigs, traces, explanations of faults, and telemetry."""
 
 import asyncio
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from ldcnd.version import version
 
 STATIC = Path(str(files("ldcnd.console") / "static"))
 SEND_TIME_S = 30.0
-"""A page that takes nothing for so long is given up."""
+"""Time after which a page that takes nothing is given up, seconds."""
 NOTHING_TO_SAY = 1008
 
 _FAULT_PAGE = """<!doctype html>

@@ -1,4 +1,4 @@
-"""What the console answers that is no public model of the daemon."""
+"""Replies of the console that are no public model of the daemon."""
 
 from ldcnd.model.commands import ErrorReply, StopReply
 from ldcnd.model.frozen import Frozen
@@ -24,9 +24,9 @@ class RigReply(Frozen):
     buses: tuple[BusInfo, ...] = ()
     """Its lines."""
     plan: RigBudget | None = None
-    """What the lines promise."""
+    """The bus budgets of the lines."""
     commands: CommandList | None = None
-    """What can be asked of it."""
+    """The commands of the rig."""
 
 
 class EndpointReply(Frozen):
@@ -48,7 +48,7 @@ class RigsReply(Frozen):
     client: str
     """The name under which this browser's commands go."""
     endpoints: tuple[EndpointReply, ...]
-    """Where rigs are looked for."""
+    """The sessions of the console."""
     rigs: tuple[RigReply, ...]
     """By name."""
 
@@ -57,7 +57,7 @@ class StopsReply(Frozen):
     """`POST /api/stop`."""
 
     rigs: dict[str, StopReply | ErrorReply]
-    """What became of it, by rig."""
+    """The outcome of the stop, by rig."""
 
 
 class LinkReply(Frozen):

@@ -1,4 +1,4 @@
-"""What a page has sent, read whole within a time and a size; and the answer as JSON."""
+"""Reads a page's request whole within a time and a size, and builds the answer as JSON."""
 
 import asyncio
 
@@ -10,7 +10,7 @@ from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
 from ldcnd.model.frozen import Frozen
 
 BODY_TIME_S = 5.0
-"""A page has so long to send what it asks."""
+"""Maximum time to receive the body of a request, seconds."""
 
 
 async def body_of(request: Request) -> bytes:

@@ -12,11 +12,11 @@ from ldcnd.log import get_logger
 log = get_logger("console")
 
 ASK_AGAIN_S = 0.5
-"""A daemon that is there but did not answer is asked again so soon; behind a router it may not be heard at first."""
+"""Pause before the next query of a daemon that did not answer, seconds; behind a router it may be late at first."""
 LINGER_S = 0.016
-"""Samples are taken so many seconds' worth at a time; less than a frame at the highest rate."""
+"""Period in which samples are taken together, seconds; less than a frame at the highest rate."""
 DESCRIPTION_AGE_S = 1.0
-"""Pages that ask what a rig is get an answer that is so old at most, however many ask."""
+"""Maximum age of the description of a rig in a reply to pages, seconds, however many request it."""
 DESCRIBE_TIME_S = 4.0
 
 
@@ -73,7 +73,7 @@ class RigWatch:
 
     async def described(self) -> RigReply:
         """Return what the rig is now, or what it was when it was last there."""
-        async with self._describing:  # those who ask meanwhile take what the first one gets
+        async with self._describing:  # concurrent requests take the answer of the first one
             if self.connected and asyncio.get_running_loop().time() >= self._described_at_s + DESCRIPTION_AGE_S:
                 try:
                     await self._describe()
@@ -82,7 +82,7 @@ class RigWatch:
         return self._reply
 
     async def _follow(self) -> None:
-        """Ask the rig what it is whenever its daemon has come."""
+        """Query the description of the rig whenever its daemon has come."""
         while True:
             self._stirred.clear()
             if not self._instances:

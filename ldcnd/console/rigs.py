@@ -24,7 +24,7 @@ MOST_RIGS = 64
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where rigs are looked for.
+    """One session of the console.
 
     Attributes:
         name: in words.

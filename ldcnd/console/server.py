@@ -34,16 +34,16 @@ from ldcnd.listen_address import ListenAddress
 from ldcnd.messaging.zenoh_config import zenoh_config
 
 END_TIME_S = 1
-"""Open pages have so long to go when the console ends."""
+"""Time for open pages to close when the console ends, seconds."""
 SENT_BYTES = 64 * 1024
-"""The kernel keeps so much for a page that does not read: frames that it would show late."""
+"""Size of the kernel's send buffer for a page: frames in it would be shown late."""
 UNREAD_MS = 30_000
-"""The kernel gives up a page that takes nothing for so long."""
+"""Time after which the kernel gives up a page that takes nothing, milliseconds."""
 LONGEST_MESSAGE_BYTES = 1024
-"""What pages say on their web sockets is short."""
+"""Maximum size of a page's message on its web sockets."""
 PING_EACH_S = 1.0
 PONG_TIME_S = 4.0
-"""A browser answers for hidden pages, too; of one that does not answer for so long the pages are gone."""
+"""Time without answer after which a browser's pages are gone, seconds; a browser answers for hidden pages, too."""
 
 
 def build_app(
@@ -72,7 +72,7 @@ async def serve(settings: ConsoleSettings) -> None:
         ConfigError: the address, the certificate or what was said about Zenoh cannot be used.
     """
     for endpoint in settings.endpoints:
-        zenoh_config(endpoint.settings)  # what is wrong with it is told now, not tried for ever
+        zenoh_config(endpoint.settings)  # an error in it is raised now, not retried for ever
     loop = asyncio.get_running_loop()
     values = LatestValues()
     rigs = Rigs(values, settings.rigs)

@@ -16,10 +16,10 @@ EVERY_ADDRESS = frozenset({"0.0.0.0", "::"})  # noqa: S104 - what is listened on
 
 @dataclass(frozen=True, slots=True)
 class ConsoleSettings:
-    """What the console needs to run.
+    """The settings of the console.
 
     Attributes:
-        endpoints: where rigs are looked for.
+        endpoints: the Zenoh endpoints of its sessions.
         rigs: these only; none means all that are found.
         address: where to listen.
         hosts: names under which browsers reach it, beside the address.
@@ -39,7 +39,7 @@ class ConsoleSettings:
     as_json: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what would let strangers in.
+        """Refuse settings that would admit unauthorised visitors.
 
         Raises:
             ConfigError: says what is missing.
@@ -71,7 +71,7 @@ class ConsoleSettings:
 
     @property
     def known_hosts(self) -> tuple[str, ...]:
-        """What browsers may call the console."""
+        """The host names and addresses that browsers may use for the console."""
         loopback = LOOPBACK_NAMES if self.address.is_loopback else ()
         return (self.address.in_url, *self.hosts, *loopback)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 LINK_S = 600.0
 IDLE_S = 12 * 3600.0
-"""A browser that shows no page for so long needs another link."""
+"""Time without an open page after which a browser needs another link, seconds."""
 MOST_LINKS = 16
 MOST_VISITORS = 100
 TOKEN_BYTES = 32
@@ -21,7 +21,7 @@ class Visitor:
         number: in the order in which they came; commands go under the name `console-<number>`.
         token: what its cookie must have.
         csrf: what its commands must carry.
-        seen_at_s: when it was last heard of, or had a page open.
+        seen_at_s: time of its last request or open page.
     """
 
     number: int
@@ -81,7 +81,7 @@ class Visitors:
         return visitor
 
     def find(self, token: str) -> Visitor | None:
-        """Return the visitor whose cookie has this token, and note that it was heard of."""
+        """Return the visitor whose cookie has this token, and record the time."""
         now_s = self._now_s()
         self._visitors = [each for each in self._visitors if each.seen_at_s > now_s - IDLE_S]
         known = [each for each in self._visitors if _same(each.token, token)]

@@ -29,11 +29,11 @@ Value = float | int | str
 
 @dataclass(frozen=True, slots=True)
 class Put:
-    """What came of a put that was not refused.
+    """The outcome of a put that was not refused.
 
     Attributes:
         value: what the field shows now; None to leave it as it is.
-        end: what a client waits for that wants to know when the put has had its effect; None for nothing.
+        end: awaited by a client that waits for the put's effect; None for no wait.
     """
 
     value: Value | None = None
@@ -45,7 +45,7 @@ Action = Callable[[Value], Awaitable[Put]]
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """What a field is worth."""
+    """The alarm of a field."""
 
     status: AlarmStatus = AlarmStatus.NO_ALARM
     severity: AlarmSeverity = AlarmSeverity.NO_ALARM

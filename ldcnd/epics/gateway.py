@@ -18,9 +18,9 @@ from ldcnd.model.meta import AxisInfo
 LEASE_S = 1.0
 """The axes do what their `loss.client` says so soon after this program is gone, in seconds."""
 RETRY_S = 5.0
-"""Control that another program has is asked for again after so long, in seconds."""
+"""Pause before the next request for control that another program has, seconds."""
 SILENT_S = 5.0
-"""An axis of which nothing came for so long is shown as unknown, in seconds."""
+"""Time without samples after which an axis is shown as unknown, seconds."""
 MOTIONLESS = (1.0, 1.0)
 """Velocity and acceleration that are shown of what has none."""
 WHO = "epics gateway"
@@ -105,7 +105,7 @@ class Gateway:
     def _start_motion(self, work: Coroutine[object, object, None], name: str) -> asyncio.Future[None]:
         """Start what may fail without ending the gateway: the client that has put it learns of it."""
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        ended.add_done_callback(lambda future: future.cancelled() or future.exception())  # nobody may wait for it
+        ended.add_done_callback(lambda future: future.cancelled() or future.exception())  # perhaps without a waiter
 
         async def motion() -> None:
             try:

@@ -46,7 +46,7 @@ INPUTS = ("forward_limit", "reverse_limit", "index", "stop_input", "amplifier_en
 SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
 MSTA_PLUS, MSTA_DONE, MSTA_POSITION, MSTA_PROBLEM, MSTA_MOVING, MSTA_COMM = 0x1, 0x2, 0x100, 0x200, 0x400, 0x1000
 MSTA_GAIN, MSTA_HOMED, MSTA_HIGH_SWITCH, MSTA_LOW_SWITCH = 0x800, 0x4000, 0x4, 0x2000
-"""Bits of MSTA that the gateway knows."""
+"""Bits of MSTA that the gateway supports."""
 
 
 class MotorRecord:

@@ -15,7 +15,7 @@ from ldcnd.model.samples import LinkState
 SHORTEST_LATENCY_S = 64e-6
 """Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""
 FRESH_S = 5.0
-"""A report counts for so long: what is older says nothing about now."""
+"""Maximum age of a report that counts, seconds."""
 ERRORS = ("timeouts", "corrupt_replies", "rejected_packets", "resynchronisations", "stray_bytes", "losses")
 
 
@@ -121,6 +121,6 @@ class HealthCollector(Collector):
 
 
 def _buckets(counts: Sequence[int]) -> list[tuple[str, float]]:
-    """Return how many were at most so long, by limit; a daemon that tells no counts has none."""
+    """Return cumulative counts by upper limit; a daemon that reports no counts has none."""
     limits = [str(SHORTEST_LATENCY_S * 2.0**bucket) for bucket in range(len(counts) - 1)]
     return list(zip((*limits, "+Inf"), accumulate(counts or (0,)), strict=True))

@@ -39,7 +39,7 @@ async def metrics_server(registry: CollectorRegistry, host: str, port: int) -> A
                     writer.write_eof()
                     await reader.read()
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # who asks gets nothing
+            pass  # the client gets no answer
         finally:
             open_now -= 1
             writer.transport.abort()

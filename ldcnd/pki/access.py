@@ -1,6 +1,6 @@
 """Access rules: what a viewer and an operator may do, in the words of Zenoh's access control.
 
-Everything is denied that no rule allows. Readers may ask for `**`, because it covers neither `@cmd` nor `@stop`; the
+Everything is denied that no rule allows. Readers may query `**`, because it covers neither `@cmd` nor `@stop`; the
 rules for the way out decide what they get. Only the daemon may publish, answer, or show a token of a daemon.
 The rules see the neighbour on a link, not the origin of a message: behind a router they see the router.
 
@@ -15,7 +15,7 @@ from ldcnd.messaging.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_ST
 
 
 class Role(StrEnum):
-    """What a login is good for."""
+    """The purpose of a login."""
 
     VIEWER = "viewer"
     """Reads everything, and may stop."""
@@ -84,9 +84,9 @@ RULES = (*WATCH, *STOP, *COMMAND, *PRESENCE)
 PERMITTED: Mapping[Role, tuple[Rule, ...]] = {Role.VIEWER: (*WATCH, *STOP), Role.OPERATOR: RULES}
 """At a daemon that people connect to."""
 PERMITTED_BEHIND_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED, Role.ROUTER: CARRY}
-"""At a daemon that routers connect to as well: they have looked at who asks."""
+"""At a daemon that routers connect to as well: they have checked the client."""
 PERMITTED_AT_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED_BEHIND_ROUTER, Role.DAEMON: CARRY}
-"""At a router. Which rig a daemon speaks for is not looked at."""
+"""At a router. The rig of a daemon is not checked."""
 
 
 def access_control(

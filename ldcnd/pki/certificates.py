@@ -1,7 +1,7 @@
-"""Certificates: an authority that signs for one site, and what it signs; the only module that knows cryptography.
+"""Certificates: an authority that signs for one site, and what it signs; the only module that uses cryptography.
 
 A viewer's or operator's certificate is good for connecting only, so it cannot be used to pose as a daemon. There are no
-revocation lists, because Zenoh reads none: who may do what is told by the policy, by common name.
+revocation lists, because Zenoh reads none: the policy decides who may do what, by common name.
 """
 
 import datetime as dt

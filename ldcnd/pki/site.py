@@ -1,7 +1,7 @@
 """A site's folder: authority, roster, and one Zenoh configuration for each login, ready to be handed over.
 
 Each configuration holds its certificate and key, so it is one file, for any Zenoh program, and it is a secret. Those of
-daemons and routers hold the access rules as well; they are written anew whenever the roster changes.
+daemons and routers hold the access rules as well; they are rewritten whenever the roster changes.
 """
 
 import base64
@@ -40,11 +40,11 @@ class Login(Frozen):
     name: LoginName
     """The common name of its certificate, and of its files."""
     role: Role
-    """What it may do."""
+    """Its permissions."""
     hosts: tuple[str, ...] = ()
     """Where a daemon or a router can be found: host names and IP addresses."""
     revoked: bool = False
-    """It may do nothing any more. It stays on the roster, because its certificate lives on: a second login of this name
+    """It may do nothing any more. It stays on the roster, because its certificate is valid: a second login of this name
     would give the old certificate its rights back."""
 
 

@@ -1,4 +1,4 @@
-"""What a rig publishes, live in the Foxglove app: the same messages as in a recording.
+"""A rig's publications, live in the Foxglove app: the same messages as in a recording.
 
 Source: Foxglove WebSocket protocol, sub-protocol `foxglove.sdk.v1`. Read-only: nothing that a client of it may publish,
 call or set is offered, because one way to move a drive is enough.
@@ -50,7 +50,7 @@ class LiveView:
         self._server.stop()
 
     def take(self, sample: Sample) -> None:
-        """Show one value to those who look at its topic."""
+        """Show one value to the subscribers of its topic."""
         if sample.kind is SampleKind.DELETE:
             return
         try:

@@ -17,7 +17,7 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.recording.messages import Entry, schema_of
 
 CHUNK_BYTES = 1024 * 1024
-"""What is compressed and written together at most; `McapFile.flush` ends a chunk earlier."""
+"""Maximum size that is compressed and written together; `McapFile.flush` ends a chunk earlier."""
 PART = ".part"
 FACTS = "ldcnd.recording"
 """Name of the metadata that tell what is missing."""
@@ -41,7 +41,7 @@ class McapFile:
 
     @property
     def size_bytes(self) -> int:
-        """What was written so far."""
+        """Size of the written data, bytes."""
         return self._stream.tell()
 
     def attach(self, name: str, document: bytes, now_ns: int) -> None:
@@ -105,13 +105,13 @@ _NUMBERS = 2**32
 
 
 class Losses:
-    """Looks at the sequence number of each value of each key, in the order in which they came.
+    """Checks the sequence number of each value of each key, in the order in which they came.
 
     What was lost before the first value of a key, or after the last, leaves no gap and is not counted.
 
     Attributes:
         missing: how many values of each key are missing.
-        restarts: how often numbers of a key began anew, because its daemon was restarted.
+        restarts: how often numbers of a key restarted, because its daemon was restarted.
     """
 
     def __init__(self) -> None:

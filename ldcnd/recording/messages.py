@@ -1,6 +1,6 @@
-"""What a published value looks like to stock viewers: events are log messages, everything else is itself.
+"""Published values for stock viewers: events become log messages, everything else stays as it is.
 
-Source: Foxglove's message schemas, `foxglove.Log`; a viewer knows it by its name and shows the fields that it knows.
+Source: Foxglove's message schemas, `foxglove.Log`; a viewer finds it by its name and shows the fields that it supports.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ _ITEMS = {item.value: model for item, model in SAMPLE_MODELS.items()}
 
 @lru_cache(maxsize=4096)
 def model_of(key: str) -> type[Published] | None:
-    """Return what a key carries, or None for one that only a newer daemon knows."""
+    """Return the content type of a key, or None for one that only a newer daemon has."""
     _, _, kind, *rest = key.split("/")
     match kind, rest:
         case "tele", [_, "event"]:
@@ -86,7 +86,7 @@ LEVELS: Mapping[CommandStatus, LogLevel] = MappingProxyType(
         CommandStatus.UNKNOWN: LogLevel.ERROR,
     }
 )
-"""What is not here went as asked."""
+"""All other statuses went as requested."""
 
 
 class Instant(Frozen):
@@ -104,7 +104,7 @@ class LogMessage(Frozen):
     timestamp: Instant
     """When it happened."""
     level: LogLevel
-    """2 for what went as asked, 3 for what was refused or ended early, 4 for failures."""
+    """2 for what went as requested, 3 for what was refused or ended early, 4 for failures."""
     message: str
     """The event in one sentence."""
     name: str

@@ -18,9 +18,9 @@ from ldcnd.model.samples import AdcSample, FaultSample, MonitorSample, PositionS
 from ldcnd.recording.messages import LogMessage, axis_of, model_of
 
 _UNREADABLE = (McapError, ZstdError, struct.error, ValueError)
-"""What the package raises on bytes that make no sense; wrong checksums are a ValueError."""
+"""Exceptions of the package for bytes that make no sense; wrong checksums are a ValueError."""
 _SHORT = (EndOfFile, struct.error)
-"""What it raises on bytes that are not there."""
+"""Its exceptions for missing bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Recording:
 
     Attributes:
         path: where it is.
-        damages: what could not be read so far, in order.
+        damages: what could not be read, in order.
     """
 
     path: Path
@@ -108,13 +108,13 @@ class Series:
 
 
 class AxisHistory:
-    """What is known of one axis.
+    """The recorded description of one axis.
 
     Attributes:
         axis: its name.
         series: the quantities, in the order in which they were first published.
         events: what became of its commands, in order.
-        not_understood: how many messages were not what this version knows, such as those of a much older one.
+        not_understood: number of messages that this version cannot decode, such as those of a much older one.
         faults: from when to when a fault stood that stops the motor, UTC in ns since 1970; an end of None is not known.
     """
 

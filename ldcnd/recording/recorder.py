@@ -12,11 +12,11 @@ from ldcnd.recording.mcap_file import Losses, McapFile
 from ldcnd.recording.messages import entry_of
 
 FLUSH_PERIOD_S = 1.0
-"""What has come is put on the disk so often: a recorder that is killed loses no more."""
+"""Period of writes to the disk, seconds: a recorder that is killed loses no more."""
 LINGER_S = 0.1
-"""Samples are taken in batches of so long: waking up for each costs as much as recording it."""
+"""Duration of a batch of samples, seconds: waking up for each costs as much as recording it."""
 KEPT_SAMPLES = 16_384
-"""So many samples may wait for a slow disk, for about 8 s of a line of 31 axes."""
+"""Maximum number of samples that wait for a slow disk, about 8 s of a line of 31 axes."""
 
 
 class Recorder:
@@ -26,7 +26,7 @@ class Recorder:
         path: the first file; those that follow have a number before the suffix.
         descriptions: of the rig, in JSON, attached to every file, by name.
         now_ns: the wall clock, UTC in ns since 1970.
-        rotate_bytes: a file that has so many bytes is followed by the next one.
+        rotate_bytes: size of a file at which the next one follows.
 
     Attributes:
         messages: how many values were recorded.
@@ -63,7 +63,7 @@ class Recorder:
 
     @property
     def summary(self) -> str:
-        """What was recorded, and what was not, in one sentence for a person."""
+        """The samples recorded and lost, in one sentence for a person."""
         missing = self.losses.missing.total()
         parts = [f"{self.messages} messages", f"{missing} missing" if missing else "none missing in between"]
         if self.too_slow:
@@ -99,7 +99,7 @@ class Recorder:
             raise self._problem
 
     def take(self, sample: Sample) -> None:
-        """Record one value; news that a key has none any more are left out. What goes wrong ends `run`."""
+        """Record one value; deletions of keys are left out. An error ends `run`."""
         if sample.kind is SampleKind.DELETE or self._problem:
             return
         try:
@@ -132,6 +132,6 @@ class Recorder:
         return file
 
     def _facts(self) -> dict[str, str]:
-        """Return what is to be known of the recording so far, for a file."""
+        """Return the facts of the recording until now, for a file."""
         counts = {"messages": self.messages, "too_slow": self.too_slow, "not_understood": self.not_understood}
         return {name: str(count) for name, count in counts.items()} | self.losses.facts()

@@ -12,7 +12,7 @@ from ldcnd.recording.reading import Damage, Recording
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What was saved.
+    """The result of a recovery.
 
     Attributes:
         messages: how many.
@@ -63,7 +63,7 @@ class _Copy:
         self._has_facts = False
 
     def add(self, record: McapRecord) -> None:
-        """Copy one record; what only helps to find others is made anew."""
+        """Copy one record; indexes are rebuilt."""
         match record:
             case Schema() if record.id not in self._schemas:
                 self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)

@@ -18,14 +18,14 @@ OWN_TIME = "t"
 """Left out, because it is the first column already."""
 
 BLOCK_ROWS = 1000
-"""So many rows of a table are written together: a rig may have more topics than a process may have open files."""
+"""Rows of a table that are written together: a rig may have more topics than a process may have open files."""
 
 Cell = int | float | str | bool | None
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written.
+    """The tables written.
 
     Attributes:
         tables: the files.

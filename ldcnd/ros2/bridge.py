@@ -26,7 +26,7 @@ from ldcnd.ros2.graph import Node, Publisher, advertise
 SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": math.tau}
 """Metres or radians in a unit; axes in other units have no joint."""
 FRESH_NS = 200_000_000
-"""A velocity accompanies a position when it is at most so much older."""
+"""Maximum age of a velocity relative to the position that it accompanies."""
 PERIOD_S = 1.0
 """Between two reports on all axes, in seconds."""
 SILENT_NS = 5_000_000_000
@@ -35,7 +35,7 @@ OK, WARN, ERROR, STALE = range(4)
 
 
 class Bridge:
-    """What is known of a rig's axes, as messages.
+    """The axes of a rig, as messages.
 
     Attributes:
         joints: the axes that are joints.

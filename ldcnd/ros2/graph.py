@@ -24,7 +24,7 @@ class Node:
     Attributes:
         domain: the ROS domain, 0 to 232.
         name: of the node.
-        session_id: names the session that it lives in, in hexadecimal.
+        session_id: names its session, in hexadecimal.
     """
 
     domain: int

@@ -68,7 +68,7 @@ def _verdict(glance: RigGlance) -> str:
     if wrong := glance.count(Severity.WRONG):
         return f"not working: {wrong}"
     if notices := glance.count(Severity.NOTICE):
-        return f"to look at: {notices}"
+        return f"notices: {notices}"
     return "nothing is wrong"
 
 

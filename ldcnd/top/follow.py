@@ -8,11 +8,11 @@ from ldcnd.model.rig_commands import ListHolders
 from ldcnd.top.rig_view import RigView, described
 
 LOOK_S = 1.0
-"""So often the daemon is asked what it is and who controls what; everything else it publishes by itself."""
+"""Period of queries for the daemon's description and the holders of leases; everything else it publishes by itself."""
 
 
 async def follow(client: RigClient, view: RigView) -> None:
-    """Feed a view until cancelled; a daemon that does not answer is asked again."""
+    """Feed a view until cancelled; a daemon that does not answer is queried again."""
     loop = asyncio.get_running_loop()
     async with client.published(lambda sample: view.take(sample, loop.time())):
         instance = None
@@ -26,5 +26,5 @@ async def follow(client: RigClient, view: RigView) -> None:
                 holders = await client.ask(ListHolders())
                 view.describe(described(daemon, await client.axes(), holders))
             except LdcndError:
-                pass  # the view tells since when nothing was heard of it
+                pass  # the view shows how long the daemon has been silent
             await asyncio.sleep(LOOK_S)

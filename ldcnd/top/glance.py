@@ -6,10 +6,10 @@ from ldcnd.model.trouble import Severity
 
 
 class Glance(Frozen):
-    """What every row tells."""
+    """The common fields of rows."""
 
     severity: Severity
-    """How much it asks for attention."""
+    """The severity of the trouble."""
     trouble: str
     """What is wrong, in words; empty when nothing is."""
 
@@ -38,11 +38,11 @@ class AxisGlance(Glance):
     quality: Quality | None
     """How much the position is worth."""
     age_s: float | None
-    """The position came so many seconds ago."""
+    """Age of the position, seconds."""
     rate_hz: float | None
     """How often the position came in the last second."""
     rate_wanted_hz: float | None
-    """How often the configuration asks for it."""
+    """The configured rate."""
     link: LinkState | None
     """Whether the drive answers."""
     holder: str | None
@@ -65,7 +65,7 @@ class BusGlance(Glance):
     resent: int
     """Exchanges sent again, since then."""
     poll_p99_s: float | None
-    """99 % of its polls were over so many seconds after they were due."""
+    """99 % of its polls ended within this time after they were due, seconds."""
     stop_longest_s: float | None
     """The longest that a stop has taken."""
 

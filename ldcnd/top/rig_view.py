@@ -1,4 +1,4 @@
-"""The latest of everything that a rig publishes, and what it comes to at a glance; knows no terminal and no clock.
+"""The latest values that a rig publishes, and their summary; uses no terminal and no clock.
 
 Samples are kept as they come and decoded when they are shown: a rig publishes many more than are read.
 """
@@ -27,14 +27,14 @@ from ldcnd.model.trouble import Severity, axis_troubles, line_troubles
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 SILENT_S = 3.0
-"""A daemon that has not reported for so long, three reports, is said to be silent."""
+"""Time without a report after which a daemon is shown as silent: three reports."""
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What the daemon said when it was asked.
+    """The daemon's last answers to queries.
 
     Attributes:
         daemon: itself.
@@ -62,7 +62,7 @@ class _Kept:
 
 
 class RigView:
-    """What is known of one rig.
+    """The known state of one rig.
 
     Args:
         rig: its name.

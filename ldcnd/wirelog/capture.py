@@ -22,7 +22,7 @@ _FACT = re.compile(r"# (\w+): (.+)")
 
 
 class CaptureHeader(Frozen):
-    """What a capture is of."""
+    """The origin of a capture."""
 
     format: Literal[1] = 1
     """Version of the text's format."""
@@ -41,9 +41,9 @@ class CaptureHeader(Frozen):
     zero_ns: int
     """The wall time at which the records' clock was 0, UTC in ns since 1970."""
     started_s: float
-    """What the records' clock showed when the daemon was started, in seconds."""
+    """The time of the records' clock when the daemon was started, in seconds."""
     until_s: float
-    """What the records' clock showed when the capture was made, in seconds."""
+    """The time of the records' clock when the capture was made, in seconds."""
     first_record: int = Field(ge=0)
     """Number of the first record; 0 when nothing that happened since the daemon started is missing."""
     cause: str = "asked for"

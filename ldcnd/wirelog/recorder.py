@@ -15,14 +15,14 @@ from ldcnd.errors import MalformedRequest
 KEPT_S = 300.0
 KEPT_BYTES = 16_000_000
 RECORD_BYTES = 200
-"""What a record takes besides its bytes, roughly: a tuple, a float, the object that holds the bytes."""
+"""Memory of a record besides its bytes, roughly: a tuple, a float, the object that holds the bytes."""
 AT_ONCE_REMARK = " at once"
 """Ends the remark of a packet that waited for the reply before it."""
 _NOTE = " # "
 
 
 class WireEvent(StrEnum):
-    """What happened on the wire."""
+    """The kind of a record."""
 
     SENT = "sent"
     RECEIVED = "received"
@@ -43,11 +43,11 @@ class WireEvent(StrEnum):
     POLLED = "polled"
     """An axis is polled from now on; named in the remark."""
     COMMAND = "command"
-    """A client asked for something; not on the wire, but why what follows is on it."""
+    """A client's request; not on the wire, but the cause of what follows on it."""
 
 
 ARRIVALS = frozenset({WireEvent.RECEIVED, WireEvent.PART, WireEvent.STRAY, WireEvent.ECHO})
-"""What came from the far end, each record in one piece."""
+"""Records from the far end, each in one piece."""
 
 
 WireEntry = tuple[float, WireEvent, bytes, str]

@@ -7,7 +7,7 @@ what it sent, in the same order: the first packet that is not ends the replay wi
 A host in the field takes time for everything and is held up now and then. What it did because of a reply follows it in
 the log: such a reply is delivered when that was done. How late it woke up for its timers is up to the event loop.
 
-What clients asked for is no packet, but a cause of packets: it is handed out again at its place between them.
+A client's request is no packet, but a cause of packets: it is handed out again at its place between them.
 """
 
 import asyncio
@@ -23,14 +23,14 @@ from ldcnd.transport.transport import Receiver, Transport
 from ldcnd.wirelog.recorder import ARRIVALS, AT_ONCE_REMARK, WireEvent, WireRecord
 
 PATIENCE_S = 1.0
-"""The host is given so long for a packet after the instant at which it sent it then; opening may take longer."""
+"""Time for the host to send a packet after the instant at which it sent it then, seconds; opening may take longer."""
 OPENING_PATIENCE_S = 15.0
 
 _FROM_OUTSIDE = ARRIVALS | {WireEvent.LOST, WireEvent.COMMAND}
 _ANY_TIME = frozenset({WireEvent.COMMAND, WireEvent.STRAY})
-"""What may as well come a little later: the host that was recorded took time for everything, this one takes none."""
+"""Events that may come a little later: the recorded host took time for everything, this one takes none."""
 _DECIDED_THERE = frozenset({WireEvent.TIMEOUT, WireEvent.RESYNC, WireEvent.SETTLED, WireEvent.POLLED})
-"""What the host made of it all; it decides again."""
+"""Decisions of the recorded host; this one decides again."""
 
 
 class Coming(Protocol):
@@ -49,7 +49,7 @@ class Replay:
     Args:
         records: from the opening of the line on, oldest first.
         until_s: when the capture ends, on the records' clock.
-        ask: carries out what a client asked for, as it stands in the journal; must not block.
+        ask: carries out a client's request, as it stands in the journal; must not block.
         shift_s: loop time less the records' time.
         fixed_baud: the port could not change its rate.
         slow_host: the host took time for what it did, as all do that are real.
@@ -114,7 +114,7 @@ class Replay:
     # -- what the host does ------------------------------------------------------------------------------------------
 
     def sent(self, data: bytes) -> None:
-        """Take a packet; nobody answers once the capture is over."""
+        """Take a packet; not answered once the capture is over."""
         if self.ended.done():
             return
         if self._take(WireEvent.SENT, lambda record: record.data == data, f"{WireEvent.SENT} {data.hex(' ')}"):

@@ -103,7 +103,7 @@ async def test_two_daemons_of_one_rig_are_a_problem_until_one_goes():
 async def test_a_daemon_that_does_not_answer_is_asked_again_until_it_does():
     async with watching() as site, site.daemon("sim", mute=True) as session:
         async with asyncio.timeout(30):
-            while not (await site.shown("sim", connected=False)).problem.startswith("nobody serves"):
+            while not (await site.shown("sim", connected=False)).problem.startswith("no daemon serves"):
                 await asyncio.sleep(0.05)
         info = DaemonInfo(
             rig="sim", version="1", api=1, instance="i1", started=1, encoding="json", axes=(), buses=()
