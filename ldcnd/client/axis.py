@@ -290,12 +290,12 @@ class Axis(AxisVerbs, Watched):
             )
 
     def _silent(self) -> SessionError:
-        return SessionError(f"axis {self.name}: nothing was heard of it yet", axis=self.name)
+        return SessionError(f"axis {self.name}: nothing was received from it yet", axis=self.name)
 
     def _repr_html_(self) -> str:
         """Return what is known of it as a table, for notebooks."""
         if self._state is None or self._position is None:
-            return table(f"axis {self.name}", [("not heard of yet",)])
+            return table(f"axis {self.name}", [("no sample received yet",)])
         state, position = self.state, self.position
         rows = [
             ("position", position),
@@ -308,7 +308,7 @@ class Axis(AxisVerbs, Watched):
 
     def __repr__(self) -> str:
         if self._state is None or self._position is None:
-            return f"<axis {self.name}: not heard of yet>"
+            return f"<axis {self.name}: no sample received yet>"
         return f"<axis {self.name}: {self.position}, {self.state}>"
 
 

@@ -215,7 +215,7 @@ class Motion:
             while self._under_way():
                 if not await self._axis.news(SILENT_S):
                     raise OutcomeUnknown(
-                        f"axis {self._axis.name}: nothing was heard of it for {SILENT_S:g} s", axis=self._axis.name
+                        f"axis {self._axis.name}: nothing was received from it for {SILENT_S:g} s", axis=self._axis.name
                     )
             try:
                 outcome = await self._axis.outcome(self.command_id)

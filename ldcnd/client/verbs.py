@@ -310,7 +310,7 @@ class AxisVerbs(ABC):
         )
 
     async def list_parameters(self) -> ParameterList:
-        """List what is known of the drive's parameters; asks nothing of the drive."""
+        """List what is known of the drive's parameters; sends nothing to the drive."""
         return await self._send(ListParameters)
 
     async def read_parameter(self, parameter: str, *, unlisted: bool = False) -> ParameterReply:
@@ -340,7 +340,7 @@ class AxisVerbs(ABC):
         Args:
             parameter: Its number, such as Pn100, or the manual's name in any case.
             value: The new value, a word without sign.
-            memory: RAM forgets at power-off; EEPROM endures 10,000 writes and must be asked for by name.
+            memory: RAM is lost at power-off; EEPROM endures 10,000 writes and must be requested by name.
             unlisted: Allow a number that the manual does not list.
             confirm_unit: The unit number that the drive will have after its next power-on, when this write changes it.
         """
@@ -359,7 +359,7 @@ class AxisVerbs(ABC):
         return await self._send(lambda: ClearCounter(counter=counter))
 
     async def restart_eeprom_count(self, *, writes: int = 0) -> EepromCount:
-        """Count EEPROM writes anew, because the drive was replaced; nothing is sent to it.
+        """Restart the count of EEPROM writes, because the drive was replaced; nothing is sent to it.
 
         Args:
             writes: Writes that the drive which is there now has taken already; 0 for a new one.
@@ -371,7 +371,7 @@ class AxisVerbs(ABC):
         return await self._send(ReadAlarms)
 
     async def read_profile(self) -> DriveProfile:
-        """Tell how the drive is taken to behave, assumptions included; asks nothing of the drive."""
+        """Return the drive's assumed behaviour, with its assumptions; sends nothing to the drive."""
         return await self._send(ReadProfile)
 
     async def read_monitors(self, *, monitors: tuple[MonitorName, ...] = ()) -> MonitorReport:
@@ -396,8 +396,8 @@ class AxisVerbs(ABC):
             values: The wanted words, by number such as Pn100. The unit number in Pn000 is not taken from here.
             driver_type: 8800H of the drive that the values come from; with another type, or none, there is a problem.
             any_type: Take values of another or of an unknown type of drive.
-            memory: RAM: for trying out, without what takes effect at power-on; EEPROM: for good; null: for good, and in
-                use at once where that is possible.
+            memory: RAM: for trying out, without what takes effect at power-on; EEPROM: permanent; null: permanent and
+                in use at once where that is possible.
         """
         return await self._send(
             lambda: PlanParameters(values=values, driver_type=driver_type, any_type=any_type, memory=memory)

@@ -19,15 +19,15 @@ _AXIS = (*commands.COMMANDS, *parameters.COMMANDS, *traces.COMMANDS)
 AXIS_COMMANDS: Mapping[Verb, type[AxisCommand[CommandReply]]] = MappingProxyType(
     {verb: command for verb in Verb for command in _AXIS if command.verb == verb and issubclass(command, AxisCommand)}
 )
-"""What an axis can be told, by verb."""
+"""Commands of an axis, by verb."""
 AXIS_QUESTIONS: Mapping[str, type[Command[Frozen]]] = MappingProxyType(
     {command.verb: command for command in _AXIS if not issubclass(command, AxisCommand)}
 )
-"""What the daemon answers about an axis without asking its drive, by verb."""
+"""Queries about an axis that the daemon answers without an exchange, by verb."""
 RIG_COMMANDS: Mapping[str, type[Command[Frozen]]] = MappingProxyType(
     {command.verb: command for command in rig_commands.COMMANDS}
 )
-"""What the rig as a whole can be told and asked, by verb."""
+"""Commands and queries of the rig as a whole, by verb."""
 COMMANDS: tuple[type[Command[Frozen]], ...] = (
     *AXIS_COMMANDS.values(),
     *AXIS_QUESTIONS.values(),
@@ -37,13 +37,13 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
 BY_VERB: Mapping[About, Mapping[str, type[Command[Frozen]]]] = MappingProxyType(
     {about: MappingProxyType({each.verb: each for each in COMMANDS if each.about is about}) for about in About}
 )
-"""What the last chunk of a command key stands for, in keys of axes and in those of the rig."""
+"""Commands by the last chunk of their key, in keys of axes and in those of the rig."""
 RENAMED: Mapping[str, str] = MappingProxyType({"plan": "preview"})
 """Verbs of before, and what they are called now."""
 
 
 def verbs_for(*capabilities: Capability) -> frozenset[Verb]:
-    """Return what a drive with these capabilities can be told."""
+    """Return the commands of a drive with these capabilities."""
     return frozenset(verb for verb, command in AXIS_COMMANDS.items() if command.capability in capabilities)
 
 

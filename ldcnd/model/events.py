@@ -1,4 +1,4 @@
-"""What has happened: who moved what, when, with which result."""
+"""Events of commands: who moved what, when, with which result."""
 
 from enum import StrEnum
 
@@ -21,11 +21,11 @@ class CommandStatus(StrEnum):
     """How far a command has got; the last five are final."""
 
     ACCEPTED = "accepted"
-    """Admitted: not refused so far."""
+    """Admitted: not refused yet."""
     EXECUTING = "executing"
     """The drive acknowledged it."""
     DONE = "done"
-    """It ended as it was asked."""
+    """It ended as requested."""
     ABORTED = "aborted"
     """Another command, a stop or a loss policy ended it early."""
     REFUSED = "refused"
@@ -55,17 +55,17 @@ class CommandEvent(Frozen):
     seq: int = Field(ge=0)
     """Grows by one with every event of the axis."""
     run: str
-    """The run of the daemon, as in `meta/daemon`: with another one, numbers begin anew."""
+    """The run of the daemon, as in `meta/daemon`: with another one, numbers restart."""
     number: int = Field(ge=0)
-    """Grows by one with every event of the rig: a gap is filled by asking for what is missing."""
+    """Grows by one with every event of the rig: a gap is filled by a request for what is missing."""
     axis: str
     """The axis."""
     command_id: str
     """Which command."""
     verb: str
-    """What was asked; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
+    """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
     motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
-    reset or that another program has changed: nobody asked for these."""
+    reset or that another program has changed: these have no request."""
     client: str | None
     """The client, as it calls itself; not authenticated."""
     login: str | None = None
@@ -74,7 +74,7 @@ class CommandEvent(Frozen):
     status: CommandStatus
     """How far it has got."""
     reason: str | None = None
-    """Why, when it did not end as asked."""
+    """Why, when it did not end as requested."""
     code: str | None = None
     """The error code, when there is one."""
     position: float | None = None
@@ -86,18 +86,18 @@ class CommandEvent(Frozen):
 
 
 class CommandOutcome(Frozen):
-    """What became of a command: the reply to `@cmd/_/outcome`."""
+    """The outcome of a command: the reply to `@cmd/_/outcome`."""
 
     command_id: str
     """Which command."""
     axis: str
     """The axis."""
     verb: str
-    """What was asked."""
+    """The verb of the command."""
     status: CommandStatus
     """How far it has got."""
     reason: str | None
-    """Why, when it did not end as asked."""
+    """Why, when it did not end as requested."""
     position: float | None = None
     """As in the event of its end."""
     following_error: float | None = None
@@ -112,17 +112,17 @@ class EventList(Frozen):
     run: str
     """The run of the daemon that they are of."""
     first_number: int = Field(ge=0)
-    """From here on nothing was left out; above what was asked for when that is forgotten."""
+    """From here on nothing was left out; above the requested number when that was discarded."""
     next_number: int = Field(ge=0)
-    """Where to ask on."""
+    """First number of the next request."""
     end_number: int = Field(ge=0)
     """The number of the event that comes next."""
     events: tuple[CommandEvent, ...]
-    """What has happened."""
+    """The events."""
 
 
 class ReadOutcome(Command[CommandOutcome]):
-    """Ask what became of a command."""
+    """Query the outcome of a command."""
 
     verb = "outcome"
     about = About.RIG
@@ -133,7 +133,7 @@ class ReadOutcome(Command[CommandOutcome]):
 
 
 class ReadEvents(Command[EventList]):
-    """Ask for events: the latest, or those from a number on."""
+    """Query events: the latest, or those from a number on."""
 
     verb = "events"
     about = About.RIG
@@ -142,6 +142,6 @@ class ReadEvents(Command[EventList]):
     axis: str | None = None
     """Only this axis."""
     count: int = Field(default=100, ge=1, le=1000)
-    """At most so many, and never more than one reply takes."""
+    """Maximum number, and never more than one reply takes."""
     from_number: int | None = Field(default=None, ge=0)
     """The first of these and later ones; the latest when missing."""

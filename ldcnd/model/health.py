@@ -10,7 +10,7 @@ from ldcnd.model.samples import LinkState
 
 
 class LaneHealth(Frozen):
-    """What waits and how long it takes in one lane of a line."""
+    """Waiting exchanges and latency of one lane of a line."""
 
     lane: Literal["stop", "command", "poll", "background"]
     """Stops go before commands, commands before polls, background work comes last."""
@@ -19,7 +19,7 @@ class LaneHealth(Frozen):
     exchanges: int = Field(ge=0)
     """Replies since the daemon started."""
     p50_s: float = Field(ge=0)
-    """Half of them came within so many seconds after they were queued (polls: after they were due)."""
+    """Half of them came within this time after they were queued (polls: after they were due), in seconds."""
     p99_s: float = Field(ge=0)
     """The same for 99 %."""
     longest_s: float = Field(ge=0)
@@ -37,7 +37,7 @@ class ItemHealth(Frozen):
     item: str
     """Last chunk of its key."""
     asked_hz: float = Field(ge=0)
-    """How often the drive is asked for it."""
+    """Its polling rate."""
     granted_hz: float = Field(ge=0)
     """How often it was published in the last period."""
 
@@ -65,13 +65,13 @@ class AxisHealth(Frozen):
     sample_age_s: float | None = Field(ge=0)
     """Age of the latest position, in seconds; null before the first."""
     rate_wanted_hz: float = Field(ge=0)
-    """How often the configuration asks for the position."""
+    """The configured rate of the position."""
     rate_hz: float = Field(ge=0)
     """How often it was published in the last period."""
     faults: int = Field(ge=0)
     """Faults that stand now."""
     items: tuple[ItemHealth, ...] = ()
-    """What it is asked for; empty for a drive family that paces itself."""
+    """Its polled items; empty for a drive family that paces itself."""
     eeprom_writes: int | None = Field(default=None, ge=0)
     """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
 
@@ -100,7 +100,7 @@ class BusHealth(Frozen):
     resent: int = Field(ge=0)
     """Exchanges sent again."""
     resynchronisations: int = Field(ge=0)
-    """How often the line was fenced."""
+    """How often the line was resynchronised."""
     stray_bytes: int = Field(ge=0)
     """Bytes that belong to no request."""
     losses: int = Field(ge=0)
@@ -108,7 +108,7 @@ class BusHealth(Frozen):
     lanes: tuple[LaneHealth, ...]
     """The most urgent first."""
     stop_wait: StopWaitHealth
-    """What a stop would have to wait."""
+    """How long a stop would have to wait."""
     axes: tuple[AxisHealth, ...]
     """The axes on the line."""
 
@@ -140,7 +140,7 @@ class DaemonHealth(Frozen):
     waiting_queries: int = Field(default=0, ge=0)
     """Queries that have no answer yet: questions, commands and stops."""
     dropped: int = Field(default=0, ge=0)
-    """Queries that were refused for being too many, and news of clients that were lost, since the daemon started."""
+    """Queries that were refused for being too many, and lost changes of clients' presence, since the daemon started."""
     heartbeat: HeartbeatHealth | None = None
     """The heartbeat; None where none is configured."""
 
@@ -150,7 +150,7 @@ class Verdict(StrEnum):
 
     FINE = "fine"
     LOOK = "look"
-    """Nothing is wrong for certain, but it deserves a look."""
+    """Nothing is wrong for certain, but it deserves attention."""
     WRONG = "wrong"
     """It must be put right before the line is used."""
 

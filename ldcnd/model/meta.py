@@ -1,4 +1,4 @@
-"""What describes a rig to those who have never heard of it: served under `meta/`."""
+"""The description of a rig for clients without prior knowledge: served under `meta/`."""
 
 from enum import StrEnum
 from typing import Literal
@@ -37,7 +37,7 @@ class CommandInfo(Frozen):
     verb: str
     """Last chunk of the key."""
     key: str
-    """Where to ask: `@cmd/<axis>/<verb>`, or `@cmd/_/<verb>` when it concerns the rig."""
+    """Key of the request: `@cmd/<axis>/<verb>`, or `@cmd/_/<verb>` when it concerns the rig."""
     summary: str
     """What it does."""
     request_schema: str
@@ -50,7 +50,7 @@ class CommandList(Frozen):
     """All commands and all error codes: `meta/commands`."""
 
     commands: tuple[CommandInfo, ...]
-    """What can be asked."""
+    """The commands and queries."""
     errors: tuple[str, ...]
     """Every code that an error reply can carry."""
     encodings: tuple[str, ...]
@@ -63,7 +63,7 @@ class ModuleInfo(Frozen):
     address: int
     """Node address."""
     title: str
-    """What it is."""
+    """Its title in the profile."""
     model: str | None
     """Model name as in the configuration; null for an unknown device: it is never moved."""
     device_id: int
@@ -92,7 +92,7 @@ class BusInfo(Frozen):
     problem: str
     """Why it is not up; empty while it is."""
     remarks: tuple[str, ...]
-    """What deserves a look although it is up."""
+    """What deserves attention although it is up."""
     started_by: Literal["reset", "adoption"] | None = None
     """Whether the drives were reset, so that positions count from 0, or taken over as they were; null while down."""
     modules: tuple[ModuleInfo, ...] = ()
@@ -110,7 +110,7 @@ class BusInfo(Frozen):
     resent: int
     """Exchanges sent again."""
     resynchronisations: int
-    """How often the line was fenced."""
+    """How often the line was resynchronised."""
     stray_bytes: int
     """Bytes that belong to no request."""
     losses: int
@@ -118,19 +118,19 @@ class BusInfo(Frozen):
     wire_busy_s: float
     """Seconds for which bytes were on the wire."""
     poll_p99_s: float
-    """99 % of all polls were complete within so many seconds after they were due."""
+    """99 % of all polls were complete within this time after they were due, in seconds."""
     command_p99_s: float
     """The same for commands, from queueing."""
     stop_p50_s: float
-    """Half of all stops had their reply within so many seconds; the bound is in `meta/budget`."""
+    """Half of all stops had their reply within this time, in seconds; the bound is in `meta/budget`."""
     stop_p99_s: float
-    """99 % of all stops had their reply within so many seconds."""
+    """99 % of all stops had their reply within this time, in seconds."""
     stop_longest_s: float
     """The longest time from queueing a stop to its reply."""
 
 
 class Provenance(StrEnum):
-    """How the daemon knows a register that cannot be read back."""
+    """The source of the daemon's copy of a register that cannot be read back."""
 
     WRITTEN_AND_ACKNOWLEDGED = "written_and_acknowledged"
     """This daemon wrote it and the drive acknowledged."""
@@ -178,7 +178,7 @@ class PastFault(Frozen):
 
 
 class AxisInfo(Frozen):
-    """What an axis is: served on `meta/axes/<axis>`."""
+    """The description of an axis: served on `meta/axes/<axis>`."""
 
     axis: str
     """Its name, the chunk in every key."""
@@ -199,7 +199,7 @@ class AxisInfo(Frozen):
     direction: str
     """forward or reverse: the sign between counts and units."""
     modulo: float | None = None
-    """A rotary axis: positions repeat after so many axis units; null for others."""
+    """A rotary axis: positions repeat after this distance, in axis units; null for others."""
     limits: AxisLimits
     """Software limits in axis units."""
     limit_stop: Literal["high", "low"] | None = None
@@ -219,6 +219,6 @@ class AxisInfo(Frozen):
     priority: PollPriority = "normal"
     """How its polls fare while its line cannot carry all of them."""
     registers: tuple[RegisterInfo, ...] = ()
-    """What the drive's write-only registers hold, as far as the daemon knows."""
+    """The contents of the drive's write-only registers, as far as they are known to the daemon."""
     past_faults: tuple[PastFault, ...] = ()
     """The latest faults, oldest first; with a `state_dir` also those before the daemon was started."""

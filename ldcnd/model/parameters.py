@@ -1,4 +1,4 @@
-"""What a drive with readable parameters says about them, about its alarms and about itself."""
+"""Models of a drive with readable parameters: the parameters, its alarms and its identity."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -20,7 +20,7 @@ class Memory(StrEnum):
     RAM = "ram"
     """The value in use; lost at power-off."""
     EEPROM = "eeprom"
-    """The value for good; the memory endures a limited number of writes."""
+    """The permanent value; the memory endures a limited number of writes."""
 
 
 class CounterName(StrEnum):
@@ -89,7 +89,7 @@ class ParameterValue(Frozen):
     stored: int = Field(ge=0, le=0xFFFF)
     """The value in EEPROM."""
     eeprom_writes: int | None
-    """So many times this daemon has written it to EEPROM; null when no ledger is kept."""
+    """How often this daemon has written it to EEPROM; null when no ledger is kept."""
     eeprom_total: int | None = None
     """EEPROM writes of the drive, all parameters together: this is what its life of 10,000 counts."""
 
@@ -105,9 +105,9 @@ class ParameterReply(CommandReply):
     value: ParameterValue
     """What both memories hold now."""
     written: bool = False
-    """The drive was told to change; false also for a write that found the value there already."""
+    """A write was sent to the drive; false also for a write that found the value there already."""
     remarks: tuple[str, ...] = ()
-    """What deserves a look."""
+    """What deserves attention."""
 
 
 class DriveFacts(Frozen):
@@ -183,7 +183,7 @@ class CounterReply(CommandReply):
 
 
 class EepromCount(CommandReply):
-    """The count of a drive's EEPROM writes after it was begun anew."""
+    """The count of a drive's EEPROM writes after the count was restarted."""
 
     previous: int
     """Writes counted for the drive that was there before, all parameters together."""
@@ -260,11 +260,11 @@ class MonitorReport(CommandReply):
     """Monitors of a drive, read one after the other."""
 
     readings: tuple[MonitorReading, ...]
-    """In the order in which they were asked for; those that the drive does not have are left out."""
+    """In the order of the request; those that the drive does not have are left out."""
 
 
 class ListParameters(AxisCommand[ParameterList]):
-    """List what is known of the drive's parameters; asks nothing of the drive."""
+    """List what is known of the drive's parameters; sends nothing to the drive."""
 
     verb = Verb.LIST_PARAMETERS
     effect = Effect.QUESTION
@@ -313,7 +313,7 @@ class PlanParameters(AxisCommand[ParameterPlan]):
     any_type: bool = False
     """Take values of another or of an unknown type of drive."""
     memory: Memory | None = None
-    """RAM: for trying out, without what takes effect at power-on; EEPROM: for good; null: for good, and in use at once
+    """RAM: for trying out, without what takes effect at power-on; EEPROM: permanent; null: permanent and in use at once
     where that is possible."""
 
 
@@ -329,7 +329,7 @@ class WriteParameter(AxisCommand[ParameterReply]):
     value: int = Field(ge=0, le=0xFFFF)
     """The new value, a word without sign."""
     memory: Memory = Memory.RAM
-    """RAM forgets at power-off; EEPROM endures 10,000 writes and must be asked for by name."""
+    """RAM is lost at power-off; EEPROM endures 10,000 writes and must be requested by name."""
     unlisted: bool = False
     """Allow a number that the manual does not list."""
     confirm_unit: int | None = Field(default=None, ge=0, le=15)
@@ -348,7 +348,7 @@ class ClearCounter(AxisCommand[CounterReply]):
 
 
 class RestartEepromCount(AxisCommand[EepromCount]):
-    """Count EEPROM writes anew, because the drive was replaced; nothing is sent to it."""
+    """Restart the count of EEPROM writes, because the drive was replaced; nothing is sent to it."""
 
     verb = Verb.RESTART_EEPROM_COUNT
     capability = Capability.PARAMETERS
@@ -368,7 +368,7 @@ class ReadAlarms(AxisCommand[AlarmReport]):
 
 
 class ReadProfile(AxisCommand[DriveProfile]):
-    """Tell how the drive is taken to behave, assumptions included; asks nothing of the drive."""
+    """Return the drive's assumed behaviour, with its assumptions; sends nothing to the drive."""
 
     verb = Verb.READ_PROFILE
     effect = Effect.QUESTION

@@ -66,7 +66,7 @@ class BusPlan(Frozen):
     mean_load: float
     """The same on average."""
     commands_per_s: float
-    """So many evenly spaced commands fit in without making a poll miss its turn."""
+    """Evenly spaced commands a second that fit in without making a poll miss its turn."""
     stop_wait_s: float
     """From a stop's arrival to its first bit, at the latest, while no reply is lost."""
     stop_s: float
@@ -74,7 +74,7 @@ class BusPlan(Frozen):
     stop_after_loss_s: float
     """To the end of the drive's reply when the exchange before it is lost."""
     stop_probe_hz: float
-    """So often it is measured how long a stop would wait; counted in the load."""
+    """How often the wait of a stop is measured by a stop probe; counted in the load."""
     holds: bool
     """No poll can come too late."""
     overload: str
@@ -82,7 +82,7 @@ class BusPlan(Frozen):
     remedies: tuple[str, ...]
     """The smallest changes that would make it hold; empty when it does."""
     polls: tuple[PollPlan, ...]
-    """What is asked of it."""
+    """The polls of the line."""
 
     @property
     def stops(self) -> bool:

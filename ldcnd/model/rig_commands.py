@@ -1,4 +1,4 @@
-"""What the rig as a whole can be asked: leases, moves of several axes, loss drills, what was on a line."""
+"""Commands of the rig as a whole: leases, moves of several axes, loss drills, wire logs."""
 
 from enum import StrEnum
 from typing import Annotated, Literal
@@ -23,7 +23,7 @@ class LeaseReply(Frozen):
     axes: tuple[str, ...]
     """The axes it covers."""
     lease_s: float
-    """It ends so many seconds after the daemon received this request, unless renewed."""
+    """Its duration from the daemon's receipt of this request, in seconds, unless renewed."""
 
 
 class Acquire(Command[LeaseReply]):
@@ -33,7 +33,7 @@ class Acquire(Command[LeaseReply]):
     about = About.RIG
 
     client: str = Field(min_length=1, max_length=64)
-    """Who asks: a name for people, shown to others and in the log."""
+    """The requester: a name for people, shown to others and in the log."""
     axes: tuple[str, ...] = ()
     """Which axes, or groups of them; none means all."""
     lease_s: float = Field(default=1.0, ge=SHORTEST_LEASE_S, le=60)
@@ -67,7 +67,7 @@ class Release(Command[LeaseReply]):
     lease: str
     """As the reply to acquire named it."""
     leave_running: bool = False
-    """Let what moves go on to its own end, without anyone in control."""
+    """Let what moves go on to its own end, without a holder of control."""
 
 
 class Holder(Frozen):
@@ -89,7 +89,7 @@ class HolderList(Frozen):
 
 
 class ListHolders(Command[HolderList]):
-    """Ask who controls what."""
+    """Query who controls what."""
 
     verb = "holders"
     about = About.RIG
@@ -172,7 +172,7 @@ class PreviewTogetherReply(Frozen):
 
 
 class PreviewTogether(GroupMoves, Command[PreviewTogetherReply]):
-    """Ask what `move_together` would do; no effect. Refused where that would be for its values."""
+    """Preview `move_together`; no effect. Refused where that would be for its values."""
 
     verb = "preview_together"
     about = About.RIG
@@ -187,7 +187,7 @@ class SpeedOverrideReply(Frozen):
     changed: tuple[str, ...]
     """Axes whose motion under way goes on at another velocity."""
     halted: tuple[str, ...]
-    """Axes that were told to halt, because it is 0."""
+    """Axes that were commanded to halt, because it is 0."""
 
 
 class SetSpeedOverride(Command[SpeedOverrideReply]):
@@ -202,7 +202,7 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     percent: float = Field(ge=0, le=100)
     """Of every velocity; 100 when the daemon starts. Set-points of `track` and duties of `set_pwm` are not scaled."""
     client: str | None = Field(default=None, max_length=64)
-    """Who asks, for the log."""
+    """The requester, for the log."""
     leases: tuple[str, ...] = Field(default=(), max_length=64)
     """The sender's leases. To raise the override they must cover every axis of which a motion would need one; lowering
     it needs none."""
@@ -279,9 +279,9 @@ class IoReply(Frozen):
 
 
 class SetIo(Command[IoReply]):
-    """Set outputs of an I/O module; what is left out stays as it is. What they switch, the daemon does not know.
+    """Set outputs of an I/O module; what is left out stays as it is. The daemon has no information on what they switch.
 
-    They keep what they were told when the daemon or its client ends: nothing in the module watches over them.
+    They keep their state when the daemon or its client ends: the module has no watchdog.
     """
 
     verb = "set_io"
@@ -388,7 +388,7 @@ class WireLogReply(Frozen):
     first_record: int = Field(ge=0)
     """Number of the first record in `lines`; records are counted since the daemon started."""
     next_record: int = Field(ge=0)
-    """Number of the record behind the last one in `lines`: ask from here for more."""
+    """Number of the record behind the last one in `lines`: first number of the next request."""
     end_record: int = Field(ge=0)
     """Number that the next record to happen will get; equal to `next_record` when this reply has all."""
     lines: tuple[str, ...]
@@ -396,7 +396,7 @@ class WireLogReply(Frozen):
 
 
 class ReadWireLog(Command[WireLogReply]):
-    """Ask what was on a line in the last seconds."""
+    """Query the records of a line in the last seconds."""
 
     verb = "wire_log"
     about = About.RIG

@@ -143,7 +143,7 @@ class LatchSample(Sample):
 
 
 class IoSample(Sample):
-    """What the lines of an I/O module show, and what they were told; published under the name of the module."""
+    """The lines of an I/O module, and its outputs; published under the name of the module."""
 
     levels: tuple[bool, ...]
     """Levels of the lines, the first is line 1; true is high. Outputs show their pins, too."""
@@ -191,7 +191,7 @@ class CurrentCommand(Frozen):
     command_id: str
     """As given in the reply that accepted it."""
     verb: str
-    """What was asked."""
+    """The verb of the command."""
     since: int
     """When it was accepted, UTC in ns since 1970."""
     target: float | None = None
@@ -208,7 +208,7 @@ class StateSample(Sample):
     enabled: bool
     """The position loop is closed."""
     referenced: bool
-    """The position means something: the axis was homed or told where it is since its drive was last reset, and neither
+    """The position is valid: the axis was homed or its position was set since its drive was last reset, and neither
     the link nor the encoder was lost since then, nor has the counter wrapped."""
     moving: Moving
     """Whether it moves; unknown when the drive does not answer."""
@@ -217,9 +217,9 @@ class StateSample(Sample):
     stop_latched: bool
     """A stop is latched; only reset clears it."""
     stop_pending: bool = False
-    """A stop was asked for and the drive has not confirmed it: it is sent again until it does, and nothing moves."""
+    """A stop was requested and the drive has not confirmed it: it is sent again until it does, and nothing moves."""
     command: CurrentCommand | None
-    """What it is doing."""
+    """The command under way."""
     last_error: str | None = None
     """Why the last command ended other than done, until the next command is accepted."""
     speed_override: float = Field(default=100.0, ge=0, le=100)
@@ -278,7 +278,7 @@ _ITEMS = frozenset(item.value for item in TelemetryItem)
 
 
 def sample_model(item: str) -> type[Sample] | None:
-    """Return what an item such as `position` or `monitor/speed_feedback` is; None for one that only others know."""
+    """Return the model of an item such as `position` or `monitor/speed_feedback`; None for one unknown here."""
     if item.startswith("monitor/"):
         return MonitorSample
     return SAMPLE_MODELS[TelemetryItem(item)] if item in _ITEMS else None

@@ -19,9 +19,9 @@ MOST_CHANNELS = 8
 MOST_SAMPLES = 10_000
 LONGEST_WAIT_S = 3600.0
 ARMING_S = 30.0
-"""A slow drive is told and asked some twenty words before its trace begins, in seconds."""
+"""Maximum time to arm a trace, in seconds: a slow drive needs some twenty exchanges before it begins."""
 ENDING_S = 10.0
-"""A slow drive needs so long to leave its trace, in seconds."""
+"""Maximum time of a slow drive to leave its trace, in seconds."""
 
 
 class TriggerKind(StrEnum):
@@ -142,7 +142,7 @@ class TraceHeader(Sample):
     """A trace without its samples; `t` is the instant of offset 0: the trigger, or the first sample without one."""
 
     trace_id: str
-    """The id of the command that asked for it."""
+    """The id of the command that requested it."""
     axis: str
     """The axis."""
     source: TraceSource
@@ -158,13 +158,13 @@ class TraceHeader(Sample):
     samples: int = Field(ge=0)
     """How many samples were granted; how many there are once it is complete."""
     pre_trigger: int = Field(ge=0)
-    """So many of them lie before the trigger."""
+    """Number of samples before the trigger."""
     trigger: TraceTrigger | None = None
     """What it waits or has waited for."""
     trigger_index: int | None = None
     """The sample at which the trigger was detected."""
     trigger_late_s: float = Field(default=0.0, ge=0)
-    """The trigger condition was met at most so long before it was detected, in seconds: 2 ms by a drive's recorder; by
+    """Maximum time between the trigger condition and its detection, in seconds: 2 ms by a drive's recorder; by
     the host, whose trace begins after it, the time from one poll to the first sample."""
     missed: int = 0
     """Polls of a trace by the host that brought no sample."""
@@ -194,7 +194,7 @@ class TraceChunk(Sample):
 
 
 class TraceReply(CommandReply):
-    """The trace is armed; values are as granted, and may differ from what was asked for."""
+    """The trace is armed; values are as granted, and may differ from the request."""
 
     trace_id: str
     """Names the trace in its header and chunks."""
@@ -207,7 +207,7 @@ class TraceReply(CommandReply):
     samples: int
     """How many samples there will be."""
     pre_trigger: int
-    """So many of them before the trigger."""
+    """Number of them before the trigger."""
 
 
 class TraceAbortReply(CommandReply):
@@ -231,7 +231,7 @@ class TakeTrace(AxisCommand[TraceReply]):
     samples: int = Field(default=500, ge=2, le=MOST_SAMPLES)
     """How many samples; a drive's own recorder always takes as many as it has room for."""
     pre_trigger: int = Field(default=0, ge=0)
-    """So many of them before the trigger; ignored without one."""
+    """Number of them before the trigger; ignored without one."""
     full_scale: Mapping[str, Annotated[float, Field(gt=0)]] = {}
     """Largest magnitude expected of a channel, in its unit: a drive's recorder that can resolves it finer. Put back
     after the trace."""

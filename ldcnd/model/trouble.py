@@ -1,4 +1,4 @@
-"""What is wrong with a line or an axis, in words: the one overview that daemon, console, fleet and command line share.
+"""Troubles of a line or an axis, in words: the one overview that daemon, console, fleet and command line share.
 
 The console's script says it in the same words (`console/static/parts/problems.js`; a test compares).
 """
@@ -12,13 +12,13 @@ from ldcnd.model.health import AxisHealth
 from ldcnd.model.samples import AxisState, FaultEntry, LinkState, TelemetryItem
 
 ENOUGH = 0.9
-"""A rate counts as kept from this share of the one that is asked for on."""
+"""Minimum share of the requested rate at which a rate counts as kept."""
 EDGE_HZ = 1.0
 """A report is about one second, at whose edges it sees a sample more or less."""
 
 
 class Severity(IntEnum):
-    """How much something asks for attention; the highest is shown first."""
+    """The priority of a trouble; the highest is shown first."""
 
     FINE = 0
     NOTICE = 1
@@ -28,7 +28,7 @@ class Severity(IntEnum):
 
 
 class Kind(Enum):
-    """What a trouble is about."""
+    """The kind of a trouble."""
 
     UNKNOWN = auto()
     STOP_PENDING = auto()
@@ -48,7 +48,7 @@ class Trouble:
 
     Attributes:
         kind: what it is about.
-        severity: how much it asks for attention.
+        severity: its priority.
         text: what it is, without a name: the axis or the line goes before it.
     """
 
@@ -58,7 +58,7 @@ class Trouble:
 
 
 class State(Protocol):
-    """What is known of an axis: a state sample, or the daemon's own knowledge."""
+    """The known state of an axis: a state sample, or the daemon's own knowledge."""
 
     @property
     def link(self) -> LinkState:
@@ -99,7 +99,7 @@ _NOT_CONFIRMED = Trouble(
     "a stop is NOT confirmed by the drive: use the machine's emergency stop",
 )
 _NO_ANSWER = Trouble(Kind.NO_ANSWER, Severity.WRONG, "the drive does not answer")
-_NEVER_SEEN = Trouble(Kind.UNKNOWN, Severity.NOTICE, "nothing was heard of it yet")
+_NEVER_SEEN = Trouble(Kind.UNKNOWN, Severity.NOTICE, "nothing was received from it yet")
 _LATCHED = Trouble(Kind.STOP_LATCHED, Severity.NOTICE, "a stop is latched: nothing moves before reset")
 _MISSED_POLLS = Trouble(Kind.MISSED_POLLS, Severity.NOTICE, "the drive missed its latest polls")
 
@@ -121,7 +121,7 @@ def axis_troubles(
     """Return what is wrong with an axis, the worst first; empty when nothing is.
 
     Of an axis that does not answer, nothing else is said but a stop that it has not confirmed: what was known of it may
-    be over. How its last command ended is news, not a state: it is told only where it is why the axis is in error stop.
+    be over. How its last command ended is an event, not a state: it is given only where it explains an error stop.
 
     Args:
         state: its last state; None before the first.
@@ -158,7 +158,7 @@ def _told(entry: FaultEntry) -> str:
 
 
 def _slowness(health: AxisHealth) -> list[Trouble]:
-    """Compare with what the drive is asked for."""
+    """Compare the rate of positions with the configured one."""
     asked = {item.item: item.asked_hz for item in health.items}
     wanted_hz = asked.get(TelemetryItem.POSITION, health.rate_wanted_hz)
     if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:

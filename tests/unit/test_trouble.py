@@ -64,7 +64,7 @@ def test_an_axis_that_is_well_has_none():
 
 
 def test_what_was_never_heard_of_is_a_doubt():
-    assert said(axis_troubles(None, None, None)) == notice("nothing was heard of it yet")
+    assert said(axis_troubles(None, None, None)) == notice("nothing was received from it yet")
 
 
 def test_a_line_that_is_not_up_is_wrong_and_says_why_where_that_is_known():
