@@ -13,10 +13,10 @@ from ldcnd.version import version
 EXIT_STATUS = tuple((str(code), f"{meaning[:1].upper()}{meaning[1:]}.") for code, meaning in EXIT_CODES.items())
 INTRODUCTION = """# Command line
 
-`ldcnd COMMAND --help` says the same, and so do the man pages of the Debian package. Every command that asks a daemon
+`ldcnd COMMAND --help` says the same, and so do the man pages of the Debian package. Every command that uses a daemon
 takes the options for finding it besides its own. This page is written by `ldcnd schema cli`.
 
-The shell completes commands, options, axes of the daemon and fault codes once it is told so, in `~/.bashrc`:
+The shell completes commands, options, axes of the daemon and fault codes with this line in `~/.bashrc`:
 `eval "$(_LDCND_COMPLETE=bash_source ldcnd)"`; zsh and fish likewise, with `zsh_source` and `fish_source`.
 
 | exit code | meaning |
@@ -69,7 +69,7 @@ def as_markdown() -> str:
             parts.append(f"{'###' if depth else '##'} `{title}`\n")
             parts.append("\n\n".join(entry.paragraphs) + "\n")
             if entry.asks_a_daemon:
-                parts.append("Asks a daemon: [options](#finding-the-daemon).\n")
+                parts.append("Uses a daemon: [options](#finding-the-daemon).\n")
             if entry.options:
                 parts.append(_table(entry.options))
     return "\n".join(parts)

@@ -85,7 +85,7 @@ def command(
 
 
 async def serve(rig: RigConfig, load: Callable[[], RigConfig], console: ListenAddress | None = None) -> None:
-    """Serve one rig until a signal asks to end; SIGHUP has its configuration read again."""
+    """Serve one rig until a signal ends it; SIGHUP has its configuration read again."""
     async with open_daemon(rig) as daemon:
         service = Service(daemon, Notifier(), load)
         terminal = Terminal()

@@ -46,7 +46,7 @@ rig = "rig"
 def command(port: str, family: str | None, file: Path | None, *, give_addresses: bool, as_json: bool) -> None:
     """Find out which drives are on PORT, at which rate and in which state; no daemon may use it meanwhile.
 
-    Listens, then asks addresses 1 to 32, or units 0 to F, at every rate: 10 to 20 seconds. It only reads: nothing
+    Listens, then probes addresses 1 to 32, or units 0 to F, at every rate: 10 to 20 seconds. It only reads: nothing
     moves, nothing is reset, nothing gets an address, unless --address says so. Exits with 1 when no drive is found.
     """
     configure_logging(level="error")  # findings say the rest

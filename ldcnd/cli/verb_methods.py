@@ -47,7 +47,7 @@ class AxisVerbs(ABC):
 
     @abstractmethod
     async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
-        """Ask the daemon about the axis."""
+        """Query the daemon about the axis."""
 '''
 
 

@@ -39,7 +39,7 @@ class RigReport(Frozen):
     instance: str
     """The run of the daemon."""
     daemon: DaemonInfo | None
-    """What the daemon says about itself; null when it shows its token and does not answer."""
+    """The daemon's description; null when it shows its token and does not answer."""
     health: DaemonHealth | None
     """How its process is doing; null before the first report."""
     buses: tuple[BusHealth, ...] = ()
@@ -47,7 +47,7 @@ class RigReport(Frozen):
     axes: tuple[AxisReport, ...] = ()
     """Its axes, in the order of lines and addresses."""
     problems: tuple[str, ...] = ()
-    """What somebody should look at; empty when all is well."""
+    """Problems that need attention; empty when all is well."""
 
 
 async def survey(session: Session, rig: str | None = None) -> tuple[RigReport, ...]:
@@ -112,7 +112,7 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
 
 
 def _silent(rig: str, instance: str) -> RigReport:
-    problem = "is alive and does not answer: frozen, or this login may not ask it"
+    problem = "is alive and does not answer: frozen, or this login may not query it"
     return RigReport(rig=rig, instance=instance, daemon=None, health=None, problems=(problem,))
 
 

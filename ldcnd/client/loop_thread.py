@@ -16,7 +16,7 @@ class LoopThread:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
 
-    # Any: what a coroutine yields and is sent is nobody's business but the loop's
+    # Any: what a coroutine yields and is sent concerns the loop only
     def start(self, work: Coroutine[Any, Any, ResultT]) -> concurrent.futures.Future[ResultT]:
         """Run a coroutine without waiting for it; cancelling the future cancels it."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)

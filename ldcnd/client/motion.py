@@ -221,7 +221,7 @@ class Motion:
                 outcome = await self._axis.outcome(self.command_id)
             except UnknownCommand:
                 raise OutcomeUnknown(
-                    f"axis {self._axis.name}: the daemon was restarted; it does not know how {self.reply.verb} went",
+                    f"axis {self._axis.name}: the daemon was restarted; it has no outcome of {self.reply.verb}",
                     axis=self._axis.name,
                 ) from None
             if outcome.status in FINAL:

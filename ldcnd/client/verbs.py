@@ -81,7 +81,7 @@ class AxisVerbs(ABC):
 
     @abstractmethod
     async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
-        """Ask the daemon about the axis."""
+        """Query the daemon about the axis."""
 
     async def power(self, *, on: bool) -> CommandReply:
         """Close or open the position loop; nothing moves.

@@ -189,7 +189,7 @@ class AxisConfig(Frozen):
     direction: Literal["forward", "reverse"] = "forward"
     """reverse: forward in axis units is backward in encoder counts."""
     modulo: float | None = Field(default=None, gt=0)
-    """A rotary axis: positions repeat after so many axis units, such as 360. It turns without an end, and takes no
+    """A rotary axis: positions repeat after this distance in axis units, such as 360. It turns endlessly, and takes no
     position limits."""
     velocity: float = Field(default=0.0, ge=0)
     """Velocity of moves that do not name one, units a second; 0 for a drive that takes no motion over its line."""

@@ -108,8 +108,8 @@ async def _release_all(page: PageControl, rig: str, axes: Iterable[str]) -> None
 async def _serve(socket: WebSocket, page: PageControl, waiting: asyncio.Queue[ToPage]) -> None:
     """Speak with the page until its web socket closes, by it, by the keep-alive's time-out or for nonsense."""
     async with asyncio.TaskGroup() as group:
-        telling = group.create_task(_tell(socket, waiting), name="page is told")
-        hearing = group.create_task(_hear(socket, page), name="page is heard")
+        telling = group.create_task(_tell(socket, waiting), name="send to page")
+        hearing = group.create_task(_hear(socket, page), name="receive from page")
         telling.add_done_callback(lambda _: hearing.cancel())
         hearing.add_done_callback(lambda _: telling.cancel())
     if not hearing.cancelled() and not hearing.result():

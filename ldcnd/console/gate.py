@@ -97,9 +97,9 @@ class Gate:
             return _stranger(scope["path"])
         if scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS:
             if headers.get("origin") != f"{self._scheme}://{host}":
-                return _refusal(403, "this is not asked by a page of this console (Origin)")
+                return _refusal(403, "this request is not from a page of this console (Origin)")
             if scope["type"] == "http" and not is_csrf_of(visitor, headers.get(CSRF_HEADER, "")):
-                return _refusal(403, "this is not asked by a page of this visitor (X-Ldcnd-Csrf)")
+                return _refusal(403, "this request is not from a page of this visitor (X-Ldcnd-Csrf)")
         scope.setdefault("state", {})["visitor"] = visitor
         return None
 

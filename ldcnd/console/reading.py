@@ -118,7 +118,7 @@ async def _serve(socket: WebSocket, page: Page, seen: Callable[[], None]) -> Non
     """Send frames until the page goes, takes nothing, or says anything: there is nothing that it may say here."""
     async with asyncio.TaskGroup() as group:
         listening = group.create_task(socket.receive(), name="page listens")
-        sending = group.create_task(_send(socket, page, seen), name="page is told")
+        sending = group.create_task(_send(socket, page, seen), name="send to page")
         listening.add_done_callback(lambda _: sending.cancel())
         sending.add_done_callback(lambda _: listening.cancel())
     if not listening.cancelled() and listening.result()["type"] == "websocket.receive":

@@ -16,7 +16,7 @@ class RigReply(Frozen):
     connected: bool
     """Its daemon is there."""
     problem: str | None
-    """What is wrong with that, in words."""
+    """The problem of the connection, in words."""
     daemon: DaemonInfo | None = None
     """None before it was ever there; the others likewise."""
     axes: tuple[AxisInfo, ...] = ()

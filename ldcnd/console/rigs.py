@@ -101,7 +101,7 @@ class Rigs:
         self._note(endpoint, problem=None)
         async with asyncio.TaskGroup() as group:
 
-            def told(rig: str, instance: str, alive: bool) -> None:  # noqa: FBT001 - told by the client
+            def told(rig: str, instance: str, alive: bool) -> None:  # noqa: FBT001 - called by the client
                 if self._wanted and rig not in self._wanted:
                     return
                 watch = self._watches.get(rig)

@@ -5,7 +5,7 @@ from enum import StrEnum
 
 
 class StartPolicy(StrEnum):
-    """What may be done to a line whose state nobody knows."""
+    """How a line in an unknown state is started."""
 
     RESET = "reset"
     """The drives are reset: what moves loses its torque, positions count from 0."""

@@ -287,7 +287,7 @@ class ZenohSession(Session):
                 await workers.run(ask, timeout_s, lambda _: None)
                 await collector.done.wait()
         except zenoh.ZError as error:
-            raise SessionError(f"{key}: cannot ask: {error}") from error
+            raise SessionError(f"{key}: cannot query: {error}") from error
         except TimeoutError:
             if not collector.items:
                 raise zenoh_failures.no_answer(key, timeout_s) from None

@@ -71,7 +71,7 @@ class Recorder:
         if self.not_understood:
             parts.append(f"{self.not_understood} not understood")
         if self.losses.restarts:
-            parts.append(f"{self.losses.restarts} topics began anew after a restart of the daemon")
+            parts.append(f"{self.losses.restarts} topics began again after a restart of the daemon")
         return "; ".join(parts)
 
     def end(self) -> None:

@@ -11,7 +11,7 @@ class Glance(Frozen):
     severity: Severity
     """The severity of the trouble."""
     trouble: str
-    """What is wrong, in words; empty when nothing is."""
+    """The worst trouble, in words; empty when there is none."""
 
 
 class AxisGlance(Glance):
@@ -78,7 +78,7 @@ class RigGlance(Frozen):
     version: str | None
     """Of its daemon; null when none answers."""
     trouble: str
-    """What concerns the rig as a whole; empty when nothing is wrong."""
+    """Troubles of the rig as a whole; empty when there are none."""
     axes: tuple[AxisGlance, ...]
     """All of them."""
     buses: tuple[BusGlance, ...]

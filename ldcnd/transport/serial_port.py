@@ -318,7 +318,7 @@ def _open(settings: SerialSettings) -> _Serial:
     )
     try:
         if settings.exclusive:
-            # pyserial's lock binds only those who ask for it; this one refuses every other user's open
+            # pyserial's lock binds only programs that use it; this one refuses every other user's open
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
         _settle_rates(port, settings)
         _settle_direction(port, settings)

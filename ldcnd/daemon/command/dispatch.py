@@ -263,7 +263,9 @@ class Dispatcher:
             entry = self._ledger.get(entry.command_id)
         if isinstance(entry.answer, CommandReply):
             return entry.answer
-        raise entry.answer or OutcomeUnknown(f"axis {entry.axis}: nobody knows how {entry.verb} went", axis=entry.axis)
+        raise entry.answer or OutcomeUnknown(
+            f"axis {entry.axis}: the outcome of {entry.verb} is unknown", axis=entry.axis
+        )
 
     def _admit(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:
         """Refuse a command that is stale, late or sent by another client; return its sender, if it names one."""

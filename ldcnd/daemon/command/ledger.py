@@ -89,7 +89,7 @@ class Ledger:
         entry = self._entries.get(command_id)
         if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
             raise CommandIdReused(
-                f"command id {command_id!r} was taken before and its answer is forgotten; it is not carried out again",
+                f"command id {command_id!r} was taken before, its answer is not kept; it is not carried out again",
                 axis=axis,
                 value=command_id,
                 remedy=Remedy("{}; give every command an id of its own", step("events", "look at the events")),

@@ -469,4 +469,4 @@ def _dialect(to: Destination[ReplyT]) -> Profile:
 
 def _require_sc(to: Destination[ReplyT], what: str) -> None:
     if not _dialect(to).sc_extensions:
-        raise NotSupported(f"{_dialect(to).title} does not know {what}")
+        raise NotSupported(f"{_dialect(to).title} does not support {what}")

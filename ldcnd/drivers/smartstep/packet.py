@@ -143,7 +143,7 @@ def decode_reply(packet: bytes) -> Reply:
     try:
         status = ResponseStatus(code)
     except ValueError:
-        raise BadReply(f"{packet!r} carries response status {code:X}, which the manual does not know") from None
+        raise BadReply(f"{packet!r} carries response status {code:X}, which the manual does not list") from None
     return Reply(unit, status, address, data)
 
 

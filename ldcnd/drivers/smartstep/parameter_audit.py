@@ -9,7 +9,7 @@ from ldcnd.model.parameters import Memory, ParameterValue
 
 
 class ParameterAudit:
-    """What each parameter of one drive is expected to be, from its first reading on."""
+    """The expected value of each parameter of one drive, from its first reading on."""
 
     def __init__(self) -> None:
         self._held: dict[str, int] = {}

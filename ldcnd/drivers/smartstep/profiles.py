@@ -45,14 +45,14 @@ class Framing(StrEnum):
 
 
 class Wiring(StrEnum):
-    """Which pairs the line has; the manual knows four wires only (1.1)."""
+    """Which pairs the line has; the manual describes four wires only (1.1)."""
 
     FOUR_WIRE = "4-wire"
     TWO_WIRE = "2-wire"
 
 
 class Echo(StrEnum):
-    """Whether the host hears its own characters; recognised by count only, never by content."""
+    """Whether the host receives its own characters; recognised by count only, never by content."""
 
     NONE = "none"
     EXPECT = "expect"
