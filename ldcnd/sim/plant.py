@@ -6,6 +6,7 @@ knows a protocol. The motor has no inductance: its current follows the voltage a
 
 import math
 import random
+from collections import deque
 from dataclasses import dataclass
 
 
@@ -29,6 +30,10 @@ class MotorPlant:
         pot_span_counts: the potentiometer turns from 0 to full scale over this range of travel.
         pot_noise: standard deviation of its reading, as a share of full scale.
         seed: of the potentiometer's noise.
+        load_nm: torque of a hanging load, positive when it pulls forward.
+        delay_s: from a change of the output to the torque: the amplifier and the motor's inductance, as a dead time.
+        backlash_counts: lost motion between motor and encoder, which sits on the load.
+        motor_reversed: the motor's leads are swapped: a positive output turns it in reverse.
     """
 
     counts_per_rev: int = 2000
@@ -47,6 +52,10 @@ class MotorPlant:
     pot_span_counts: tuple[int, int] = (-105_000, 105_000)
     pot_noise: float = 0.0
     seed: int = 1
+    load_nm: float = 0.0
+    delay_s: float = 0.0
+    backlash_counts: float = 0.0
+    motor_reversed: bool = False
 
 
 class Shaft:
@@ -57,6 +66,8 @@ class Shaft:
         velocity_counts: counts per step.
         stalled: something holds it.
         current_limited: the motor would have drawn more current in the last step than the amplifier gives.
+        slack_counts: how far the motor has turned forward within the backlash, 0 to all of it.
+        delay_steps: for so many steps, at most, the motor goes on with what it got before.
     """
 
     def __init__(self, plant: MotorPlant, step_s: float) -> None:
@@ -65,6 +76,13 @@ class Shaft:
         self.velocity_counts = 0.0
         self.stalled = False
         self.current_limited = False
+        self.slack_counts = 0.0
+        self.delay_steps = math.ceil(plant.delay_s / step_s)
+        whole = int(plant.delay_s / step_s)
+        self._late_share = plant.delay_s / step_s - whole
+        self._on_the_way: deque[float | None] = deque([0.0] * (whole + 1))
+        self._backlash = plant.backlash_counts
+        self._supply_v = -plant.supply_v if plant.motor_reversed else plant.supply_v
         self._peak_v = math.inf
         self._peak_change = 0.0
         self._dice = random.Random(plant.seed)  # noqa: S311 - reproducible on purpose
@@ -75,9 +93,10 @@ class Shaft:
         self._driven_decay = math.exp(-damping_per_s * step_s)
         self._coasting_decay = math.exp(-plant.viscous_nm_s / inertia * step_s)
         # the velocity that full duty approaches, times the share of the way that one step covers
-        full_duty = torque * plant.supply_v / resistance / (inertia * damping_per_s) * counts_per_step
+        full_duty = torque * self._supply_v / resistance / (inertia * damping_per_s) * counts_per_step
         self._gain = full_duty * (1.0 - self._driven_decay)
         self._friction = plant.friction_nm / inertia * step_s * counts_per_step
+        self._load = plant.load_nm / inertia * step_s * counts_per_step
         self._back_emf_v = torque / counts_per_step
         self._change_per_a = torque / inertia * step_s * counts_per_step
         self._lowest = float(plant.reverse_limit_counts - plant.stop_margin_counts)
@@ -92,15 +111,18 @@ class Shaft:
         """Let one step pass with a duty of -1 to 1 on the motor, or None with its windings open."""
         before = self.velocity_counts
         self.current_limited = False
+        if self.delay_steps:
+            duty = self._delayed(duty)
         if duty is None:
             velocity = before * self._coasting_decay
         else:
-            winding_v = duty * self.plant.supply_v - self._back_emf_v * before
+            winding_v = duty * self._supply_v - self._back_emf_v * before
             if -self._peak_v <= winding_v <= self._peak_v:
                 velocity = before * self._driven_decay + duty * self._gain
             else:
                 self.current_limited = True
                 velocity = before * self._coasting_decay + math.copysign(self._peak_change, winding_v)
+        velocity += self._load
         if velocity > self._friction:
             velocity -= self._friction
         elif velocity < -self._friction:
@@ -112,18 +134,35 @@ class Shaft:
         if velocity == 0.0 == before:
             self.velocity_counts = 0.0
             return
-        position = self.position_counts + 0.5 * (before + velocity)
+        way = 0.5 * (before + velocity)
+        position = self.position_counts + (self._transmitted(way) if self._backlash else way)
         if not self._lowest < position < self._highest:
             position = min(max(position, self._lowest), self._highest)
             velocity = 0.0
         self.position_counts = position
         self.velocity_counts = velocity
 
+    def _delayed(self, duty: float | None) -> float | None:
+        """Return what reaches the motor now: between two outputs in the share in which the dead time lies there."""
+        on_the_way = self._on_the_way
+        on_the_way.append(duty)
+        earlier = on_the_way.popleft()
+        later = on_the_way[0]
+        if earlier is None or later is None:
+            return later
+        return later + (earlier - later) * self._late_share
+
+    def _transmitted(self, way: float) -> float:
+        """Return how far the load goes when the motor goes this way."""
+        slack = self.slack_counts + way
+        self.slack_counts = min(max(slack, 0.0), self._backlash)
+        return slack - self.slack_counts
+
     def current_a(self, duty: float | None) -> float:
         """Return the motor current with that duty on the motor, positive when it drives forward."""
         if duty is None:
             return 0.0
-        winding_v = duty * self.plant.supply_v - self._back_emf_v * self.velocity_counts
+        winding_v = duty * self._supply_v - self._back_emf_v * self.velocity_counts
         return min(max(winding_v, -self._peak_v), self._peak_v) / self.plant.resistance_ohm
 
     @property

@@ -132,3 +132,54 @@ def test_potentiometer_noise_is_seeded():
     assert readings(1) == readings(1)
     assert readings(1) != readings(2)
     assert len(set(readings(1))) > 10
+
+
+def test_a_hanging_load_pulls_a_motor_that_friction_does_not_hold():
+    held, falling = shaft_of(load_nm=-0.003), shaft_of(load_nm=-0.01)
+
+    run(held, None, 200)
+    run(falling, None, 200)
+
+    assert held.position_counts == 0.0
+    assert falling.position_counts < -50
+
+
+def test_a_dead_time_shifts_what_the_motor_does_and_changes_nothing_else():
+    late, prompt = shaft_of(delay_s=3 * STEP_S), shaft_of()
+
+    for shaft, steps in ((late, 103), (prompt, 100)):
+        run(shaft, 0.5, steps)
+
+    assert late.position_counts == pytest.approx(prompt.position_counts)
+
+
+def test_half_a_step_of_dead_time_lies_between_none_and_one():
+    none, half, one = (shaft_of(delay_s=share * STEP_S) for share in (0.0, 0.5, 1.0))
+
+    for shaft in (none, half, one):
+        run(shaft, 0.5, 50)
+
+    assert one.position_counts < half.position_counts < none.position_counts
+
+
+def test_with_backlash_the_load_stands_until_the_motor_has_turned_through_it():
+    loose, tight = shaft_of(backlash_counts=30.0), shaft_of()
+
+    for shaft in (loose, tight):
+        run(shaft, 0.5, 100)
+    gone = loose.position_counts
+    for shaft in (loose, tight):
+        run(shaft, -0.5, 100)
+
+    assert tight.position_counts - loose.position_counts == pytest.approx(0.0, abs=1e-6)
+    assert gone > 100
+
+
+def test_swapped_leads_turn_the_motor_the_other_way():
+    swapped, right = shaft_of(motor_reversed=True), shaft_of()
+
+    for shaft in (swapped, right):
+        run(shaft, 0.5, 100)
+
+    assert swapped.position_counts == pytest.approx(-right.position_counts)
+    assert swapped.current_a(0.5) == pytest.approx(-right.current_a(0.5))

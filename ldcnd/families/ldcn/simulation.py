@@ -87,6 +87,14 @@ class PlantConfig(Frozen):
     """The potentiometer turns from 0 to full scale over this range."""
     pot_noise: float | None = Field(default=None, ge=0, le=1)
     """Standard deviation of its reading, as a share of full scale."""
+    load_nm: float | None = None
+    """Torque of a hanging load, positive when it pulls forward; 0."""
+    delay_s: float | None = Field(default=None, ge=0, le=0.1)
+    """Dead time from a change of the output to the torque: the amplifier and the motor's inductance; 0."""
+    backlash_counts: float | None = Field(default=None, ge=0)
+    """Lost motion between the motor and the encoder, which sits on the load; 0."""
+    motor_reversed: bool | None = None
+    """Whether the motor's leads are swapped: a positive output turns it in reverse. Then no position loop holds."""
 
 
 class Quirks(Frozen):

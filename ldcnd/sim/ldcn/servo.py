@@ -220,7 +220,7 @@ class ServoLoop:
     def run(self, cycles: int) -> None:
         """Let servo cycles pass."""
         steady = 0
-        enough = STEADY_TICKS * self._divisor
+        enough = STEADY_TICKS * self._divisor + self.shaft.delay_steps
         if self._is_plain:
             cycles, steady = self._run_plainly(cycles)
         while cycles > 0 and (steady <= enough or (self.analog_target is not None and not self._arrived)):
@@ -247,6 +247,7 @@ class ServoLoop:
             and not self.gains.cl
             and not self.gains.deadband
             and not self._limited
+            and not self.shaft.delay_steps
         )
 
     def _run_plainly(self, cycles: int) -> tuple[int, int]:
