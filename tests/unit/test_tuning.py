@@ -1,0 +1,166 @@
+"""Plants found in traces, gains designed for them, and what the model promises of a move."""
+
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
+from ldcnd.errors import ValueOutOfRange
+from ldcnd.sim.plant import MotorPlant
+from ldcnd.tuning.ldcn.design import (
+    GAIN_MARGIN_DB,
+    LEAST_PHASE_DEG,
+    MOST_OVERSHOOT,
+    gains_for,
+    margins,
+    propose,
+    within_authority,
+)
+from ldcnd.tuning.ldcn.identify import Identified, Record, identify
+from ldcnd.tuning.ldcn.plant import Plant
+from ldcnd.tuning.ldcn.response import Move, Start, figures, simulate
+from tests.support.simulated_plants import REFERENCE, drawn_plants, excite, tuned
+
+SMALL_MOTOR = Plant.of(MotorPlant())
+MOVE = Move(500, 20_000.0, 400_000.0)
+SEED = 24
+CHEAP = (5, 11, 13, 21)
+"""Machines of the sixty of `test_sixty_plants.py` that come to rest soon, so that their traces are short."""
+WELL_KNOWN = Plant(
+    acceleration=0.01 * SMALL_MOTOR.acceleration,
+    damping_per_s=1.0,
+    friction_pwm=0.1,
+    load_pwm=0.1,
+    delay_s=0.0003,
+    backlash_counts=1.0,
+)
+
+
+def test_a_plant_moves_as_the_machine_that_it_was_made_of():
+    machine = MotorPlant(inertia_kg_m2=2e-4, delay_s=0.0007, backlash_counts=5.0, load_nm=0.003, counts_per_rev=8000)
+
+    of_machine = simulate(PIC_SERVO_V4, machine, REFERENCE, MOVE, 0.3)
+    of_plant = simulate(PIC_SERVO_V4, Plant.of(machine), REFERENCE, MOVE, 0.3)
+
+    assert max(abs(of_machine.positions - of_plant.positions)) <= 1
+
+
+def test_a_plant_is_found_again_in_the_machine_that_it_makes():
+    plant = Plant(5000.0, 20.0, 3.0, -1.0, 0.001, 4.0)
+
+    again = Plant.of(plant.motor())
+
+    for name in ("acceleration", "damping_per_s", "friction_pwm", "load_pwm", "delay_s", "backlash_counts"):
+        assert getattr(again, name) == pytest.approx(getattr(plant, name)), name
+
+
+def test_overshoot_and_settling_are_those_of_the_record():
+    commanded = [0.0, 50.0, 100.0, 100.0, 100.0, 100.0, 100.0, 100.0, 100.0, 100.0, 100.0]
+    positions = [0.0, 30.0, 90.0, 108.0, 103.0, 100.0, 100.0, 100.0, 100.0, 100.0, 100.0]
+
+    shown = figures([n / 10 for n in range(11)], positions, commanded, window_counts=2.0)
+
+    assert shown.overshoot == pytest.approx(0.08)
+    assert shown.settling_s == pytest.approx(0.2)  # commanded until 0.2 s, outside until 0.4 s
+    assert shown.settled
+    assert shown.following_error_counts == 20
+
+
+def test_a_dead_time_takes_its_angle_from_the_phase_margin():
+    prompt = margins(PIC_SERVO_V4, SMALL_MOTOR, REFERENCE)
+    late = margins(PIC_SERVO_V4, replace(SMALL_MOTOR, delay_s=0.001), REFERENCE)
+
+    assert late.crossover_hz == pytest.approx(prompt.crossover_hz)
+    assert prompt.phase_deg - late.phase_deg == pytest.approx(360 * prompt.crossover_hz * 0.001, rel=1e-3)
+    assert late.gain_db < prompt.gain_db
+
+
+def test_a_loop_without_margin_rings_and_one_with_margin_does_not():
+    plant = Plant(20_000.0, 20.0, friction_pwm=0.2, delay_s=0.002)
+    ringing = replace(REFERENCE, kp=900, kd=2000)
+
+    without, having = (margins(PIC_SERVO_V4, plant, gains) for gains in (ringing, replace(ringing, kp=60)))
+    rings, rests = (
+        simulate(PIC_SERVO_V4, plant, gains, MOVE, 1.0).positions[-200:] for gains in (ringing, replace(ringing, kp=60))
+    )
+
+    assert without.phase_deg < 0
+    assert having.phase_deg > 20
+    assert max(rings) - min(rings) > 10 * (max(rests) - min(rests))
+
+
+@pytest.mark.parametrize("profile", [PIC_SERVO_V4, LS_182AP, PIC_SERVO_SC], ids=lambda profile: profile.name)
+@pytest.mark.parametrize("wanted_hz", [10.0, 20.0, 40.0])
+def test_gains_have_the_bandwidth_and_the_phase_that_were_wanted(profile, wanted_hz):
+    plant = Plant(16_000.0, 20.0, friction_pwm=2.0, delay_s=0.0005)
+
+    found = margins(profile, plant, gains_for(profile, plant, wanted_hz, 50.0, 0.1))
+
+    assert found.crossover_hz == pytest.approx(wanted_hz, rel=0.05)
+    assert 49.0 < found.phase_deg < 56.0  # the integral costs less than was set aside for it
+
+
+def test_a_bandwidth_that_no_registers_give_is_refused():
+    known = Identified(SMALL_MOTOR, WELL_KNOWN, 0.3)
+
+    with pytest.raises(ValueOutOfRange, match="at 400 Hz"):
+        propose(PIC_SERVO_V4, known, MOVE, bandwidth_hz=400.0)
+
+
+def test_a_proposal_states_its_margins_and_what_the_move_will_look_like():
+    plant = replace(SMALL_MOTOR, friction_pwm=3.0, delay_s=0.0006)
+    known = Identified(plant, WELL_KNOWN, 0.3)
+    move = within_authority(plant, MOVE)
+
+    proposal = propose(PIC_SERVO_V4, known, move, bandwidth_hz=30.0)
+
+    assert proposal.margins == margins(PIC_SERVO_V4, plant, proposal.gains)
+    assert proposal.margins.crossover_hz == pytest.approx(30.0, rel=0.05)
+    assert proposal.margins.phase_deg > LEAST_PHASE_DEG
+    assert proposal.margins.gain_db > GAIN_MARGIN_DB
+    assert proposal.figures.overshoot < MOST_OVERSHOOT
+    assert proposal.figures.settled
+    assert proposal.gains.el < PIC_SERVO_V4.most_error_limit
+    assert not simulate(PIC_SERVO_V4, plant, proposal.gains, move, 0.5).tripped
+
+
+def test_a_move_is_slowed_down_to_half_of_what_the_motor_can_do():
+    plant = Plant(1000.0, 20.0, friction_pwm=5.0, load_pwm=-20.0)
+
+    move = within_authority(plant, Move(5000, 1e6, 1e9))
+
+    needed = move.acceleration_counts_per_s2 + move.speed_counts_per_s * plant.damping_per_s
+    assert needed / plant.acceleration + 25.0 <= 125.0
+    with pytest.raises(ValueOutOfRange, match="friction and load take"):
+        within_authority(replace(plant, load_pwm=200.0), move)
+
+
+def test_a_trace_without_motion_tells_nothing():
+    still = Record(REFERENCE, MOVE, Start(), tuple(n / 400 for n in range(100)), (0,) * 100)
+
+    with pytest.raises(ValueOutOfRange, match="tells too little"):
+        identify(PIC_SERVO_V4, [still])
+
+
+def test_a_reversed_motor_gives_no_trace_and_stays_within_the_distance():
+    for plant in drawn_plants(SEED, 4):
+        reversed_motor = replace(plant, motor=replace(plant.motor, motor_reversed=True, load_nm=0.0))
+
+        found = excite(PIC_SERVO_V4, reversed_motor, seed=1)
+
+        assert found.records == ()
+        assert 0 < found.farthest_counts <= plant.distance_counts, plant
+
+
+@pytest.mark.parametrize("number", CHEAP)
+def test_of_a_drawn_machine_traces_tell_the_inertia_and_gains_suit_it(number):
+    *_, plant = drawn_plants(SEED, number + 1)
+    print(plant)
+
+    outcome = tuned(PIC_SERVO_V4, plant)
+
+    assert outcome.worst_error < 0.1
+    assert outcome.measured.settled
+    assert not outcome.tripped
+    assert outcome.measured.overshoot < 0.15
+    assert outcome.farthest_counts <= plant.distance_counts
