@@ -80,7 +80,7 @@ REVERTS = (
     ),
     revert(
         "ldcnd/daemon/line/line.py",
-        "await self._send_pending_stops()  # before anything else",
+        "await self._send_pending_stops()  # first",
         "pass  #",
         (PENDING + "test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_rate",),
     ),

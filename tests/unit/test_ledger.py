@@ -97,7 +97,7 @@ def test_a_replay_whose_answer_is_forgotten_is_refused(ledger):
     for number in range(ANSWERS_PER_SENDER + 1):
         done(ledger, f"c{number}")
 
-    with pytest.raises(CommandIdReused, match="forgotten"):
+    with pytest.raises(CommandIdReused, match="not kept"):
         ledger.repeated("c0", "x", MOVE)
     assert ledger.repeated("c1", "x", MoveAbsolute(position=1.0, command_id="c1")) == ledger.get("c1")
 
