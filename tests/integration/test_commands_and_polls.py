@@ -5,11 +5,14 @@ import pytest
 from ldcnd.bus.queue import COMMANDS_PER_POLL
 from tests.bench.commands_and_polls import CALLERS, CROWDS, MOST_ROUNDS, MOST_WAIT, ORDERS, Load, shared
 
+SECONDS = 1.0
+"""Ten rounds of the largest crowd."""
+
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("drives", CROWDS)
 def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(order, drives):
-    seen = shared(order, drives, Load.HALF, 2.5)
+    seen = shared(order, drives, Load.HALF, SECONDS)
 
     assert seen.commands == pytest.approx(0.5, abs=0.05)
     assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
@@ -19,7 +22,7 @@ def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(ord
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("drives", CROWDS)
 def test_commands_that_always_wait_leave_every_axis_a_poll_in_two_rounds(order, drives):
-    seen = shared(order, drives, Load.FULL, 2.5)
+    seen = shared(order, drives, Load.FULL, SECONDS)
 
     assert CALLERS > COMMANDS_PER_POLL
     assert seen.commands > 0.6

@@ -11,7 +11,7 @@ from tests.bench.saturated_rig import saturating
 from tests.support.chain_rig import rig_on
 
 DRIVES = 8
-SECONDS = 12.0
+SECONDS = 6.0
 
 
 def lost_s(records):

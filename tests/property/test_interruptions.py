@@ -390,7 +390,7 @@ def interrupted(seed: int, chosen: Chosen, *, kill: bool) -> Interruptions:
 def test_a_daemon_may_be_interrupted_anywhere(kill):
     dice = random.Random(1)
 
-    came = interrupted(1, lambda _: dice.random() < 0.01, kill=kill)
+    came = interrupted(1, lambda _: dice.random() < 0.006, kill=kill)
 
     assert came.visited > 10
 

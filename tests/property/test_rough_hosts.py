@@ -63,7 +63,7 @@ def report_after(names, story, cuts, seed=1, attempts=1):
 
 
 @pytest.mark.parametrize("names", CHAINS, ids="+".join)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(story=st.lists(deeds, max_size=6), cuts=cuts, seed=st.integers(0, 1000))
 def test_a_clean_host_initialises_after_any_rough_one(names, story, cuts, seed):
     report = report_after(names, story, cuts, seed)
@@ -73,7 +73,7 @@ def test_a_clean_host_initialises_after_any_rough_one(names, story, cuts, seed):
 
 
 @pytest.mark.parametrize("names", CHAINS, ids="+".join)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     story=st.lists(st.one_of(deeds, st.builds(rough.individual_baud, addresses, bauds)), max_size=6),
     cuts=cuts,

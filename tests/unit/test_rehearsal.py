@@ -36,7 +36,7 @@ def test_where_the_cycles_lie_matters_little(rate_hz: float):
 
 
 async def test_a_line_that_polls_all_the_time_is_as_quick_as_one_that_is_simulated_byte_by_byte():
-    simulated = await saturated(31, 10.0, by_phase=True)
+    simulated = await saturated(31, 3.0, by_phase=True)
     drive = Drive(2000.0, replace(COST, overhead_s=0.0))
 
     assert sum(mean_lengths_s((drive,) * 31, CYCLE)) / 31 == pytest.approx(1.0 / simulated.per_s, rel=0.03)

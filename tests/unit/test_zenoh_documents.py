@@ -4,7 +4,7 @@ import json
 import re
 from pathlib import Path
 
-import jsonschema
+import jsonschema_rs
 import pytest
 from click.testing import CliRunner
 
@@ -23,10 +23,11 @@ ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
 KEYS = Keys("rig")
 DOCUMENT = asyncapi_document()
-OFFICIAL = jsonschema.Draft7Validator(
+OFFICIAL = jsonschema_rs.Draft7Validator(
     json.loads((ROOT / "tests" / "vectors" / "asyncapi" / "asyncapi-3.0.0.json").read_text())
 )
 """As the AsyncAPI Initiative publishes it."""
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def page(name: str) -> str:
@@ -174,7 +175,8 @@ def test_the_official_schema_finds_what_is_wrong(path: tuple[str, ...], wrong: o
 
 def test_the_schemas_of_the_asyncapi_document_are_json_schemas() -> None:
     for schema in DOCUMENT["components"]["schemas"].values():
-        jsonschema.Draft202012Validator.check_schema(schema)
+        assert schema.get("$schema", DRAFT) == DRAFT
+        jsonschema_rs.meta.validate({"$schema": DRAFT} | schema)
     json.dumps(DOCUMENT)
 
 
