@@ -21,12 +21,14 @@ from ldcnd.model.commands import Power, Reset, StopReply
 from ldcnd.model.events import ReadOutcome
 from ldcnd.model.rig_commands import (
     AxisMove,
+    AxisPath,
     LinePath,
     ListHolders,
     MoveTogether,
     MoveTogetherReply,
     PreviewTogether,
     SetSpeedOverride,
+    WalkPath,
 )
 
 GROUP_TIME_S = 10.0
@@ -180,6 +182,43 @@ def group_preview(target: Target, moves: tuple[str, ...], velocity: float | None
     ]
     lines.append(f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation or 0.0)} from the line")
     target.show(reply, *lines)
+
+
+@group.command("path", context_settings={"ignore_unknown_options": True})
+@click.argument("corners", nargs=-1, required=True, metavar="AXIS=P1,P2,...")
+@click.option("--speed", type=Finite(), help="Along the path, in axis units a second; as fast as may be when missing.")
+@click.option("--velocity", type=Finite(), help="The highest of each axis, units a second; the axis defaults.")
+@click.option("--acceleration", type=Finite(), help="Likewise, units a second squared.")
+@click.option("--max-deviation", type=Finite(), help="Refuse a path that would be left by more, in axis units.")
+@commanding
+def group_path(
+    sender: Sender,
+    corners: tuple[str, ...],
+    speed: float | None,
+    velocity: float | None,
+    acceleration: float | None,
+    max_deviation: float | None,
+) -> None:
+    """Walk all members of a configured group along a polyline, on drives with path mode: `z=20,20,0 c=0,15,0`."""
+    who = {"lease": sender.lease, "client": None if sender.lease else NAME}
+    moves = []
+    for each in corners:
+        axis, _, places = each.partition("=")
+        *via, end = places.split(",")
+        values = {"axis": axis, "via": via, "position": end, "velocity": velocity, "acceleration": acceleration}
+        moves.append(of_options(AxisPath, **values, **who))
+    request = of_options(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation)
+
+    async def work(client: RigClient) -> None:
+        infos = [await axis_of(client, move.axis) for move in moves]
+        reply = await client.ask(request, timeout_s=GROUP_TIME_S)
+        lines = [
+            f"{each.axis}: accepted{values_of(each, info)}" for each, info in zip(reply.replies, infos, strict=True)
+        ]
+        said = f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation)} from the path"
+        sender.target.show(reply, *lines, f"{said}; ends within {rounded(reply.ahead_s)} s if the daemon dies")
+
+    sender.target.run(work)
 
 
 def _shares(

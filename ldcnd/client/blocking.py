@@ -4,7 +4,7 @@ Nothing is implemented twice: a call runs the asyncio client's own method on a l
 arguments, its result and its errors. Safe to use from several threads. An interrupted wait for a motion halts the axis.
 """
 
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, contextmanager
 from functools import wraps
 from pathlib import Path
@@ -190,6 +190,21 @@ class Rig(Facade[rig.Rig]):
             targets, velocity=velocity, acceleration=acceleration, path=path, max_deviation=max_deviation
         )
         return tuple(Motion(self._loop, move) for move in self._loop.run(moves))
+
+    def path(
+        self,
+        corners: dict[str, Sequence[float]],
+        *,
+        speed: float | None = None,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        max_deviation: float | None = None,
+    ) -> tuple[Motion, ...]:
+        """Walk the members of one group along a polyline; see `ldcnd.Rig.path`."""
+        motions = self._wrapped.path(
+            corners, speed=speed, velocity=velocity, acceleration=acceleration, max_deviation=max_deviation
+        )
+        return tuple(Motion(self._loop, motion) for motion in self._loop.run(motions))
 
     @overload
     def control(

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import os
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Literal, overload
@@ -22,6 +22,7 @@ from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.model.rig_commands import (
     Acquire,
     AxisMove,
+    AxisPath,
     HolderList,
     IoReply,
     IoTimer,
@@ -36,6 +37,7 @@ from ldcnd.model.rig_commands import (
     Snapshot,
     SnapshotReply,
     SpeedOverrideReply,
+    WalkPath,
 )
 from ldcnd.model.samples import FaultSample, Sample
 
@@ -174,13 +176,46 @@ class Rig:
         """
         moves = []
         for name, position in targets.items():
-            control = self._axis(name).control
-            if control is None:
-                raise LeaseRequired(f"axis {name} is not controlled here", axis=name, remedy="use Rig.control")
             move = AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
-            moves.append(control.stamped(move, name))
+            moves.append(self._control_of(name).stamped(move, name))
         reply = await self._client.ask(MoveTogether(moves=tuple(moves), path=path, max_deviation=max_deviation))
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
+
+    async def path(
+        self,
+        corners: Mapping[str, Sequence[float]],
+        *,
+        speed: float | None = None,
+        velocity: float | None = None,
+        acceleration: float | None = None,
+        max_deviation: float | None = None,
+    ) -> tuple[Motion, ...]:
+        """Walk the members of one group along a polyline; for drives with path mode.
+
+        Args:
+            corners: by axis, where it is at each corner, in axis units; exactly the members of a configured group, all
+                controlled here, equally many for each. The last one is the end, the first one not where they stand.
+            speed: along the path, in axis units a second; as fast as the axes allow when missing.
+            velocity: the highest of each axis; its default when missing.
+            acceleration: likewise.
+            max_deviation: a path that would be left by more, in axis units, is refused.
+
+        Raises:
+            LeaseRequired: one of them is not controlled by this program.
+        """
+        moves = []
+        for name, places in corners.items():
+            *via, end = places
+            move = AxisPath(axis=name, via=tuple(via), position=end, velocity=velocity, acceleration=acceleration)
+            moves.append(self._control_of(name).stamped(move, name))
+        reply = await self._client.ask(WalkPath(moves=tuple(moves), speed=speed, max_deviation=max_deviation))
+        return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
+
+    def _control_of(self, name: str) -> Control:
+        control = self._axis(name).control
+        if control is None:
+            raise LeaseRequired(f"axis {name} is not controlled here", axis=name, remedy="use Rig.control")
+        return control
 
     async def set_speed_override(self, percent: float) -> SpeedOverrideReply:
         """Scale every velocity of the rig, 0 to 100 %; at 0 what moves is halted and nothing begins.

@@ -29,6 +29,7 @@ from ldcnd.model.rig_commands import (
     SetIo,
     SetIoTimer,
     SetSpeedOverride,
+    WalkPath,
 )
 
 STOP_TIME_S = 3.0
@@ -98,7 +99,7 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         rig, verb = (request.path_params[name] for name in ("rig", "verb"))
         client = rigs.client(rig)
         kind = _class_of(About.RIG, verb)
-        if kind in LEASE_COMMANDS:
+        if kind in LEASE_COMMANDS or kind is WalkPath:  # a page controls no path
             raise _unknown(verb)
         page = page_of(request, pages) if PAGE_HEADER in request.headers else None
         envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))

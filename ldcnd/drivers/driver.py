@@ -5,7 +5,7 @@ seconds; units, limits, states and authority are the daemon's.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -322,6 +322,58 @@ class Tracks(ABC):
     @abstractmethod
     async def track(self, position_counts: int) -> None:
         """Go to a position at once, without a profile; never repeated."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathStatus:
+    """What a drive shows of a path.
+
+    Attributes:
+        commanded_counts: where it commands its motor to be.
+        points: still in its buffer.
+        running: it walks through them.
+        enabled: its loop is closed.
+    """
+
+    commanded_counts: int
+    points: int
+    running: bool
+    enabled: bool
+
+
+class WalksPaths(ABC):
+    """It walks through points that are sent to it, at a fixed rate, and stands at the last one when none is left.
+
+    Attributes:
+        path_period_s: between two points.
+        path_packet: so many points fit into one packet.
+        path_most_counts: largest step from one point to the next.
+    """
+
+    path_period_s: float
+    path_packet: int
+    path_most_counts: int
+
+    @abstractmethod
+    def check_path(self) -> None:
+        """Refuse a path that this drive cannot walk.
+
+        Raises:
+            NotSupported: it has no path mode.
+            WrongState: what it holds of its options is not known.
+        """
+
+    @abstractmethod
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]:
+        """Return what `add_points` sends for a full packet, for looking at only."""
+
+    @abstractmethod
+    async def path_status(self) -> PathStatus:
+        """Read what it shows."""
+
+    @abstractmethod
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """Append points, counts from one to the next; never repeated."""
 
 
 class TakesGains(ABC):

@@ -189,6 +189,18 @@ class Network(ABC):
         """
         raise NotSupported("this family cannot start several drives together")
 
+    async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
+        """Have drives walk through the points that they hold, from the same servo cycle on.
+
+        Args:
+            names: of axes; exactly the members of one group.
+            still_wanted: as for `start_group`.
+
+        Raises:
+            NotSupported, OutcomeUnknown, BusError: as `start_group`.
+        """
+        raise NotSupported("this family has no path mode")
+
     async def snapshot(self, still_free: Callable[[], None]) -> Instant:  # noqa: ARG002 - part of the contract
         """Return the positions of all axes at one instant.
 

@@ -145,6 +145,51 @@ class MoveTogether(GroupMoves, Command[MoveTogetherReply]):
     ends = Ends.BY_READING
 
 
+class AxisPath(AxisMove):
+    """The share of one axis in a path: `position` is its end; velocity and acceleration are the highest on the way."""
+
+    model_config = ConfigDict(title="AxisPath")
+
+    via: tuple[float, ...] = Field(default=(), max_length=5000)
+    """Where the axis is at each corner before the end, in axis units; equally many for all axes."""
+
+
+class PathReply(Frozen):
+    """The axes walk along the path: the reply to `@cmd/_/path`."""
+
+    replies: tuple[CommandReply, ...]
+    """One for each axis, in the order of the request."""
+    duration_s: float
+    """To the last point, without settling."""
+    deviation: float = Field(ge=0)
+    """How far from the polyline the axes get at most, by the points; what their servos lag behind comes on top."""
+    rate_hz: float
+    """Points a second."""
+    ahead_s: float
+    """If the daemon dies, the axes end within so much of the path."""
+
+
+class WalkPath(Command[PathReply]):
+    """Walk the axes of one configured group along a polyline, or none of them; for drives with path mode.
+
+    A stop, a fault, a lost lease or a lost packet of any axis stops all of them. They slow down at corners so that no
+    axis is accelerated by more than it may be.
+    """
+
+    verb = "path"
+    effect = Effect.MOTION
+    about = About.RIG
+    needs_lease = True
+    ends = Ends.BY_READING
+
+    moves: tuple[AxisPath, ...] = Field(min_length=2, max_length=31)
+    """Exactly the members of a group, each once."""
+    speed: float | None = Field(default=None, gt=0)
+    """Along the path, in axis units a second; as fast as the axes allow when missing."""
+    max_deviation: float | None = Field(default=None, gt=0)
+    """A path that would be left by more than this is refused; in the unit of the axes."""
+
+
 class AxisShare(Frozen):
     """The share of one axis in moves that were only planned."""
 
@@ -420,6 +465,7 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Rehearse,
     MoveTogether,
     PreviewTogether,
+    WalkPath,
     SetSpeedOverride,
     ReadWireLog,
     Snapshot,

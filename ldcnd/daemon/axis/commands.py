@@ -12,6 +12,7 @@ from ldcnd.daemon.axis.procedures.approach import ApproachMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
 from ldcnd.daemon.axis.procedures.home import HomeSequence
 from ldcnd.daemon.axis.procedures.jog import HeldJog, Holds, no_such_jog
+from ldcnd.daemon.axis.procedures.path import PathMember, PathShareRequest
 from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
@@ -118,6 +119,8 @@ class AxisCommands:
     def _procedure_for(self, turn: Turn, request: AxisCommand[CommandReply]) -> Procedure | None:
         """Return what carries out a request that takes more than one step."""
         match request:
+            case PathShareRequest():
+                return PathMember(self._motion, turn, request)
             case GroupMoveRequest():
                 return GroupMember(self._motion, turn, request)
             case Home():

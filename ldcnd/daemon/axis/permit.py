@@ -25,10 +25,12 @@ from ldcnd.drivers.driver import (
     Homes,
     Motion,
     Moves,
+    PathStatus,
     PwmOutput,
     StopMode,
     TakesGains,
     Tracks,
+    WalksPaths,
 )
 from ldcnd.drivers.network import Network
 from ldcnd.errors import NotSupported, Remedy, RequestRefused, ShuttingDown, StopLatched, step
@@ -89,6 +91,17 @@ def homing(drive: QuietDrive) -> Homes:
     if isinstance(drive, Homes):
         return drive
     raise cannot(drive.spec, "home")
+
+
+def walking(drive: QuietDrive) -> WalksPaths:
+    """Return a drive as one that walks paths.
+
+    Raises:
+        NotSupported: it does not.
+    """
+    if isinstance(drive, WalksPaths):
+        return drive
+    raise cannot(drive.spec, "walk a path")
 
 
 def cannot(spec: AxisSpec, what: str) -> NotSupported:
@@ -240,6 +253,13 @@ class Permit:
         with self._beginning(self.to_move()):
             await drive.track(position_counts)
 
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """Have the drive go on along a path; see `WalksPaths`."""
+        drive = walking(self._gate.driver)
+        self.ask_to_move()
+        with self._beginning(self.to_move()):
+            return await drive.add_points(steps)
+
     async def power_on(self) -> None:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
         self._to_energise()()
@@ -309,6 +329,22 @@ class Gate:
         return StopLatched(
             f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
         )
+
+
+async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
+    """Have axes walk their paths; every member's permission is asked directly before the packet that starts.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
+    """
+    conditions = [permit.to_move() for permit in permits]
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    with only_while(ask_all):
+        await network.start_path(names, ask_all)
 
 
 async def start_together(

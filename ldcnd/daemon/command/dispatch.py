@@ -8,6 +8,7 @@ from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting, plans_on_line
+from ldcnd.daemon.axis.procedures.path import PathShareRequest, SharedPath
 from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.authority import Authority, Lease
@@ -57,6 +58,7 @@ from ldcnd.model.rig_commands import (
     ListHolders,
     MoveTogether,
     MoveTogetherReply,
+    PathReply,
     PreviewTogether,
     PreviewTogetherReply,
     ReadWireLog,
@@ -68,6 +70,7 @@ from ldcnd.model.rig_commands import (
     SetSpeedOverride,
     Snapshot,
     SpeedOverrideReply,
+    WalkPath,
 )
 
 log = get_logger("commands")
@@ -126,7 +129,7 @@ class Dispatcher:
             case Preview():
                 why = self.why(self._rig.axis(axis), Why(absolute=command.position is not None))
                 return self._rig.axis(axis).preview(command, tuple(cause.text for cause in why.causes))
-            case MoveTogether():
+            case MoveTogether() | WalkPath():
                 return await self._move_together(command, login)
             case SetSpeedOverride():
                 return await self._set_speed_override(command)
@@ -344,9 +347,13 @@ class Dispatcher:
                 group.create_task(change(axis), name=f"speed override {axis.config.name}")
         return SpeedOverrideReply(percent=command.percent, changed=tuple(sorted(changed)), halted=tuple(sorted(halted)))
 
-    async def _move_together(self, command: MoveTogether, login: str | None) -> MoveTogetherReply:
-        moves = _shares(command)
+    async def _move_together(
+        self, command: MoveTogether | WalkPath, login: str | None
+    ) -> MoveTogetherReply | PathReply:
         execute = partial(self.carry_out, login=login)
+        if isinstance(command, WalkPath):
+            return await walk_path(self._rig, command, execute)
+        moves = _shares(command)
         straight = command.path is LinePath.LINEAR
         return await move_together(self._rig, moves, execute, straight=straight, max_deviation=command.max_deviation)
 
@@ -459,6 +466,38 @@ async def move_together(
             raise meeting.failure or result
         replies.append(result)
     return MoveTogetherReply(replies=tuple(replies), deviation=meeting.deviation)
+
+
+async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:
+    """Walk axes along a polyline; returns once every drive walks.
+
+    Raises:
+        MalformedRequest: an axis is named twice, or the axes have differently many corners.
+        UnknownAxis, NotSupported, RequestRefused, BusError: as `move_together`.
+    """
+    via = {move.axis: move.via for move in command.moves}
+    if len({len(corners) for corners in via.values()}) > 1 or len(via) < len(command.moves):
+        raise MalformedRequest("a path names each axis once, with equally many corners", remedy="see `via`")
+    line = _line_of(rig, via)
+    path = SharedPath(line.network, line.bus, frozenset(via), command.speed, command.max_deviation)
+    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis", "via"})) for move in command.moves}
+
+    async def take_part(name: str, move: MoveAbsolute) -> CommandReply | LdcndError:
+        try:
+            return await execute(name, PathShareRequest.of(move, via[name], path))
+        except LdcndError as error:
+            path.fail(error)
+            return error
+
+    async with asyncio.TaskGroup() as group:
+        tasks = [group.create_task(take_part(name, move), name=f"path {name}") for name, move in moves.items()]
+    replies = []
+    for task in tasks:
+        result = task.result()
+        if isinstance(result, LdcndError):
+            raise path.failure or result
+        replies.append(result)
+    return path.reply(tuple(replies))
 
 
 def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply:

@@ -94,13 +94,8 @@ class Groups:
         Raises:
             NotSupported, DriveFault, OutcomeUnknown, BusError: as there.
         """
+        group = self.group_of(frozenset(motions))
         names = frozenset(motions)
-        group = self._plan.exactly(names)
-        if group is None or not self._usable(group):
-            raise NotSupported(
-                f"axes {', '.join(sorted(names))} are not exactly the members of one group",
-                remedy="configure a [[bus.group]] of these axes",
-            )
         await self._prove()
         before: dict[str, int] = {}
         for name, motion in motions.items():
@@ -125,6 +120,40 @@ class Groups:
             await self._stop_all(group)
             raise OutcomeUnknown(
                 f"group of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were commanded to stop",
+                remedy="read the axis states before anything else",
+            )
+
+    async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:
+        """See `Network.start_path`.
+
+        Raises:
+            NotSupported, OutcomeUnknown, BusError: as there.
+        """
+        group = self.group_of(names)
+        await self._prove()
+        still_wanted()
+        profile = self._drives[min(names)].profile
+        sent = False
+        try:
+            if group.leader is None:
+                await self._bus.execute(commands.start_path(commands.Group(group.address, profile, self._rate.cycle_s)))
+            else:
+                await self._bus.execute(commands.start_path(Node(group.address, profile)))
+            sent = True
+            stuck = [name for name in sorted(names) if not (await self._drives[name].path_status()).running]
+        except LdcndError as error:
+            if isinstance(error, RequestRefused) and not sent:
+                raise
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"path of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
+                " were told to stop",
+                remedy="read the axis states before anything else",
+            ) from error
+        if stuck:
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"path of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were told to stop",
                 remedy="read the axis states before anything else",
             )
 
@@ -165,6 +194,20 @@ class Groups:
             positions[name] = home + self._drives[name].state.offset_counts
         io = [await self._captured(module, io_before[module.name]) for module in self._io if module.name in io_before]
         return Instant(positions, timing.sent_at_s, timing.received_at_s, tuple(io))
+
+    def group_of(self, names: frozenset[str]) -> Group:
+        """Return the group that has exactly these members.
+
+        Raises:
+            NotSupported: there is none.
+        """
+        group = self._plan.exactly(names)
+        if group is None or not self._usable(group):
+            raise NotSupported(
+                f"axes {', '.join(sorted(names))} are not exactly the members of one group",
+                remedy="configure a [[bus.group]] of these axes",
+            )
+        return group
 
     # -- steps -------------------------------------------------------------------------------------------------------
 

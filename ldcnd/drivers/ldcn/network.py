@@ -401,6 +401,10 @@ class LdcnNetwork(Network):
         await self._groups.start(motions, still_wanted)
 
     @override
+    async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:
+        await self._groups.start_path(names, still_wanted)
+
+    @override
     async def snapshot(self, still_free: Callable[[], None]) -> Instant:
         return await self._groups.snapshot(still_free)
 

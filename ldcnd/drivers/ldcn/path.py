@@ -53,7 +53,7 @@ def encode_point(point: PathPoint, *, fast_path: bool) -> int:
     if point.cycles not in periods:
         allowed = f"{periods[0]} or {periods[1]}"
         raise ValueOutOfRange(f"a path point takes {allowed} cycles", value=point.cycles, limit=allowed)
-    most = _most_step(point.cycles)
+    most = most_step(point.cycles)
     if abs(point.counts) > most:
         raise ValueOutOfRange(
             f"a path point of {point.cycles} cycles moves {most} counts at most, not {point.counts}",
@@ -93,6 +93,6 @@ def encode_points(profile: Profile, points: Iterable[PathPoint], *, fast_path: b
     return b"".join(word.to_bytes(WORD_BYTES, "little") for word in words)
 
 
-def _most_step(cycles: int) -> int:
+def most_step(cycles: int) -> int:
     """Return the largest step whose speed still fits the word: below 256 counts per cycle."""
     return (1 << 16) * cycles // _SPEED_FRACTION - 1

@@ -10,6 +10,7 @@ Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute p
 """
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from types import MappingProxyType
 from typing import Any
@@ -31,18 +32,21 @@ from ldcnd.drivers.driver import (
     KeepsMark,
     Motion,
     Moves,
+    PathStatus,
     PwmOutput,
     Register,
     RemembersRegisters,
     StopMode,
     TakesGains,
     Tracks,
+    WalksPaths,
     Warns,
 )
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
 from ldcnd.drivers.ldcn.faults import DriveState, FaultCode, sensor_lost
+from ldcnd.drivers.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
 from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, Gains, RegisterBook, gain_values
 from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
@@ -50,6 +54,7 @@ from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, tr
 from ldcnd.errors import (
     BadReply,
     DriveFault,
+    NotSupported,
     OutcomeUnknown,
     PacketRejected,
     Remedy,
@@ -148,6 +153,10 @@ def _shifted(motion: Motion, offset_counts: int) -> Motion:
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""
 STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+PATH_CYCLES = 64
+"""Servo cycles of a path point: the longer period, which leaves most of the line to others."""
+PATH_MOST_COUNTS = most_step(PATH_CYCLES)
+PATH_ITEMS = StatusItem.POSITION | StatusItem.POSITION_ERROR | StatusItem.AUX | StatusItem.BIT7
 EVIDENCE_ITEMS = STATE_ITEMS | StatusItem.HOME
 
 STOP_CONTROLS = {
@@ -167,7 +176,7 @@ def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusIt
     return mask
 
 
-class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersRegisters, KeepsMark):
+class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, RemembersRegisters, KeepsMark):
     """A drive at one address, in the dialect of its profile."""
 
     shows_inputs = True
@@ -187,6 +196,10 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         self._book = RegisterBook(profile)
         self._gains = spec.gains
         self._initialised = False
+        self._path_option_known = False  # a fast path, left by another host, would run at twice the speed
+        self.path_period_s = PATH_CYCLES * profile.servo_cycle_s
+        self.path_packet = MOST_POINTS_PER_PACKET
+        self.path_most_counts = PATH_MOST_COUNTS
         self._switching_off = 0
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
 
@@ -195,6 +208,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         self.state.restarted()
         self._book.reset()
         self._initialised = False
+        self._path_option_known = True
 
     def adopted(self, status: Status, *, known: bool) -> None:
         """The drive was taken over as it is, with this status; gains count as configured.
@@ -208,6 +222,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
             self.state.unseen()
         else:
             self.state.taken_over(status)
+            self._path_option_known = False
         self._book.assume(gain_values(self._gains) if self._gains else {})
         if self._gains:
             self.state.servo_divisor = self._gains.sr
@@ -627,6 +642,51 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs, RemembersReg
         self.state.loaded(absolute=False, opens_loop=False)
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
         await self._bus.execute(replace(exchange, repeatable=False))
+
+    # -- path mode ---------------------------------------------------------------------------------------------------
+
+    @override
+    def check_path(self) -> None:
+        if not (self.profile.path_points and self.profile.sc_extensions):
+            raise NotSupported(
+                f"axis {self.spec.name}: {self.profile.title} has no path mode", axis=self.spec.name, value="path"
+            )
+        if not self._path_option_known:
+            raise WrongState(
+                f"axis {self.spec.name}: an earlier host may have set the fast path, and no status shows it",
+                axis=self.spec.name,
+                remedy='restart the daemon with start = "reset"',
+            )
+
+    @override
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]:
+        points = [PathPoint(0, PATH_CYCLES)] * MOST_POINTS_PER_PACKET
+        return commands.add_path_points(self._node, points), commands.read_status(self._node, PATH_ITEMS)
+
+    @override
+    async def path_status(self) -> PathStatus:
+        status = await self._bus.execute(commands.read_status(self._node, PATH_ITEMS))
+        position, error, aux, points = status.position, status.position_error, status.aux, status.bit7
+        if position is None or error is None or aux is None or points is None:
+            raise BadReply(f"axis {self.spec.name}: the status packet lacks what shows a path")
+        return PathStatus(
+            commanded_counts=position + error + self.state.offset_counts,
+            points=points,
+            running=bool(aux & AuxFlag.PATH_MODE),
+            enabled=bool(aux & AuxFlag.SERVO_ON),
+        )
+
+    @override
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """See `WalksPaths`. A reply that is lost leaves open whether they were taken: they are never sent again.
+
+        Raises:
+            OutcomeUnknown: the reply was lost.
+        """
+        points = [PathPoint(counts, PATH_CYCLES) for counts in steps]
+        self.state.loaded(absolute=False, opens_loop=False)
+        await self._bus.execute(commands.add_path_points(self._node, points))
+        return await self.path_status()
 
     @override
     async def captured_home(self) -> int:

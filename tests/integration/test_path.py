@@ -1,0 +1,241 @@
+"""Several PIC-SERVO SC on one polyline: how near they stay, and that whatever ends one of them ends all."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from itertools import pairwise
+
+import pytest
+
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.errors import NotSupported, PositionLimit, ValueOutOfRange
+from ldcnd.model.commands import Halt, Power, Stop
+from ldcnd.model.rig_commands import Acquire, AxisPath, PathReply, Release, WalkPath
+from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.wirelog.recorder import WireEvent
+from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+
+NAMES = ("z", "c")
+GAINS = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "cl": 0, "el": 4000, "sr": 1, "deadband": 0}
+AXIS = {
+    "gains": GAINS,
+    "unit": "mm",
+    "counts_per_unit": 1000,
+    "velocity": 30.0,
+    "acceleration": 100.0,
+    "limits": {"position_min": -50.0, "position_max": 50.0, "velocity": 60.0, "acceleration": 200.0},
+    "reference": "at_reset",
+    "model": "pic-servo-sc",
+}
+TRIANGLE = {"z": (20.0, 20.0, 0.0), "c": (0.0, 15.0, 0.0)}
+CIRCLE = {
+    "z": tuple(10.0 - 10.0 * math.cos(math.tau * at / 72) for at in range(1, 73)),
+    "c": tuple(10.0 * math.sin(math.tau * at / 72) for at in range(1, 73)),
+}
+
+
+def sc_chain() -> Chain:
+    return build_chain(ChainSpec(tuple(ModuleSpec("picservo-sc") for _ in range(2))))
+
+
+@asynccontextmanager
+async def two_sc(chain: Chain, *, leased: bool = False) -> AsyncIterator[ChainRig]:
+    """Run a daemon on two PIC-SERVO SC of one group, with closed loops."""
+    config = simulated_config(group=[{"name": "plane", "axes": list(NAMES)}])
+    document = config.model_dump(mode="json", exclude_unset=True)
+    table = document["bus"][0]
+    table["axis"] = [{"name": name, "address": at + 1, **AXIS} for at, name in enumerate(NAMES)]
+    for key in ("module", "simulate", "fault"):
+        table.pop(key, None)
+    document["authority"] = "leased" if leased else "open"
+    config = type(config).model_validate(document)
+    async with rig_on(chain, config) as rig:
+        lease = await rig.client.ask(Acquire(client="set-up", axes=NAMES, lease_s=30.0)) if leased else None
+        for name in NAMES:
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Power(on=True, lease=lease.lease if lease else None))
+        if lease:
+            await rig.client.ask(Release(lease=lease.lease))
+        yield rig
+
+
+def path(corners: dict[str, tuple[float, ...]] = TRIANGLE, **values: object) -> WalkPath:
+    moves = tuple(AxisPath(axis=name, via=each[:-1], position=each[-1]) for name, each in corners.items())
+    return WalkPath(moves=moves, **values)
+
+
+def from_polyline(point: tuple[float, float], corners: list[tuple[float, float]]) -> float:
+    nearest = math.inf
+    for (ax, ay), (bx, by) in pairwise(corners):
+        length = math.hypot(bx - ax, by - ay)
+        share = ((point[0] - ax) * (bx - ax) + (point[1] - ay) * (by - ay)) / length**2
+        share = min(1.0, max(0.0, share))
+        nearest = min(nearest, math.dist(point, (ax + share * (bx - ax), ay + share * (by - ay))))
+    return nearest
+
+
+def places(chain: Chain) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return where the drives command their motors to be, and where those are, mm."""
+    drives = [drive(chain, 1), drive(chain, 2)]
+    z, c = (each.loop.trajectory.position / 65536 / 1000 for each in drives)
+    at_z, at_c = (each.shaft.position_counts / 1000 for each in drives)
+    return (z, c), (at_z, at_c)
+
+
+async def rests(chain: Chain, for_s: float = 0.5) -> bool:
+    _, before = places(chain)
+    await asyncio.sleep(for_s)
+    return math.dist(before, places(chain)[1]) < 0.02
+
+
+@pytest.mark.parametrize(("speed", "corners"), [(8.0, TRIANGLE), (15.0, TRIANGLE), (40.0, TRIANGLE), (15.0, CIRCLE)])
+async def test_axes_on_a_path_stay_as_near_to_it_as_was_said_before(speed, corners):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        said = await rig.client.ask(path(corners, speed=speed))
+        assert isinstance(said, PathReply)
+        loop = asyncio.get_running_loop()
+        until_s, line = loop.time() + said.duration_s, [(0.0, 0.0), *zip(corners["z"], corners["c"], strict=True)]
+        commanded = moved = 0.0
+        while loop.time() < until_s:
+            await asyncio.sleep(0.02)
+            wanted, shafts = places(chain)
+            commanded, moved = max(commanded, from_polyline(wanted, line)), max(moved, from_polyline(shafts, line))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    print(f"{speed} mm/s: {said.duration_s:.2f} s, {said.deviation:.4f}, {commanded:.4f}, {moved:.4f} mm")
+    assert commanded <= said.deviation + 0.001
+    assert [state.last_error for state in states] == [None, None]
+    assert [state.state for state in states] == [AxisState.STANDSTILL] * 2
+    assert math.dist(places(chain)[1], (corners["z"][-1], corners["c"][-1])) < 0.05
+
+
+async def test_a_path_beyond_a_limit_or_too_far_from_its_line_moves_nothing():
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        with pytest.raises(PositionLimit):
+            await rig.client.ask(path({"z": (20.0, 60.0, 0.0), "c": (0.0, 5.0, 0.0)}))
+        with pytest.raises(ValueOutOfRange):
+            await rig.client.ask(path(max_deviation=1e-4))
+        assert await rests(chain)
+        assert places(chain)[1] == pytest.approx((0.0, 0.0), abs=0.02)
+        for name in NAMES:
+            state = await rig.client.state(name)
+            assert state is not None
+            assert state.state is AxisState.STANDSTILL
+
+
+async def halt_one(rig: ChainRig, _chain: Chain) -> None:
+    await rig.client.command("c", Halt())
+
+
+async def stop_one(rig: ChainRig, _chain: Chain) -> None:
+    await rig.client.command("z", Stop())
+
+
+async def trip(_rig: ChainRig, chain: Chain) -> None:
+    drive(chain, 2).loop.open()
+
+
+async def underrun(_rig: ChainRig, chain: Chain) -> None:
+    drive(chain, 1).loop.trajectory.path._points.clear()
+
+
+@pytest.mark.parametrize("what", [halt_one, stop_one, trip, underrun])
+@pytest.mark.parametrize("after_s", [0.3, 1.7])
+async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRig, Chain], Awaitable[None]], after_s):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        await rig.client.ask(path(speed=15.0))
+        await asyncio.sleep(after_s)
+
+        await what(rig, chain)
+        await asyncio.sleep(1.0)
+        still = await rests(chain)
+        states = [await rig.client.state(name) for name in NAMES]
+
+    assert still
+    assert math.dist(places(chain)[1], (0.0, 0.0)) > 0.1
+    assert all(state is not None and state.command is None for state in states)
+
+
+async def test_if_the_daemon_dies_the_axes_stand_at_the_end_of_their_buffers():
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        said = await rig.client.ask(path(speed=10.0))
+        await asyncio.sleep(1.0)
+        await rig.kill()
+        await asyncio.sleep(said.ahead_s + 0.1)
+        still = await rests(chain)
+        wanted, shafts = places(chain)
+
+    assert still
+    assert math.dist(wanted, shafts) < 0.02
+    assert from_polyline(wanted, [(0.0, 0.0), *zip(TRIANGLE["z"], TRIANGLE["c"], strict=True)]) < said.deviation + 0.001
+
+
+@pytest.mark.parametrize("by_force", [False, True])
+async def test_a_path_whose_sender_has_lost_one_axis_is_fed_no_further(by_force):
+    chain = sc_chain()
+    async with two_sc(chain, leased=True) as rig:
+        lease = await rig.client.ask(Acquire(client="walker", axes=NAMES, lease_s=30.0 if by_force else 1.0))
+        walked = path(speed=10.0)
+        moves = tuple(move.model_copy(update={"lease": lease.lease}) for move in walked.moves)
+        await rig.client.ask(walked.model_copy(update={"moves": moves}))
+        await asyncio.sleep(0.5)
+        if by_force:
+            await rig.client.ask(Acquire(client="other", axes=("c",), force=True))
+        await asyncio.sleep(1.5)
+        still = await rests(chain)
+        before = len(rig.sent)
+        await asyncio.sleep(1.0)
+        later = [packet.command for packet in rig.sent[before:]]
+
+    assert still
+    assert math.dist(places(chain)[1], (0.0, 0.0)) < 20.0
+    assert Command.ADD_PATH_POINTS not in later
+
+
+async def test_a_stop_at_any_instant_of_a_path_is_the_last_that_moves():
+    for tenth in range(1, 12):
+        chain = sc_chain()
+        async with two_sc(chain) as rig:
+            walking = asyncio.create_task(rig.client.ask(path(speed=15.0)))
+            await asyncio.sleep(0.02 * tenth)
+            await rig.client.command("z", Stop())
+            await rig.client.command("c", Stop())
+            await asyncio.wait([walking])
+            walking.exception()
+            await asyncio.sleep(1.0)
+            assert await rests(chain), f"stopped after {0.02 * tenth:.2f} s"
+            assert not any(module.loop.trajectory.path.running for module in (drive(chain, 1), drive(chain, 2)))
+
+
+async def test_polls_go_on_while_a_path_is_fed():
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        await rig.client.ask(path(speed=10.0))
+        loop = asyncio.get_running_loop()
+        since_s = loop.time()
+        await asyncio.sleep(2.0)
+        records = [each for each in rig.line.bus.wire_log.records() if each.at_s >= since_s]
+        reads_s = [each.at_s for each in records if each.event is WireEvent.SENT and each.data[1:3] == bytes((1, 0x13))]
+        states = [await rig.client.state(name) for name in NAMES]
+
+    assert all(state is not None and state.link is LinkState.UP for state in states)
+    assert max(after - before for before, after in pairwise(reads_s)) < 0.15
+
+
+async def test_drives_without_path_mode_refuse():
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(m) for m in ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4"))))
+    async with rig_on(
+        chain, simulated_config({"reference": "at_reset"}, group=[{"name": "plane", "axes": ["x", "y"]}])
+    ) as rig:
+        for name in ("x", "y"):
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Power(on=True))
+        with pytest.raises(NotSupported, match="path mode"):
+            await rig.client.ask(path({"x": (1.0,), "y": (2.0,)}))
