@@ -158,6 +158,7 @@ async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRi
         states = [await rig.client.state(name) for name in NAMES]
 
     assert still
+    assert what is not trip or not drive(chain, 2).loop.servo_on
     assert math.dist(places(chain)[1], (0.0, 0.0)) > 0.1
     assert all(state is not None and state.command is None for state in states)
 

@@ -42,7 +42,6 @@ EXPLAINED = {
     ("rehearse", "console"): "a loss is rehearsed at the machine, with `ldcnd drill`",
     ("read_monitors", "console"): "the page of the axis shows the monitors as they are published",
     ("path", "console"): "for programs: a page walks no path",
-    ("path", "documentation"): "[move-a-group](../how-to/move-a-group.md): Along a path",
     ("acquire", "documentation"): "[console](../how-to/console.md): Take control",
     ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
@@ -52,6 +51,8 @@ EXPLAINED = {
     ("rehearse", "command line"): "`ldcnd drill`",
 }
 """Why a verb is not in a place; everything else is there."""
+PLAIN_WORDS = {"path"}
+"""Verbs that stand for something else in the sources of the console."""
 METHODS_OF_RIGS = {
     "holders",
     "outcome",
@@ -106,6 +107,8 @@ def _found(command: type[Command[Frozen]], place: str) -> str:
             return f"`{kind.__name__}.{name}`" if known and hasattr(kind, name) else ""
         case "command line":
             return _commands_that_send(command)
+        case "console" if command.verb in PLAIN_WORDS:
+            return ""
         case "console":
             sources = [*ROOT.glob("ldcnd/console/static/**/*.js"), *ROOT.glob("ldcnd/console/*.py")]
             return _in_sources(

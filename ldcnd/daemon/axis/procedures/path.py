@@ -160,7 +160,9 @@ class SharedPath:
             raise
         else:
             self.begun_s = next(iter(members.values())).motion.clock.now_s()
-            if not self._started.done():
+            if self._started.done():
+                await self.stop_all("a member has left while the drives were started")
+            else:
                 self._started.set_result(None)
 
     def _planned(self, axes: Mapping[str, PathAxis]) -> Walk:
@@ -254,13 +256,14 @@ class SharedPath:
             return
         self.broken = reason
         log.warning("path stopped", axes=sorted(self._names), reason=reason)
+        closed = {name for name, share in self._shares.items() if share.member.motion.tracker.energised}
         try:
-            await self._network.stop_together(StopMode.SMOOTH, self._names)
+            await self._network.stop_together(StopMode.SMOOTH, frozenset(closed))
         except BusError as error:
             log.error("stop of a path not sent to the group", reason=error.message)
-        for share in self._shares.values():
-            try:
-                await share.member.motion.driver.stop(StopMode.SMOOTH)
+        for name, share in self._shares.items():
+            try:  # a stop that holds would close the loop of a drive that has tripped
+                await share.member.motion.driver.stop(StopMode.SMOOTH if name in closed else StopMode.OFF)
             except BusError as error:
                 log.error("stop of a path not confirmed", axis=share.member.motion.config.name, reason=error.message)
 
