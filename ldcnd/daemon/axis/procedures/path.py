@@ -6,7 +6,7 @@ first. Permission is asked for every packet. What ends one member ends all: the 
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from typing_extensions import override
 
@@ -75,11 +75,13 @@ class _Share:
         member: the procedure of its axis.
         sent: points.
         over: it has reached the last point.
+        tripped: its drive has opened its loop.
     """
 
     member: "PathMember"
     sent: int = 0
-    over: bool = field(default=False)
+    over: bool = False
+    tripped: bool = False
 
 
 class SharedPath:
@@ -256,7 +258,9 @@ class SharedPath:
             return
         self.broken = reason
         log.warning("path stopped", axes=sorted(self._names), reason=reason)
-        closed = {name for name, share in self._shares.items() if share.member.motion.tracker.energised}
+        closed = {
+            name for name, share in self._shares.items() if share.member.motion.tracker.energised and not share.tripped
+        }
         try:
             await self._network.stop_together(StopMode.SMOOTH, frozenset(closed))
         except BusError as error:
@@ -374,7 +378,10 @@ class PathMember(Procedure):
                 status = await walking(motion.driver).path_status()
                 now_s = motion.clock.now_s()
                 ends_s = path.begun_s + (path.plan.duration_s if path.plan else 0.0)
-                if share.sent >= len(self.steps) and not status.running and not status.points:
+                share.tripped = not status.enabled
+                if share.tripped:
+                    reason = f"axis {name} has opened its loop"
+                elif share.sent >= len(self.steps) and not status.running and not status.points:
                     if now_s < ends_s - 2 * walking(motion.driver).path_period_s:
                         reason = f"axis {name} ended its path early"
                     else:
