@@ -14,6 +14,7 @@ from ldcnd.tuning.ldcn.design import (
     gains_for,
     margins,
     propose,
+    stiff_gains,
     within_authority,
 )
 from ldcnd.tuning.ldcn.identify import Identified, Record, identify
@@ -24,7 +25,7 @@ from tests.support.simulated_plants import REFERENCE, drawn_plants, excite, tune
 SMALL_MOTOR = Plant.of(MotorPlant())
 MOVE = Move(500, 20_000.0, 400_000.0)
 SEED = 24
-CHEAP = (5, 11, 13, 21)
+CHEAP = (11, 30, 39, 42)
 """Machines of the sixty of `test_sixty_plants.py` that come to rest soon, so that their traces are short."""
 WELL_KNOWN = Plant(
     acceleration=0.01 * SMALL_MOTOR.acceleration,
@@ -115,13 +116,25 @@ def test_a_proposal_states_its_margins_and_what_the_move_will_look_like():
     proposal = propose(PIC_SERVO_V4, known, move, bandwidth_hz=30.0)
 
     assert proposal.margins == margins(PIC_SERVO_V4, plant, proposal.gains)
-    assert proposal.margins.crossover_hz == pytest.approx(30.0, rel=0.05)
+    assert proposal.margins.crossover_hz == pytest.approx(30.0, rel=0.1)  # a quick integral lowers it a little
     assert proposal.margins.phase_deg > LEAST_PHASE_DEG
     assert proposal.margins.gain_db > GAIN_MARGIN_DB
     assert proposal.figures.overshoot < MOST_OVERSHOOT
     assert proposal.figures.settled
     assert proposal.gains.el < PIC_SERVO_V4.most_error_limit
     assert not simulate(PIC_SERVO_V4, plant, proposal.gains, move, 0.5).tripped
+
+
+def test_stiff_gains_follow_a_step_on_a_plant_whose_dead_time_is_not_known():
+    heavy = Plant(1425.0, 3.7, friction_pwm=1.4, delay_s=0.0015)
+    known = Identified(heavy, replace(WELL_KNOWN, acceleration=14.0), 0.3)
+
+    gains = replace(stiff_gains(PIC_SERVO_V4, known), ki=0, il=0)
+    for delay_s in (0.0, 0.003):
+        run = simulate(PIC_SERVO_V4, replace(heavy, delay_s=delay_s), gains, Move(250, 25_000.0, 2.5e7), 0.6)
+
+        assert not run.tripped
+        assert run.positions[-1] == pytest.approx(250, abs=50)  # friction holds it there
 
 
 def test_a_move_is_slowed_down_to_half_of_what_the_motor_can_do():
@@ -152,6 +165,7 @@ def test_a_reversed_motor_gives_no_trace_and_stays_within_the_distance():
         assert 0 < found.farthest_counts <= plant.distance_counts, plant
 
 
+@pytest.mark.timeout(300)  # a second or two of processor time, on a machine that may be busy
 @pytest.mark.parametrize("number", CHEAP)
 def test_of_a_drawn_machine_traces_tell_the_inertia_and_gains_suit_it(number):
     *_, plant = drawn_plants(SEED, number + 1)

@@ -21,14 +21,14 @@ from ldcnd.tuning.ldcn.response import Figures, Move, Response, figures, simulat
 MOST_GAIN = 0x7FFF
 MOST_OUTPUT = 250
 """Output limit; "usually, PWM value greater than 250 is not recommended" (LS-182AP manual)."""
-PHASE_MARGINS_DEG = (60.0, 45.0, 35.0)
+PHASE_MARGINS_DEG = (60.0, 45.0, 35.0, 30.0)
 """Tried for the estimated plant."""
-LEAST_PHASE_DEG = 25.0
+LEAST_PHASE_DEG = 20.0
 """Of each plant that it may be."""
 MOST_LEAD_DEG = 78.0
 """More phase than this is made of nearly nothing but the derivative, and holds no position."""
 GAIN_MARGIN_DB = 6.0
-INTEGRAL_SHARES = (0.1, 0.4)
+INTEGRAL_SHARES = (0.1, 0.25, 0.7)
 """The integral acts below this share of the crossover."""
 BANDWIDTHS_HZ = tuple(4.0 * 1.35**n for n in range(12))
 """Tried where none is wanted: 4 to 109 Hz."""
