@@ -166,7 +166,7 @@ class Tuned:
         return abs(self.known.plant.acceleration / self.true.acceleration - 1)
 
 
-def tuned(profile: Profile, plant: DrawnPlant) -> Tuned:
+def tuned(profile: Profile, plant: DrawnPlant, bandwidth_hz: float | None = None) -> Tuned:
     """Excite a machine softly, then stiffly, identify it, propose gains, and move with them."""
     soft = excite(profile, plant, seed=plant.number)
     first = identify(profile, soft.records)
@@ -174,7 +174,7 @@ def tuned(profile: Profile, plant: DrawnPlant) -> Tuned:
     known = identify(profile, (*soft.records, *stiff), first.plant)
     distance = plant.distance_counts // 2
     move = within_authority(known.plant, Move(distance, 40.0 * distance, 800.0 * distance))
-    proposal = propose(profile, known, move)
+    proposal = propose(profile, known, move, bandwidth_hz)
     run = simulate(profile, plant.motor, proposal.gains, move, TEST_S)
     usual = simulate(profile, plant.motor, REFERENCE, move, TEST_S)
     return Tuned(

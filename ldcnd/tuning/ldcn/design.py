@@ -226,11 +226,11 @@ def _better(
     plant = known.plant
     try:
         gains = gains_for(profile, plant, *way)
+        there = margins(profile, plant, gains)
         edges = _edges(known)
-        there = [margins(profile, each, gains) for each in (plant, *edges)]
+        if not _is_safe(there) or not all(_is_safe(margins(profile, edge, gains)) for edge in edges):
+            return best
     except ValueOutOfRange:
-        return best
-    if min(each.phase_deg for each in there) < LEAST_PHASE_DEG or min(each.gain_db for each in there) < GAIN_MARGIN_DB:
         return best
     duration_s = _duration_s(move)
     predicted = simulate(profile, plant, gains, move, duration_s)
@@ -245,7 +245,11 @@ def _better(
         good = shown.settled and not run.tripped and shown.overshoot <= MOST_OVERSHOOT
         if not good or (best is not None and worst >= best[0] - SAME_S):
             return best
-    return worst, Proposal(gains, there[0], predicted, outcome)
+    return worst, Proposal(gains, there, predicted, outcome)
+
+
+def _is_safe(there: Margins) -> bool:
+    return there.phase_deg >= LEAST_PHASE_DEG and there.gain_db >= GAIN_MARGIN_DB
 
 
 def _edges(known: Identified) -> tuple[Plant, ...]:
