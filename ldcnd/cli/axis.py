@@ -1,5 +1,7 @@
 """`ldcnd axis`: show axes and move them."""
 
+from datetime import UTC, datetime
+
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
@@ -73,6 +75,16 @@ def list_axes(target: Target) -> None:
         where = f"{position.value:12.{decimals(axis)}f} {axis.unit}" if isinstance(position, PositionSample) else "?"
         what = state_word(state) if state else "unknown"
         target.show(axis, f"{axis.axis:8} {axis.model:14} {axis.bus}/{axis.address:<4} {where:20} {what}")
+
+
+@command.command()
+@click.argument("axis", type=AXIS)
+@with_target
+def faults(target: Target, axis: str) -> None:
+    """Show the faults that AXIS has had, oldest first; `ldcnd fault CODE` explains them."""
+    for each in target.run(lambda client: axis_of(client, axis)).past_faults:
+        at = datetime.fromtimestamp(each.since / 1e9, UTC).isoformat(timespec="milliseconds")
+        target.show(each, f"{at} {each.code:16} {each.source:7} {each.text}")
 
 
 @command.command()

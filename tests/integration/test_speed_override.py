@@ -6,6 +6,7 @@ import pytest
 
 from ldcnd.errors import LeaseHeld, WrongState
 from ldcnd.model.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, Preview, SetPwm, Track
+from ldcnd.model.events import ReadEvents
 from ldcnd.model.rig_commands import Acquire, SetSpeedOverride
 from ldcnd.model.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
@@ -135,3 +136,19 @@ async def test_anyone_may_lower_it_and_raising_it_needs_control():
         with pytest.raises(LeaseHeld):
             await override(rig, 50)
         assert (await override(rig, 50, leases=(held.lease,))).percent == 50
+
+
+async def test_the_expected_end_follows_the_speed_of_a_move_under_way():
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
+        await asyncio.sleep(0.3)
+        before = (await rig.rig.client.state(AXIS)).command.expected_end
+        await override(rig, 25)
+        after = (await rig.until(lambda state: state.command.expected_end != before)).command.expected_end
+        await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+        events = (await rig.rig.client.ask(ReadEvents(axis=AXIS))).events
+        (ended,) = [each for each in events if each.command_id == sent.command_id and each.status == "done"]
+
+        assert after > before + 3e9
+        assert 0 <= (ended.t - after) / 1e9 < 0.3

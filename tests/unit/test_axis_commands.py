@@ -30,6 +30,7 @@ from ldcnd.model.commands import (
     SetGains,
     SetOutputs,
     SetPosition,
+    Verb,
 )
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.samples import AxisState, Moving
@@ -503,3 +504,27 @@ async def test_an_unknown_outcome_of_a_start_keeps_the_command_and_a_stop_ends_i
         await bench.stop()
 
         assert bench.ended[-1][:2] == ("first", CommandStatus.ABORTED)
+
+
+@pytest.mark.parametrize("error", [LeaseExpired("not renewed"), ReplyTimeout("no answer")], ids=["refused", "lost"])
+async def test_an_aborting_move_that_is_not_started_in_mid_move_brings_the_one_before_to_rest(error):
+    async with axis_bench() as bench:
+        bench.drive.retargets = True
+        await bench.send(MoveAbsolute(position=10.0), "first")
+        await bench.pass_s(0.1, **RUNNING)
+        bench.drive.told.clear()
+        bench.drive.during["start"] = raising(error)
+        then = MoveAbsolute(position=20.0, buffer_mode="aborting")
+
+        with pytest.raises(type(error)):
+            await bench.axis.in_turn(then, bench.axis.permit(Verb.MOVE_ABSOLUTE), lambda: bench.send(then, "second"))
+        state, told = bench.tracker.state, bench.drive.calls
+        await bench.settled(enabled=True)
+
+        assert told == ["load", "start", "stop"]
+        assert state is AxisState.STOPPING
+        assert bench.tracker.state is AxisState.STANDSTILL
+        assert bench.ended == [
+            ("first", CommandStatus.ABORTED, "aborted by move_absolute"),
+            ("second", CommandStatus.FAILED, error.message),
+        ]

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
 from ldcnd.daemon.axis.permit import cannot
 from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
@@ -458,6 +458,14 @@ class AxisCommands:
             return False  # it has ended meanwhile: what was loaded is not started
         await turn.permit.start()
         self._moved = turn, changed, share
+        way = abs((changed.target_counts or 0) - self._motion.latest().position_counts)
+        tracker.ends_after(
+            rest_of_profile_s(
+                way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
+            ),
+            self._motion.clock.now_s(),
+            self._motion.clock.now_ns(),
+        )
         return True
 
     # -- registers ---------------------------------------------------------------------------------------------------

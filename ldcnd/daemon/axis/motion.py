@@ -25,7 +25,7 @@ from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion, Sett
 from ldcnd.daemon.axis.straight import LineAxis
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
-from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Homes, Motion
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Homes, Motion, StopMode
 from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import (
     BusError,
@@ -178,6 +178,12 @@ def profile_duration_s(distance: float, velocity: float, acceleration: float) ->
     if distance * acceleration < velocity * velocity:
         return 2 * math.sqrt(distance / acceleration)
     return distance / velocity + velocity / acceleration
+
+
+def rest_of_profile_s(way: float, before: float, after: float, acceleration: float) -> float:
+    """Return how long a trapezoid takes that slews and goes on at another velocity; any consistent units, positive."""
+    change_s = (after - before) / acceleration
+    return way / after + after / (2 * acceleration) + change_s * abs(after - before) / (2 * after)
 
 
 class AxisMotion:
@@ -361,6 +367,7 @@ class AxisMotion:
     ) -> None:
         """Start what was loaded, if that is still permitted; the state says so before the drive does."""
         turn.permit.ask_to_move()
+        in_motion = self.tracker.command is not None and not self.tracker.at_rest
         self.begin(turn.command_id, turn.verb, state, completion, opens_loop=opens_loop, plan=plan)
         try:
             await turn.permit.start()
@@ -368,10 +375,25 @@ class AxisMotion:
             self.tracker.started(self.clock.now_s())  # the next readings tell
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
-            self.tracker.finished(error.message)
+            if in_motion:
+                await self._end_what_went_before(turn, error)
+            else:
+                self.tracker.finished(error.message)
             self.publish_state()
             raise
         self.tracker.started(self.clock.now_s())
+
+    async def _end_what_went_before(self, turn: Turn, error: BusError | RequestRefused) -> None:
+        """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""
+        command = self.tracker.command
+        if command is None or command.command_id != turn.command_id:
+            return  # a stop has taken over
+        self.tracker.started(self.clock.now_s())
+        self.tracker.failing(error.message)
+        await self.driver.stop(StopMode.SMOOTH)
+        if self.tracker.command is command:
+            self.stopping(turn.command_id, turn.verb)
+            self.tracker.failing(error.message)
 
     def begin(
         self,

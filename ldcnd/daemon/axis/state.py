@@ -515,6 +515,12 @@ class AxisTracker:
             self._ends_at_s = now_s + self.command.duration_s
         self._rest.forget(rests=False, commanded=True)
 
+    def ends_after(self, rest_s: float, now_s: float, now_ns: int) -> None:
+        """The motion under way goes on at another speed, and its profile should end so much later."""
+        if self.command:
+            self.command = replace(self.command, duration_s=(now_ns - self.command.since_ns) / 1e9 + rest_s)
+            self._ends_at_s = now_s + rest_s
+
     def failing(self, reason: str) -> None:
         """The active command will not end as it was asked, for this reason, once the axis has come to rest."""
         self._failure = reason
