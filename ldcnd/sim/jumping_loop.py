@@ -34,16 +34,26 @@ class Arrival:
 
 
 class _JumpingSelector(selectors.SelectSelector):
-    """Never waits: with nothing ready, the clock moves on to the next timer or arrival."""
+    """Never waits: with nothing ready, the clock moves on to the next timer or arrival.
+
+    Attributes:
+        poked: the loop's own pipe was written to; as long as it was not, and nothing else is watched, nothing is ready.
+        signalled: signals write to that pipe too.
+    """
 
     def __init__(self, now_s: float, awake_at_s: Sequence[float]) -> None:
         super().__init__()
+        self.poked = True
+        self.signalled = False
         self.now_s = now_s
         self.awake_at_s = sorted(awake_at_s)
         self.arrivals: list[tuple[float, int, Arrival]] = []
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(0)
+        ready: list[tuple[selectors.SelectorKey, int]] = []
+        if self.poked or self.signalled or timeout is None or len(self.get_map()) > 1:
+            self.poked = False
+            ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
             return ready
         while self.arrivals and self.arrivals[0][2].callback is None:
@@ -86,6 +96,21 @@ class JumpingLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         """Return virtual seconds."""
         return self._jumping.now_s
+
+    def _write_to_self(self) -> None:
+        """Wake the loop, from a thread or a signal handler: the next look is a real one."""
+        super()._write_to_self()  # type: ignore[misc] # known to asyncio's loops, not to their types
+        self._jumping.poked = True
+
+    def add_signal_handler(  # type: ignore[override] # as below
+        self,
+        sig: int,
+        callback: Callable[..., object],
+        *args: Any,  # noqa: ANN401 - whatever the callback takes
+    ) -> None:
+        """Handle a signal: from now on every look is a real one, for a signal writes to the pipe by itself."""
+        super().add_signal_handler(sig, callback, *args)
+        self._jumping.signalled = True
 
     def hold_up(self, duration_s: float) -> None:
         """Let time pass as if the callback that runs now had taken so long."""

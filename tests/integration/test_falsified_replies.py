@@ -38,7 +38,7 @@ async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_publish
             for axis in "xyzc":
                 await rig.until(axis, lambda _: True)
                 await rig.client.command(axis, Power(on=True))
-            while len(published) < 1000:
+            while len(published) < 600:
                 _, sample = await anext(positions)
                 assert isinstance(sample, PositionSample)
                 published.append(sample)

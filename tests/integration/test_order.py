@@ -35,7 +35,7 @@ overload = "skip"
 
 @pytest.fixture
 def polls(tmp_path):
-    """Count the polls of two seconds of a saturated line with another order in its file."""
+    """Count the polls of a second of a saturated line with another order in its file."""
 
     async def run(order: str) -> int:
         path = tmp_path / "rig.toml"
@@ -45,7 +45,7 @@ def polls(tmp_path):
             await asyncio.sleep(1.0)
             statistics = rig.daemon.rig.buses[0].bus.statistics
             before = statistics.replies
-            await asyncio.sleep(2.0)
+            await asyncio.sleep(1.0)
             return statistics.replies - before
 
     return run

@@ -1,5 +1,8 @@
 import asyncio
 import random
+import signal
+import socket
+import threading
 
 import pytest
 
@@ -44,3 +47,37 @@ def test_a_timer_never_comes_early_and_at_whole_nanoseconds(starts_at_s):
 
     with asyncio.Runner(loop_factory=lambda: JumpingLoop(starts_at_s)) as runner:
         runner.run(wait())
+
+
+async def test_what_a_thread_hands_over_comes_while_timers_run():
+    loop, came = asyncio.get_running_loop(), asyncio.Event()
+    thread = threading.Thread(target=loop.call_soon_threadsafe, args=(came.set,))
+    thread.start()
+    thread.join()
+
+    async with asyncio.timeout(1.0):
+        await came.wait()
+
+    assert loop.time() == 0.0
+
+
+async def test_a_signal_comes_while_timers_run():
+    loop, came = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_signal_handler(signal.SIGUSR2, came.set)
+    try:
+        await asyncio.sleep(1.0)
+        signal.raise_signal(signal.SIGUSR2)
+        async with asyncio.timeout(1.0):
+            await came.wait()
+    finally:
+        loop.remove_signal_handler(signal.SIGUSR2)
+
+
+async def test_a_socket_is_read_while_timers_run():
+    loop = asyncio.get_running_loop()
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        ours.settimeout(0.0)
+        theirs.sendall(b"x")
+        async with asyncio.timeout(1.0):
+            assert await loop.sock_recv(ours, 1) == b"x"
