@@ -161,7 +161,7 @@ class Tuned:
     farthest_counts: float
 
     @property
-    def worst_error(self) -> float:
+    def acceleration_error(self) -> float:
         """How far the acceleration is from the truth, as a share."""
         return abs(self.known.plant.acceleration / self.true.acceleration - 1)
 

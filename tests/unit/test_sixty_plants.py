@@ -1,5 +1,6 @@
 """Sixty machines drawn by lot, tuned from their traces alone."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,11 @@ SAMPLES_S = 0.005
 """Two samples of a trace: what settles within so much of each other settles alike."""
 
 
+def settles_as_well(outcome):
+    usual = outcome.reference.settling_s if outcome.reference.settled else math.inf
+    return outcome.measured.settled and outcome.measured.settling_s <= usual + SAMPLES_S
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 def test_sixty_drawn_machines_are_identified_and_tuned():
@@ -22,7 +28,8 @@ def test_sixty_drawn_machines_are_identified_and_tuned():
         found.append((plant, tuned(PIC_SERVO_V4, plant)))
         print(found[-1][1].known, found[-1][1].measured, found[-1][1].reference)
 
-    assert sum(outcome.worst_error < 0.1 for _, outcome in found) >= 0.95 * PLANTS
+    assert sum(outcome.acceleration_error < 0.1 for _, outcome in found) >= 0.95 * PLANTS
+    assert sum(settles_as_well(outcome) for _, outcome in found) >= 0.85 * PLANTS
     for plant, outcome in found:
         assert outcome.measured.settled, plant
         assert not outcome.tripped, plant

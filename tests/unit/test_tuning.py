@@ -173,7 +173,7 @@ def test_of_a_drawn_machine_traces_tell_the_inertia_and_gains_suit_it(number):
 
     outcome = tuned(PIC_SERVO_V4, plant, bandwidth_hz=23.0)  # to search all would cost seconds
 
-    assert outcome.worst_error < 0.1
+    assert outcome.acceleration_error < 0.1
     assert outcome.measured.settled
     assert not outcome.tripped
     assert outcome.measured.overshoot < 0.15
