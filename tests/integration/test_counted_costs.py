@@ -33,7 +33,7 @@ class Bound:
     bytecodes: float = 0.0
 
 
-POLL = Bound(calls=69, turns=3.4, bytecodes=3080)
+POLL = Bound(calls=69, turns=3.4, bytecodes=3095)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
 COMMAND = Bound(calls=1335, turns=77)
 """A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;

@@ -324,13 +324,13 @@ class AxisService:
         tracker, gate = self.tracker, self._plausibility
         verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
         if verdict is Verdict.BELIEVED:
-            if gate.zeroed:
-                self._changed_by_another(DRIVE_RESET, "its position counter has begun anew at 0")
-                tracker.referenced = False
-            elif gate.jumped and tracker.command is None:
-                log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
-                tracker.jumped()
             if gate.confirmed:  # what only the first of two readings was asked for is true as well
+                if gate.zeroed:
+                    self._changed_by_another(DRIVE_RESET, "its position counter has begun anew at 0")
+                    tracker.referenced = False
+                elif gate.jumped and tracker.command is None:
+                    log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
+                    tracker.jumped()
                 first, first_timing = gate.confirmed
                 self.observed(first, first.asked - asked, first_timing)
             self.observed(reading, asked, timing)
@@ -350,7 +350,8 @@ class AxisService:
         was_referenced = tracker.referenced
         if tracker.command:
             arrivals.reading = reading
-        self._audit(reading, timing)
+        if reading.altered != self._altered or not reading.profile_done:  # a call less for each poll of what stands
+            self._audit(reading, timing)
         tracker.observed(reading, timing, self._clock.now_ns())
         if was_away and self.returned:
             self.returned()

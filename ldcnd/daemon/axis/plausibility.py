@@ -52,7 +52,7 @@ class PlausibilityGate:
 
     Attributes:
         jumped: the reading that was believed last is where no motion can have led since the one before.
-        zeroed: the drive's counter has gone to about 0, and no motion has led there: it was reset.
+        zeroed: the drive's counter has gone to about 0, and no motion has led there: reset; with `confirmed`.
         foreign: the reading that was judged last, and not believed, is where no motion can have led: it may be another
             drive's.
         confirmed: the reading that the one that was believed last has confirmed, and when; None if it needed no other.
@@ -92,7 +92,7 @@ class PlausibilityGate:
             standing: the axis was at rest, and nothing was commanded since.
         """
         known = self._known
-        self.jumped, self.zeroed, self.confirmed, self.foreign = False, False, None, False
+        self.jumped, self.confirmed, self.foreign = False, None, False
         if known is None:
             return self._believe(reading, timing)
         if self._follows(known, reading, timing, NOISE_COUNTS if standing else None):
