@@ -196,7 +196,7 @@ async def test_outputs_need_the_lease_of_the_line_and_no_latched_stop():
 
 @pytest.mark.parametrize(
     ("module", "message"),
-    [({"name": "x"}, "x"), ({"model": "pic-step"}, "no lines to serve"), ({"name": None}, "without a name")],
+    [({"name": "x"}, "x"), ({"model": "pic-step"}, "no lines to serve"), ({"name": None}, "with a name of the module")],
 )
 def test_impossible_modules_are_refused_in_the_configuration(module, message):
     with pytest.raises(ValidationError, match=message):

@@ -170,19 +170,21 @@ async def test_values_that_cannot_be_make_the_layout_uncertain():
     assert "hardly laid out as lsb-io-shift" in trace.header.problem
 
 
-async def test_instant_of_the_trigger_is_within_its_error():
+@pytest.mark.parametrize("after_s", [0.7, 1.7])
+async def test_instant_of_the_trigger_is_within_its_error(after_s):
     async with trace_rig() as under_test:
         loop = asyncio.get_running_loop()
         client = under_test.rig.client
         reply = await arm_trace(client, "feed", trace_request())
-        await asyncio.sleep(0.7)
+        await asyncio.sleep(after_s)
         pulses_at_ns = EPOCH_NS + round(loop.time() * 1e9)
         under_test.pulses(10_000.0)
         header = await wait_for_trace(client, "feed", reply.trace_id, 60)
 
     # the motor reaches the level within some 10 ms of the first pulse
     assert abs(header.t - pulses_at_ns - 5_000_000) <= header.t_error_ns + 10_000_000
-    assert header.t_error_ns < 300_000_000
+    # the mode is read every 0.2 s, comparisons of the trace and slow polls come between
+    assert header.t_error_ns < 600_000_000
 
 
 async def test_second_unit_keeps_its_rate_while_a_trace_uploads():

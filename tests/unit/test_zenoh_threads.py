@@ -32,6 +32,7 @@ def threads() -> list[Path]:
     return list(Path("/proc/self/task").iterdir())
 
 
+ENOUGH = 8
 LISTENING = """
 import asyncio, sys
 from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
@@ -41,8 +42,13 @@ async def main():
         open_zenoh_session(ZenohSettings(listen=(sys.argv[1],))),
         open_zenoh_session(ZenohSettings(connect=(sys.argv[1],), mode="client")),
     ):
-        names = [(thread / "comm").read_text() for thread in Path("/proc/self/task").iterdir()]
-        print(sum(name.startswith("tx-") for name in names))
+        senders = 0
+        async with asyncio.timeout(20):
+            while senders < int(sys.argv[2]):  # a thread that has just begun has no name yet
+                await asyncio.sleep(0.01)
+                names = [(thread / "comm").read_text() for thread in Path("/proc/self/task").iterdir()]
+                senders = sum(name.startswith("tx-") for name in names)
+        print(senders)
 asyncio.run(main())
 """
 
@@ -51,9 +57,11 @@ asyncio.run(main())
 async def test_a_daemon_starts_enough_sending_threads():
     """While one closes the link of a client that takes nothing, the others send."""
     program = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", LISTENING, free_endpoint(), stdout=asyncio.subprocess.PIPE, cwd=Path(__file__).parents[2]
+        *(sys.executable, "-c", LISTENING, free_endpoint(), f"{ENOUGH}"),
+        stdout=asyncio.subprocess.PIPE,
+        cwd=Path(__file__).parents[2],
     )
     async with asyncio.timeout(30):
         said, _ = await program.communicate()
 
-    assert int(said) >= 8
+    assert int(said) >= ENOUGH
