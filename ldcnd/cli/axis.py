@@ -177,7 +177,7 @@ def move(
 @click.option("--velocity", type=Finite(), help="Search velocity, signed; units a second.")
 @click.option("--find-velocity", type=Finite(), help="Speed at which a limit switch is found first; units a second.")
 @click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
-@click.option("--position", type=Finite(), help="What the position is called there.")
+@click.option("--position", type=Finite(), help="Value of the reference position.")
 @click.option("--timeout", "timeout_s", type=Finite(), help="Longest search, in seconds.")
 @click.option("--distance", type=Finite(), help="Longest search, in axis units.")
 @click.option("--stop", type=click.Choice([stop.value for stop in HomeStop]), help="How the motor stops there.")

@@ -103,8 +103,7 @@ class AxisVerbs(ABC):
         """Move to a position on a trapezoidal profile.
 
         Args:
-            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
-                new move.
+            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
             position: Target in axis units; on an axis with a modulo any turn of it is meant.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
@@ -128,11 +127,10 @@ class AxisVerbs(ABC):
         velocity: float | None = None,
         acceleration: float | None = None,
     ) -> Motion:
-        """Move by a distance from where the axis is told to be; becomes absolute when it is admitted.
+        """Move by a distance from the commanded position; becomes absolute when it is admitted.
 
         Args:
-            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
-                new move.
+            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
             distance: Distance in axis units, signed.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
@@ -149,8 +147,7 @@ class AxisVerbs(ABC):
         """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
 
         Args:
-            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
-                new move.
+            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
         """
@@ -167,11 +164,10 @@ class AxisVerbs(ABC):
         hold_s: float = 0.4,
         renews: str | None = None,
     ) -> Motion:
-        """Run at a velocity for as long as a hand says that it is held; ends by itself when nothing is heard of that.
+        """Run at a velocity for as long as the client renews the hold; ends by itself when no renewal arrives.
 
         Args:
-            buffer_mode: What happens if the axis moves already; the answer comes when the drive has acknowledged the
-                new move.
+            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
             hold_s: Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog.
@@ -204,17 +200,17 @@ class AxisVerbs(ABC):
         stop: HomeStop | None = None,
         move_to: float | None = None,
     ) -> Motion:
-        """Find the reference position; what is missing comes from the axis's configuration.
+        """Find the reference position; missing values come from the axis's configuration.
 
         Args:
-            method: What marks the reference position.
+            method: Signal that marks the reference position.
             velocity: Search velocity in units a second, positive forward, not 0. On the index at most 0.75 of an index
                 width in a servo cycle: a faster search is refused with the nearest velocity.
             find_velocity: Speed at which a limit switch is found first, in units a second; the axis then moves off it
                 and comes back at `velocity` to take the reference over. A missing one, and any other method, searches
                 at `velocity` alone.
             acceleration: Acceleration in units a second squared.
-            position: What the position is called there, in axis units.
+            position: Value of the reference position, in axis units.
             timeout_s: Longest search, in seconds; moving off a limit switch first counts as a search of its own.
             distance: Longest search, in axis units; a missing one is as far as the velocity goes in that time.
             stop: How the motor stops there.
@@ -247,8 +243,8 @@ class AxisVerbs(ABC):
         """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
 
         Args:
-            sources: What latches: any change of a limit switch input, an index pulse, the current limit; the first of
-                them counts.
+            sources: Signals that latch: any change of a limit switch input, an index pulse, the current limit; the
+                first counts.
             position: Where the move ends at the latest, in axis units; needs a referenced axis.
             distance: How far it goes at most, in axis units, signed.
             velocity: Speed in units a second; the axis default when missing. On the index at most 0.75 of an index
@@ -272,10 +268,10 @@ class AxisVerbs(ABC):
         return await self._send(Reset)
 
     async def set_position(self, position: float) -> CommandReply:
-        """Tell a standing axis where it is; afterwards it is referenced.
+        """Set the position of an axis at standstill; afterwards it is referenced.
 
         Args:
-            position: What the present position is called, in axis units.
+            position: New value of the present position, in axis units.
         """
         return await self._send(lambda: SetPosition(position=position))
 
@@ -303,7 +299,8 @@ class AxisVerbs(ABC):
             cl: Current limit: 0 is off; odd where the sense voltage rises with the current, even where it falls.
             el: Position error limit.
             deadband: Amplifier deadband compensation.
-            sr: Servo rate divisor; it changes what velocities mean to the drive, so only a standing axis takes it.
+            sr: Servo rate divisor; it changes the unit of velocities in the drive, so only an axis at standstill
+                accepts it.
         """
         return await self._send(
             lambda: SetGains(kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr)
@@ -435,7 +432,7 @@ class AxisVerbs(ABC):
 
         Args:
             duty: Share of the supply voltage, positive forward.
-            duration_s: How long, in seconds.
+            duration_s: Duration, in seconds.
         """
         return await self._start(lambda: SetPwm(duty=duty, duration_s=duration_s))
 
@@ -461,7 +458,7 @@ class AxisVerbs(ABC):
         return await self._send(AbortTrace)
 
     async def why(self, *, absolute: bool = True) -> WhyReply:
-        """Ask why an axis cannot move.
+        """Report why an axis cannot move.
 
         Args:
             absolute: Whether the motion would name a position, which needs a referenced axis.
@@ -477,7 +474,7 @@ class AxisVerbs(ABC):
         velocity: float | None = None,
         acceleration: float | None = None,
     ) -> PreviewReply:
-        """Ask what a motion would do; exactly one of position, distance and velocity-alone says which motion is meant.
+        """Compute what a motion would do; exactly one of position, distance and velocity alone selects the motion.
 
         Args:
             position: A move to this position, in axis units.

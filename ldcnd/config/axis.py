@@ -44,7 +44,7 @@ class HomeConfig(Frozen):
     """How `home` searches when the request does not say."""
 
     method: HomeMethod
-    """What marks the reference position."""
+    """Signal that marks the reference position."""
     velocity: float
     """Units a second, positive forward; on the index at most 0.75 of an index width in a servo cycle."""
     find_velocity: float | None = Field(default=None, gt=0)
@@ -52,7 +52,7 @@ class HomeConfig(Frozen):
     index_width: int = Field(default=1, ge=1)
     """Counts for which the index pulse lasts: 1 for one that is gated with both tracks, 4 for one that is not."""
     position: float = 0.0
-    """What the position is called there, in axis units."""
+    """Value of the reference position, in axis units."""
     timeout_s: float = Field(default=60.0, gt=0, le=3600)
     """Longest search, in seconds."""
     distance: float | None = Field(default=None, gt=0)

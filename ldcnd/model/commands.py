@@ -1,9 +1,9 @@
-"""What an axis can be asked to do: one class for each command, and what every command has in common.
+"""The commands of an axis: one class for each command, and the base classes that they share.
 
 A command is sent as the payload of a query on `@cmd/<axis>/<verb>`, or on `@cmd/_/<verb>` when it is about the rig. Its
-class says everything about it: keys, schemas, time-outs, access rules and the tables of the command line, the console
-and the documentation are derived from its attributes. Commands about parameters, traces and events stand beside what
-they answer with; `ldcnd.model.catalogue` has them all.
+class is the only definition: keys, schemas, time-outs, access rules and the tables of the command line, the console
+and the documentation are derived from its attributes. Commands about parameters, traces and events are defined beside
+their replies; `ldcnd.model.catalogue` has them all.
 """
 
 from enum import StrEnum
@@ -19,15 +19,15 @@ from ldcnd.model.frozen import Frozen
 LARGEST_INTEGER = 2**53 - 1
 """The largest integer that every reader of JSON keeps exactly."""
 LONGEST_NAME = 64
-"""Characters of a name or an id that a client gives."""
+"""Longest name or id that a client may give, in characters."""
 ANSWER_S = 5.0
 """Longest wait of a client for the reply to a command that is a few exchanges with its drive, in seconds."""
 REPLAYED_WITHIN_S = 3600.0
-"""A command id is remembered for so long, in seconds, once the command has come."""
+"""Time for which a command id is remembered after the command has arrived, in seconds."""
 
 
 class Verb(StrEnum):
-    """What an axis can be asked to do, and the last chunk of the key; what it cannot is refused as not_supported."""
+    """The commands of an axis and the last chunks of their keys; a drive without the capability: not_supported."""
 
     POWER = "power"
     MOVE_ABSOLUTE = "move_absolute"
@@ -61,14 +61,14 @@ class Verb(StrEnum):
 
 
 class About(StrEnum):
-    """What a command names: an axis, or the rig as a whole."""
+    """Target of a command: an axis, or the rig as a whole."""
 
     AXIS = "axis"
     RIG = "rig"
 
 
 class Effect(StrEnum):
-    """What a command does to the rig."""
+    """Effect of a command on the rig."""
 
     QUESTION = "question"
     """Changes nothing: it needs no lease and leaves no event."""
@@ -90,7 +90,7 @@ class Ends(StrEnum):
 
 
 class Capability(StrEnum):
-    """What a drive must have to take a command."""
+    """Function of a drive that a command needs."""
 
     MOTION = "motion"
     """A position loop that takes commands over its line."""
@@ -101,7 +101,7 @@ class Capability(StrEnum):
 
 
 class Role(StrEnum):
-    """What a login is good for."""
+    """Permissions of a login."""
 
     VIEWER = "viewer"
     """Reads everything, and may stop."""
@@ -123,7 +123,7 @@ def _schema_title(command: type) -> str:
 
 
 class Command(Frozen, Generic[ReplyT_co]):
-    """The base of all commands, generic in what a command is answered with.
+    """The base of all commands, generic in the type of the reply.
 
     Attributes:
         verb: last chunk of its key.
@@ -132,7 +132,7 @@ class Command(Frozen, Generic[ReplyT_co]):
         needs_lease: where leases are required, it is refused without one.
         ends: when it is over.
         answer_s: longest wait of a client for its reply, in seconds.
-        role: the least that a login must be good for to send it.
+        role: the lowest role of a login that may send it.
     """
 
     model_config = ConfigDict(model_title_generator=_schema_title)
@@ -148,17 +148,17 @@ class Command(Frozen, Generic[ReplyT_co]):
     if not TYPE_CHECKING:  # the reply is no part of the fields: pydantic need not make a model for each
 
         def __class_getitem__(cls, reply: object) -> GenericAlias:
-            """Return the class with what it is answered with."""
+            """Return the class with the type of its reply."""
             return GenericAlias(cls, reply)
 
     @classmethod
     def reply_model(cls) -> type[ReplyT_co]:
-        """Return what the command is answered with."""
+        """Return the type of the command's reply."""
         return _reply_model(cls)
 
     @classmethod
     def summary(cls) -> str:
-        """Return the first line of what the class says about itself."""
+        """Return the first line of the class's docstring."""
         return (cls.__doc__ or "").strip().partition("\n")[0]
 
 
@@ -173,10 +173,10 @@ def _reply_model(command: type[Command[ReplyT_co]]) -> type[ReplyT_co]:
 
 
 class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
-    """The base of what one axis is told to do: with what proves that it may be carried out, and only once.
+    """The base of commands to one axis, with the fields that prove permission and prevent a second execution.
 
     Attributes:
-        capability: what a drive must have to take it.
+        capability: function of a drive that it needs.
     """
 
     about: ClassVar[About] = About.AXIS
@@ -189,20 +189,20 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
     Remembered for an hour, and under a lease with a sequence for as long as the daemon runs; what may be delivered
     later than that carries `not_after` or `instance`."""
     client: str | None = Field(default=None, max_length=LONGEST_NAME)
-    """Who sends it: a name for people, in events and the log; not authenticated. A lease knows its own."""
+    """Sender: a name for people, in events and the log; not authenticated. A lease has its own."""
     lease: str | None = None
     """The lease under which it is sent."""
     sequence: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
     """Grows with every command under the lease; an older one that comes later is refused."""
     instance: str | None = None
-    """The run of the daemon that it is meant for, as in `meta/daemon`; after a restart, which forgets all command ids,
-    a command that was sent again is refused instead of being carried out twice."""
+    """The run of the daemon for which it is meant, as in `meta/daemon`. A restart discards all command ids; with this
+    field a command that is sent again after a restart is refused instead of being carried out twice."""
     not_after: int | None = Field(default=None, ge=0, le=2**63 - 1)
     """Do not start it after this instant, UTC in ns since 1970; needs clocks that agree."""
 
 
 class CommandReply(Frozen):
-    """The drive acknowledged the command. Values are what the drive's registers make of those that were asked for."""
+    """The drive acknowledged the command. Values are those requested, as rounded by the drive's registers."""
 
     command_id: str
     """Names the command in `state`, in events and in the log."""
@@ -245,11 +245,11 @@ class RemedyStep(Frozen):
     said: str
     """The words of the remedy that name it."""
     arguments: dict[str, bool | float | str] = Field(default_factory=dict)
-    """What it is to carry."""
+    """The arguments of the command."""
 
 
 class ReceivedError(Frozen):
-    """Why a query was not carried out, as a client reads it: the daemon may be newer and know more codes."""
+    """Why a query was not carried out, as a client reads it: a newer daemon may have more codes."""
 
     code: str = Field(description="what went wrong")
     message: str = Field(description="one sentence for a person: what, to whom, which value, which limit")
@@ -282,25 +282,25 @@ class Power(AxisCommand[CommandReply]):
 
 
 class BufferMode(StrEnum):
-    """What a move does that finds the axis moving; PLCopen's buffer modes, and a refusal."""
+    """Effect of a move on an axis that moves already; PLCopen's buffer modes, and a refusal."""
 
     REFUSE = "refuse"
-    """It is refused: the sender did not know of the motion under way."""
+    """The move is refused: the sender was not aware of the motion under way."""
     ABORTING = "aborting"
-    """What it was doing ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that drive
-    goes on to the new goal within the new velocity and acceleration, without a halt."""
+    """The command under way ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that
+    drive goes on to the new goal within the new velocity and acceleration, without a halt."""
     BUFFERED = "buffered"
-    """It waits until what the axis is doing has ended."""
+    """The move waits until the command under way has ended."""
 
 
 class Move(AxisCommand[CommandReply]):
-    """What the moves have in common."""
+    """The base of the moves."""
 
     effect = Effect.MOTION
     ends = Ends.BY_READING
 
     buffer_mode: BufferMode = BufferMode.REFUSE
-    """What happens if the axis moves already; the answer comes when the drive has acknowledged the new move."""
+    """Effect if the axis moves already; the reply comes when the drive has acknowledged the new move."""
 
 
 class Direction(StrEnum):
@@ -327,7 +327,7 @@ class MoveAbsolute(Move):
 
 
 class MoveRelative(Move):
-    """Move by a distance from where the axis is told to be; becomes absolute when it is admitted."""
+    """Move by a distance from the commanded position; becomes absolute when it is admitted."""
 
     verb = Verb.MOVE_RELATIVE
 
@@ -358,7 +358,7 @@ SHORTEST_HOLD_S, LONGEST_HOLD_S = 0.2, 1.0
 
 
 class Jog(Move):
-    """Run at a velocity for as long as a hand says that it is held; ends by itself when nothing is heard of that.
+    """Run at a velocity for as long as the client renews the hold; ends by itself when no renewal arrives.
 
     The first one begins the jog. Later ones that carry its `command_id` in `renews` keep it alive, and may change its
     velocity; they begin nothing: a jog that is over stays over. `halt` ends it.
@@ -402,7 +402,7 @@ class QuickStop(AxisCommand[CommandReply]):
 
 
 class HomeMethod(StrEnum):
-    """What marks the reference position."""
+    """Signal that marks the reference position."""
 
     INDEX = "index"
     FORWARD_LIMIT = "forward_limit"
@@ -423,7 +423,7 @@ class HomeStop(StrEnum):
 
 
 class Home(AxisCommand[CommandReply]):
-    """Find the reference position; what is missing comes from the axis's configuration.
+    """Find the reference position; missing values come from the axis's configuration.
 
     An axis that stands on the limit switch it is to run onto moves off it first.
     """
@@ -433,7 +433,7 @@ class Home(AxisCommand[CommandReply]):
     ends = Ends.BY_READING
 
     method: HomeMethod | None = None
-    """What marks the reference position."""
+    """Signal that marks the reference position."""
     velocity: float | None = None
     """Search velocity in units a second, positive forward, not 0. On the index at most 0.75 of an index width in a \
 servo cycle: a faster search is refused with the nearest velocity."""
@@ -443,7 +443,7 @@ servo cycle: a faster search is refused with the nearest velocity."""
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared."""
     position: float | None = None
-    """What the position is called there, in axis units."""
+    """Value of the reference position, in axis units."""
     timeout_s: float | None = Field(default=None, gt=0, le=3600)
     """Longest search, in seconds; moving off a limit switch first counts as a search of its own."""
     distance: float | None = Field(default=None, gt=0)
@@ -455,7 +455,7 @@ servo cycle: a faster search is refused with the nearest velocity."""
 
 
 class ProbeSource(StrEnum):
-    """What latches the position of a probe."""
+    """Signal that latches the position of a probe."""
 
     INDEX = "index"
     FORWARD_LIMIT = "forward_limit"
@@ -483,7 +483,7 @@ class Probe(AxisCommand[CommandReply]):
     ends = Ends.BY_READING
 
     sources: tuple[ProbeSource, ...] = Field(min_length=1, max_length=4)
-    """What latches: any change of a limit switch input, an index pulse, the current limit; the first of them counts."""
+    """Signals that latch: any change of a limit switch input, an index pulse, the current limit; the first counts."""
     position: float | None = None
     """Where the move ends at the latest, in axis units; needs a referenced axis."""
     distance: float | None = None
@@ -504,12 +504,12 @@ class Reset(AxisCommand[CommandReply]):
 
 
 class SetPosition(AxisCommand[CommandReply]):
-    """Tell a standing axis where it is; afterwards it is referenced."""
+    """Set the position of an axis at standstill; afterwards it is referenced."""
 
     verb = Verb.SET_POSITION
 
     position: float
-    """What the present position is called, in axis units."""
+    """New value of the present position, in axis units."""
 
 
 class SetGains(AxisCommand[CommandReply]):
@@ -534,7 +534,7 @@ class SetGains(AxisCommand[CommandReply]):
     deadband: int | None = Field(default=None, ge=0, le=0xFF)
     """Amplifier deadband compensation."""
     sr: int | None = Field(default=None, ge=1, le=0xFF)
-    """Servo rate divisor; it changes what velocities mean to the drive, so only a standing axis takes it."""
+    """Servo rate divisor; it changes the unit of velocities in the drive, so only an axis at standstill accepts it."""
 
 
 class MoveAnalog(AxisCommand[CommandReply]):
@@ -567,7 +567,7 @@ class SetPwm(AxisCommand[CommandReply]):
     duty: float = Field(ge=-1, le=1)
     """Share of the supply voltage, positive forward."""
     duration_s: float = Field(gt=0)
-    """How long, in seconds."""
+    """Duration, in seconds."""
 
 
 class Track(AxisCommand[CommandReply]):
@@ -582,7 +582,7 @@ class Track(AxisCommand[CommandReply]):
 
 
 class PinMode(StrEnum):
-    """What a limit switch pin does."""
+    """Use of a limit switch pin."""
 
     INPUT = "input"
     HIGH = "high"
@@ -609,7 +609,7 @@ class Cause(Frozen):
     code: str
     """The error code that a motion would be refused with."""
     text: str
-    """What is in the way."""
+    """The obstacle, in one sentence."""
     remedy: str | None
     """The command, or the hand, that clears it."""
     steps: tuple[RemedyStep, ...] = ()
@@ -624,15 +624,15 @@ class WhyReply(Frozen):
     axis: str
     """The axis."""
     can_move: bool
-    """Whether a motion within the limits would be accepted from the one who asks."""
+    """Whether a motion within the limits would be accepted from the sender."""
     causes: tuple[Cause, ...]
-    """What is in the way, in the order in which it has to be cleared."""
+    """The obstacles, in the order in which they have to be cleared."""
     first_fault: str | None
-    """What went wrong first, if anything did since the last reset."""
+    """The first fault since the last reset; null when there was none."""
 
 
 class Why(Command[WhyReply]):
-    """Ask why an axis cannot move."""
+    """Report why an axis cannot move."""
 
     verb = "why"
     about = About.AXIS
@@ -645,14 +645,14 @@ class Why(Command[WhyReply]):
 
 
 class PreviewReply(Frozen):
-    """What the motion would be; nothing was sent: the reply to `@cmd/<axis>/preview`."""
+    """The motion as it would be; nothing was sent: the reply to `@cmd/<axis>/preview`."""
 
     axis: str
     """The axis."""
     refusal: ErrorReply | None
     """Why its values would be refused, with the nearest that would not; null when they would be accepted."""
     obstacles: tuple[str, ...]
-    """What else is in the way now; see `why`."""
+    """The other obstacles now; see `why`."""
     position: float | None = None
     """Where it would end, in axis units; null when it has no end."""
     approach_from: float | None = None
@@ -660,21 +660,21 @@ class PreviewReply(Frozen):
     velocity: float | None = None
     """Velocity that the registers would hold, units a second."""
     velocity_error: float | None = None
-    """Held minus asked."""
+    """Held minus requested velocity, units a second."""
     acceleration: float | None = None
     """Acceleration that the registers would hold, units a second squared."""
     acceleration_error: float | None = None
-    """Held minus asked."""
+    """Held minus requested acceleration, units a second squared."""
     duration_s: float | None = None
     """Of the profile, without settling; null when it has no end."""
     packets: tuple[str, ...] = ()
-    """What would be sent, in hexadecimal."""
+    """The packets that would be sent, in hexadecimal."""
     bus_s: float | None = None
     """For how long that would occupy the line at most, in seconds."""
 
 
 class Preview(Command[PreviewReply]):
-    """Ask what a motion would do; exactly one of position, distance and velocity-alone says which motion is meant."""
+    """Compute what a motion would do; exactly one of position, distance and velocity alone selects the motion."""
 
     verb = "preview"
     about = About.AXIS
