@@ -1,4 +1,4 @@
-"""One bus: owns the port, opens it again when it is lost, and lets its users take turns on the line."""
+"""One bus: owns the port, reopens it after a loss, and schedules the exchanges of its users on the line."""
 
 import asyncio
 from typing import Any, TypeVar
@@ -21,17 +21,17 @@ from ldcnd.wirelog.recorder import WireEvent, WireLog
 
 MISSES_BEFORE_BACKOFF = 3
 MUTE_SHARE = 0.005
-"""Of the line's time, for polls that nobody answers."""
+"""Fraction of the line's time that polls without a reply may take, so that mute nodes cost the others little."""
 FIRST_BACKOFF_S = 0.05
 LONGEST_BACKOFF_S = 5.0
-"""A mute node is asked at least that often, whatever share of the line it takes."""
+"""Longest pause between two polls of a mute node, seconds, whatever fraction of the line they take."""
 
 
 class MuteNodes:
-    """Who does not answer.
+    """The nodes that do not reply.
 
     Attributes:
-        misses: exchanges in a row that were not answered, by node; without those that answer.
+        misses: consecutive exchanges without a reply, by node; nodes that reply are absent.
     """
 
     def __init__(self) -> None:
@@ -39,19 +39,19 @@ class MuteNodes:
         self._backed_off: set[int] = set()
 
     def failing(self) -> set[int]:
-        """Return the nodes that left their last exchange unanswered."""
+        """Return the nodes that did not reply to their last exchange."""
         return set(self.misses)
 
     def missed(self, node: int) -> None:
-        """Note an exchange without an answer."""
+        """Count an exchange without a reply."""
         self.misses[node] = self.misses.get(node, 0) + 1
 
     def pause_s(self, node: int, lost_s: float) -> float:
-        """Return for how long to leave a node alone, whose poll has just been lost.
+        """Return how long to pause polling a node whose poll has just been lost, in seconds.
 
         Args:
-            node: its miss was noted.
-            lost_s: what a poll that it does not answer costs the line.
+            node: its miss was counted.
+            lost_s: time that a poll without a reply takes on the line.
         """
         beyond = self.misses[node] - MISSES_BEFORE_BACKOFF
         if beyond < 0:
@@ -62,9 +62,9 @@ class MuteNodes:
         return min(doubled_s, many * lost_s / MUTE_SHARE, LONGEST_BACKOFF_S)
 
     def answered(self, node: int) -> int | None:
-        """Note an answer; return another node that is now worth asking at once, if this one had been given up.
+        """Note a reply; return another node to poll at once, if this one was backed off.
 
-        What made several nodes mute, a connector or the supply of one of them, often ends for all of them together.
+        A common cause, such as a connector or the supply of one node, often ends for all mute nodes together.
         """
         if self.misses.pop(node, None) is None or node not in self._backed_off:
             return None
@@ -72,7 +72,7 @@ class MuteNodes:
         return min(self._backed_off, key=lambda other: (other < node, other), default=None)  # the chain, once round
 
     def forget(self) -> None:
-        """Begin anew: the line was opened."""
+        """Clear all misses: the line was opened."""
         self.misses.clear()
         self._backed_off.clear()
 
@@ -84,7 +84,7 @@ log = get_logger("bus")
 FIRST_REOPEN_S = 0.1
 LONGEST_REOPEN_S = 2.0
 LONGEST_OPENING_S = 10.0
-"""Closing what was lost and opening a port anew are both bounded and together take less."""
+"""Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
 
 class Bus(Users):
@@ -113,11 +113,12 @@ class Bus(Users):
     async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
         """Run one exchange in its lane's turn and return the decoded reply.
 
-        With `once` it is not sent again when the node says that our packet was damaged: the damage may be in what the
-        node says, and then the packet was executed.
+        With `once` it is not sent again when the node reports that the packet was damaged: the damage may be in that
+        report, and then the packet was executed.
 
-        What can move is sent only if the condition of the caller's context (`only_while`) holds when its turn comes.
-        Cancelling the caller never leaves half a packet on the wire; what was sent is completed and its reply dropped.
+        An exchange that can cause motion is sent only if the condition of the caller's context (`only_while`) holds
+        when its turn comes. Cancelling the caller never leaves half a packet on the wire; a sent exchange completes
+        and its reply is dropped.
 
         Raises:
             BusDown: the line is not open, or was lost before the request was sent.
@@ -163,12 +164,12 @@ class Bus(Users):
         return await self._submit(exchange, Lane.COMMAND, at_baud=baud)
 
     async def probe_stop_wait(self) -> None:
-        """Measure how long a single stop would have to wait now: its place is taken by a question that moves nothing.
+        """Measure how long a single stop would have to wait now, with a harmless exchange in its place.
 
-        Real stops overtake it. What it finds is in `BusStatistics.stop_wait`. Without a node to ask, nothing is done.
+        Real stops overtake it. The result is in `BusStatistics.stop_wait`. Without a node to probe, it does nothing.
 
         Raises:
-            BusDown, ReplyTimeout, PacketRejected, BadReply: as `execute`; the question is not repeated.
+            BusDown, ReplyTimeout, PacketRejected, BadReply: as `execute`; the probe is not repeated.
         """
         exchange = self.resync.probe(self._mute.failing())
         if exchange is None or self._line is None or not self._queue.takes_probe():
@@ -181,14 +182,14 @@ class Bus(Users):
     def add_poller(self, poller: Poller[Any]) -> None:
         """Let a poller take part from its `due_at_s` on; adding it again only moves its turn.
 
-        All pollers are forgotten when the line is lost: whoever brings the network up again adds them again.
+        All pollers are removed when the line is lost; they are added again when the network is initialised again.
         """
         self._pollers.add(poller)
         self._queue.schedule(poller, poller.due_at_s)
         self._kick()
 
     def remove_poller(self, poller: Poller[Any]) -> None:
-        """Stop asking; a poll on the wire is still delivered."""
+        """Stop polling; a poll on the wire is still delivered."""
         self._pollers.discard(poller)
         self._queue.unschedule(poller)
 
@@ -198,7 +199,7 @@ class Bus(Users):
             self._line.close(reason)
 
     def distrust(self) -> None:
-        """Have the line prove that it is in step: a reply was not what its node can have said."""
+        """Resynchronise the line: a reply was one that its node cannot have sent."""
         if self._line:
             self._line.distrust()
 
@@ -279,7 +280,7 @@ class Bus(Users):
 
     @property
     def fence_s(self) -> float:
-        """What it takes to get back in step after a reply was lost, in seconds."""
+        """Duration of a resynchronisation after a lost reply, in seconds."""
         probe = self.resync.probe(self._mute.failing())
         flush_s = len(self.resync.flush) * self.settings.bits_per_byte / self.baud
         return self.resync.quiet_s + flush_s + self.resync.settle_s + (self.longest_s(probe) if probe else 0.0)
@@ -321,7 +322,7 @@ class Bus(Users):
             remedy="check the adapter and its cable",
         )
 
-    # -- the life of the port ----------------------------------------------------------------------------------------
+    # -- opening the port --------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Own the port until cancelled: open it, and open it again with bounded back-off whenever it is lost."""
@@ -384,7 +385,7 @@ class Bus(Users):
 
     @override
     def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
-        # to choose a poll and what to ask takes longer than all else between two packets
+        # to choose a poll and its items takes longer than all else between two packets
         exchange = turn.exchange
         reply_s = exchange.reply_bytes * byte_s
         at_s = self._order.free_at_s(exchange.node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s

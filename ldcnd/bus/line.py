@@ -5,7 +5,7 @@ noted, decoded and delivered. No task and no timer per exchange.
 
 No reply is ever credited to a later request. Replies of these lines carry no sequence number, so the line relies on
 three facts: bytes that arrive sooner than the wire can carry them belong to something older; nothing but the reply may
-follow a request; after any loss the line is fenced and probed (`Fence`) before it is used again.
+follow a request; after any loss the line is resynchronised (`Fence`) before it is used again.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ from ldcnd.wirelog.recorder import WireEvent, WireLog
 
 
 class Phase(Enum):
-    """What the line is doing."""
+    """State of the line."""
 
     IDLE = "idle"
     REPLY = "reply"
@@ -42,7 +42,7 @@ class Phase(Enum):
 
 
 class Users(Protocol):
-    """Whom the line serves: the bus, with its queue and its knowledge of the nodes."""
+    """The interface of the bus that the line uses: its queue and its state of the nodes."""
 
     def take(self, now_s: float) -> Turn | None:
         """Remove and return the next turn, or None when nothing is due."""
@@ -51,7 +51,7 @@ class Users(Protocol):
         """Note that a turn that was taken is on the wire."""
 
     def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
-        """Make ready what can be made ready of the next turn, while there is time.
+        """Prepare the next turn, while there is time.
 
         Args:
             turn: on the wire.
@@ -60,41 +60,41 @@ class Users(Protocol):
         """
 
     def next_due_s(self) -> float:
-        """Return when something will be due, in loop time."""
+        """Return when the next exchange is due, in loop time."""
 
     def stop_waits(self) -> bool:
         """Tell whether a stop is queued."""
 
     def failing(self) -> set[int]:
-        """Return the nodes that left their last exchange unanswered."""
+        """Return the nodes that did not reply to their last exchange."""
 
     def answered(self, turn: Turn) -> None:
         """Note that the turn's node replied, or that no reply was due."""
 
     def missed(self, turn: Turn, now_s: float) -> None:
-        """Note that the turn's node did not reply, before the turn learns of it."""
+        """Note that the turn's node did not reply; called before the turn's own `lost`."""
 
     def again(self, turn: Turn) -> None:
         """Give the turn back to the front of its lane."""
 
     def line_lost(self, reason: str) -> None:
-        """Learn, once, that the line is gone and every turn that was on it has heard of it."""
+        """Note the loss of the line; called once, after every turn on it has its outcome."""
 
 
 NOT_PLAIN = 0
 """No reply has so few bytes."""
-ANY = 1  # byte to expect where each would be news
+ANY = 1  # byte to expect where every byte counts
 LATE_S = 1.0
-"""A line that is so far behind what it had planned next does not turn."""
+"""Longest delay of the next planned action, seconds; a line that is later counts as stuck."""
 _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
 
 
 class Line(Receiver):
-    """One open transport and what is on it; a `Receiver`, made anew at every opening.
+    """One open transport with its exchange; a `Receiver`, created at every opening.
 
     Attributes:
-        phase: what it is doing.
-        wire: what it has at its end.
+        phase: its state.
+        wire: its end on the host.
     """
 
     def __init__(
@@ -125,24 +125,24 @@ class Line(Receiver):
         transport.attach(self)
 
     def turning(self, now_s: float) -> bool:
-        """Tell whether the line keeps to its own plan: it always knows when it will act next, and then does."""
+        """Tell whether the line acts on time: the time of its next action is always set, and is not past."""
         if self.phase is Phase.IDLE:
             return not self._users.stop_waits() and now_s <= self._users.next_due_s() + LATE_S
         due_s = self._watchdog.deadline_s
         return due_s < NEVER_S and now_s <= due_s + LATE_S
 
     def kick(self) -> None:
-        """Look at the queue: something was added to it."""
+        """Check the queue: something was added to it."""
         if self.phase is Phase.IDLE:
             self._next()
         elif self.phase is Phase.FENCE and self._users.stop_waits():
             self._watchdog.set(self._loop.time())
 
     def distrust(self) -> None:
-        """Prove that the line is in step before anything more is believed: a reply may have been to something older.
+        """Resynchronise before another reply is accepted: a reply may have belonged to an older request.
 
-        Every later reply then is the one to the request before; so what is on the wire is not believed either, unless
-        it must not be repeated.
+        Every later reply then belongs to the request before it; so the reply on the wire is not accepted either, unless
+        its exchange must not be repeated.
         """
         if self.phase is Phase.IDLE:
             self._fence.doubt()
@@ -155,7 +155,7 @@ class Line(Receiver):
 
         Args:
             reason: for the errors.
-            for_good: the bus ends: a poll that this cuts off is not missed by its drive.
+            for_good: the bus ends: a poll that this interrupts does not count as a miss of its drive.
         """
         if self.phase is Phase.CLOSED:
             return
@@ -172,7 +172,7 @@ class Line(Receiver):
 
     @override
     def transport_lost(self, reason: str) -> None:
-        # a write that failed has told it already when the port tells it again
+        # after a failed write the port reports the loss a second time
         if self.phase is Phase.CLOSED:
             return
         self._statistics.losses += 1
@@ -190,7 +190,7 @@ class Line(Receiver):
         self._take_apart(data, now_s)
 
     def _take_apart(self, data: bytes, now_s: float) -> None:
-        """Find out what bytes are that need not be one whole reply."""
+        """Sort bytes that need not be one whole reply."""
         was_plain, self._missing = self._missing, NOT_PLAIN
         self._statistics.bytes_in += len(data)
         own_taken_off = self.wire.without_echo(data, now_s)
@@ -221,7 +221,7 @@ class Line(Receiver):
             data = whole.surplus
 
     def _judge(self, turn: Turn, whole: Whole, verdict: ReplyVerdict, arrived: bytes, now_s: float) -> None:
-        """Believe a reply, wait for a better one, or distrust it."""
+        """Accept a reply, wait for a better one, or reject it."""
         flaw = "came too early" if whole.early else _FLAWS.get(verdict, "")
         why = "came with surplus bytes" if whole.surplus else flaw
         self.wire.note(WireEvent.RECEIVED, now_s, arrived, why)
@@ -230,7 +230,7 @@ class Line(Receiver):
         elif whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
             self._distrust(turn, whole.reply + whole.surplus, why, now_s)
         elif not turn.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
-            # not believed before no other reply can come
+            # not accepted before no other reply can come
             self.phase, self._kept = Phase.LINGER, (whole.reply, now_s)
             self._watchdog.set(until_s)
         elif verdict is ReplyVerdict.REJECTED:
@@ -239,7 +239,7 @@ class Line(Receiver):
             self._complete(turn, whole.reply, now_s)
 
     def _true_reply_by_s(self, turn: Turn) -> float:
-        """Return until when the node's own reply may still come although one has come already; never when unpaced."""
+        """Return until when the node's own reply may still arrive after another one; minus infinity when unpaced."""
         if not self._settings.paced:
             return -NEVER_S
         return self._sent_at_s + self.wire.longest_s(turn.exchange) + LINGER_S
@@ -271,7 +271,7 @@ class Line(Receiver):
         else:
             self._attend(following, AT_ONCE[following.lane], failure, early=int(turn.laborious))
         turn.completed(reply, timing)
-        if self._turn and self._missing and turn.lane is POLL:  # who waits for an answer has it first
+        if self._turn and self._missing and turn.lane is POLL:  # callers that wait for a reply get it first
             byte_s = self.wire.byte_s
             self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * byte_s, byte_s)
 
@@ -308,11 +308,11 @@ class Line(Receiver):
         self._lose(turn, BadReply(f"node {turn.exchange.node}: reply {reply.hex(' ')} {why}"), now_s)
 
     def _lose(self, turn: Turn, error: BusError, now_s: float) -> None:
-        """Settle the turn whose reply will never be trusted, and fence the line."""
+        """Settle the turn whose reply cannot be valid any more, and resynchronise the line."""
         self._users.missed(turn, now_s)
         if not isinstance(turn, Probe):
             self._fence.doubt()
-        # before the fence, which a stop that is sent again cuts short
+        # before the resynchronisation, which a stop that is sent again cuts short
         if turn.lost(error):
             self._send_again(turn)
         self._release(turn)
@@ -323,7 +323,7 @@ class Line(Receiver):
         self._users.again(turn)
 
     def _collided(self, data: bytes, now_s: float) -> None:
-        """What came back is not what was sent."""
+        """Handle an echo that differs from what was sent."""
         if self._turn and self.phase is Phase.REPLY:
             why = "follows an echo that differs: collision"
             self.wire.note(WireEvent.RECEIVED, now_s, data, why)
@@ -332,7 +332,7 @@ class Line(Receiver):
             self._stray(data, now_s)
 
     def _stray(self, data: bytes, now_s: float) -> None:
-        """Bytes that nobody asked for: late ones while fenced, a sign of being out of step otherwise."""
+        """Handle bytes outside a reply: late ones in a resynchronisation, otherwise a sign of being out of step."""
         self.wire.stray(data, now_s)
         if self.phase is Phase.FENCE and not self._users.stop_waits():
             self._watchdog.set(self._fence.disturbed(now_s))
@@ -363,7 +363,7 @@ class Line(Receiver):
                 self.transport_lost(failure)
 
     def _flushed(self, now_s: float) -> None:
-        """Behind the fence: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
+        """After the flush: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
         self.wire.discard_input()
         self.phase = Phase.IDLE
         probe = None if self._users.stop_waits() else self._fence.probe(self._users.failing(), now_s)
@@ -421,7 +421,7 @@ class Line(Receiver):
     def _attend(self, turn: Turn, remark: str, failure: str, *, early: int = 0) -> None:
         """Note a request that has just been written, and prepare for its reply.
 
-        With much to do behind it the line is woken `early` by so many bytes, to answer the last one with warm caches.
+        When processing takes long, the line is woken `early` bytes before the end, so that caches are warm.
         """
         exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s

@@ -1,7 +1,7 @@
-"""What wants to be asked again and again: the contract between the bus and whoever polls.
+"""Periodic exchanges: the interface between the bus and its pollers.
 
-A poller is asked for its next exchange only when the line is free for it, so an overfull line delays polls but never
-piles them up.
+The bus takes the next exchange of a poller only when the line is free for it, so an overloaded line delays polls but
+never queues several of one poller.
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ from ldcnd.model.samples import TelemetryItem
 ReplyT = TypeVar("ReplyT")
 
 NO_DEADLINE_S = float("inf")
-"""Deadline of a poll that only wants time of the line that nobody else's wants; it is never late."""
+"""Deadline of a poll that only uses time left by all other polls; it is never late."""
 
 
 def next_on_grid(due_s: float, period_s: float, now_s: float) -> float:
@@ -27,7 +27,7 @@ def next_on_grid(due_s: float, period_s: float, now_s: float) -> float:
 
 
 class Priority(IntEnum):
-    """Whose polls go first on a line that has fallen behind, highest first."""
+    """Order of polls on a line that has fallen behind, highest first."""
 
     HIGH = 0
     NORMAL = 1
@@ -38,12 +38,12 @@ class Poller(ABC, Generic[ReplyT]):
     """One periodic user of the line; every method runs on the event loop, returns at once and never raises.
 
     Attributes:
-        node: whom it asks; a node that does not answer is asked more and more seldom.
-        due_at_s: when it wants its next slot, in loop time; read by the bus after each slot.
+        node: the node that it polls; one that does not reply is polled less and less often.
+        due_at_s: when its next slot is due, in loop time; read by the bus after each slot.
         deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
-        priority: how it fares while the line cannot carry all polls; does not change while it waits for a turn.
-        rates_hz: how often it asks for each telemetry item; empty for one that asks for none.
-        laborious: much is done with each reply, so the request behind it is on its way first; see `Line`.
+        priority: its rank while the line cannot carry all polls; does not change while it waits for a slot.
+        rates_hz: rate at which it reads each telemetry item; empty for one that reads none.
+        laborious: processing a reply takes long, so the next request is sent first; see `Line`.
     """
 
     node: int
@@ -54,7 +54,7 @@ class Poller(ABC, Generic[ReplyT]):
     laborious: bool = False
 
     def prepare(self, at_s: float) -> None:
-        """Make ready what takes time: the next slot is likely to come at about that instant."""
+        """Prepare the next exchange, which takes time; the next slot is expected at about that instant."""
 
     @abstractmethod
     def next_exchange(self, now_s: float) -> Exchange[ReplyT]:
@@ -66,4 +66,4 @@ class Poller(ABC, Generic[ReplyT]):
 
     @abstractmethod
     def missed(self, error: BusError) -> None:
-        """Learn that this slot brought nothing."""
+        """Note that this slot brought no reply."""

@@ -1,8 +1,8 @@
-"""Which exchange goes on the wire next: four lanes and a fairness bound. Pure: knows no clock and no wire.
+"""Order of the exchanges: four lanes and a fairness bound. Pure: uses no clock and no wire.
 
-`PhaseOrder` chooses among polls for drives that answer at the end of a servo cycle of their own. The drives on a line
-are not synchronised: one that is asked at the right instant answers at once, one that is asked just too late makes the
-line wait for nearly a whole cycle. Phase and length of each cycle show in the replies.
+`PhaseOrder` chooses among polls of drives that reply at the end of a servo cycle of their own. The drives on a line are
+not synchronised: a drive polled at the right instant replies at once, a drive polled just too late makes the line wait
+for nearly a whole cycle. Phase and length of each cycle are measured from the replies.
 """
 
 import heapq
@@ -18,13 +18,13 @@ from ldcnd.errors import BusBusy
 from ldcnd.exchange import Timing
 
 CHOICE = 16
-"""The choice among equals is among so many at most, because looking at each takes time."""
+"""Most polls with equal deadlines to choose among, because comparing each takes time."""
 SHORTEST_ROUND, LONGEST_ROUND = 0.5, 1.5
-"""Turns for which a late poll waits, as shares of how many are late. The longest one keeps the longest gap below two
-mean ones, also when several are passed over.
+"""Turns for which a late poll waits, as fractions of the number of late polls. The upper one keeps the longest gap
+below two mean ones, also when several are passed over.
 """
 FEW = 4
-"""So many wait for a turn less than that: turns are counted, not seconds, and with few of them chance weighs more."""
+"""The longest wait is shorter by `FEW` / number of late polls, in turns: with few of them chance weighs more."""
 
 Choose = Callable[[Sequence[Poller[Any]], float], Poller[Any]]
 """Which of several polls to run now, at an instant in loop time; there is always one."""
@@ -33,9 +33,9 @@ Choose = Callable[[Sequence[Poller[Any]], float], Poller[Any]]
 class PollRank:
     """Polls of one priority that are due; false while there is none. The earliest deadline goes first.
 
-    Where deadlines leave a choice it is somebody else's: among polls with the same deadline, and among those that are
-    late already. These have no deadline to lose, so they take turns: half of them go before one goes again, and who was
-    passed over for `LONGEST_ROUND` rounds goes now.
+    Where deadlines leave a choice, `choose` decides: among polls with the same deadline, and among late ones. Late
+    polls have no deadline to lose, so they take turns: half of them go before one goes again, and one passed over for
+    `LONGEST_ROUND` rounds goes now.
     """
 
     def __init__(self, choose: Choose | None) -> None:
@@ -66,7 +66,7 @@ class PollRank:
         heapq.heappush(self.due, (poller.deadline_at_s, at_s, serial, poller))
 
     def remove(self, poller: Poller[Any]) -> None:
-        """Forget a poll; unknown ones are ignored."""
+        """Remove a poll; unknown ones are ignored."""
         self._late = [late for late in self._late if late[2] is not poller]
         self.due = [due for due in self.due if due[3] is not poller]
         heapq.heapify(self.due)
@@ -90,7 +90,7 @@ class PollRank:
         before = self._turn - SHORTEST_ROUND * late
         among = [poller for turn, _, poller in self._late if turn <= before] or [first]
         chosen = choose(among, now_s)
-        del self._late[among.index(chosen)]  # both begin with who is late longest
+        del self._late[among.index(chosen)]  # both begin with the one that is late longest
         return chosen
 
     def _take_equal(self, choose: Choose, now_s: float) -> Poller[Any]:
@@ -106,8 +106,8 @@ class PollRank:
 
 NORMAL = Priority.NORMAL
 POLLS_PER_LOWER = 16
-"""So many polls may pass a late one of a lower priority before such a one goes. On a line of 31 axes at 19200 baud that
-one priority could fill alone, each of the others is asked every five seconds then, as seldom as a drive that is mute.
+"""Most polls that may pass a late one of a lower priority. On a line of 31 axes at 19200 baud that one priority could
+fill alone, each of the others is then polled every five seconds, as seldom as a mute drive.
 """
 
 
@@ -116,17 +116,16 @@ class PollQueue:
 
     As long as no poll that is due is late, the earliest deadline goes first, whatever the priority. Once one is, the
     line has fallen behind; until it has caught up, which is when nothing with a deadline is due, the highest priority
-    goes first, and deadlines count within one priority only. That concerns all that are due and not just the late ones:
-    who is only asked once it is late has lost a turn by then.
+    goes first, and deadlines count within one priority only. That concerns all due polls and not
+    just the late ones: a poll that only counts once it is late has lost a turn by then.
 
     A late poll of a lower priority waits for at most `POLLS_PER_LOWER` others for each late one before it.
 
-    Who goes next can be chosen ahead, while the line is busy. As long as the line keeps up, a poll that becomes due
-    meanwhile goes before if its deadline is earlier, so whoever has the earliest one never waits for a choice made too
-    soon.
+    The next poll can be chosen ahead, while the line is busy. As long as the line keeps up, a poll that becomes due
+    meanwhile goes first if its deadline is earlier, so the earliest deadline never waits for a choice made too soon.
 
     Args:
-        choose: who chooses where deadlines leave a choice, see `PollRank`; None for who is due longest.
+        choose: chooses where deadlines leave a choice, see `PollRank`; None for the one that is due longest.
     """
 
     def __init__(self, choose: Choose | None) -> None:
@@ -138,7 +137,7 @@ class PollQueue:
         self._serial = count()
         self._behind = False
         self._passed = 0
-        self._ahead: Poller[Any] | None = None  # who was chosen ahead
+        self._ahead: Poller[Any] | None = None  # the one chosen ahead
 
     def schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Let a poller have its next turn at `at_s`; replaces any turn it had."""
@@ -150,7 +149,7 @@ class PollQueue:
         heapq.heappush(self._later, (at_s, serial, poller))
 
     def unschedule(self, poller: Poller[Any]) -> None:
-        """Forget a poller; unknown ones are ignored."""
+        """Remove a poller; unknown ones are ignored."""
         self._turns.pop(poller, None)
         if poller is self._ahead:
             self._ahead = None
@@ -180,7 +179,7 @@ class PollQueue:
         return False
 
     def look_ahead(self, at_s: float) -> Poller[Any] | None:
-        """Choose who of those that are due at about `at_s` goes then; None when nobody is, or one is chosen already."""
+        """Choose among the polls due at about `at_s`; None when none is due, or one is chosen already."""
         if self._ahead or not self.is_due(at_s):
             return None
         self._ahead = self._take(at_s)
@@ -253,19 +252,19 @@ STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and tur
 
 
 class Queueable(Protocol):
-    """What the queue must know of a job."""
+    """The interface of a job that the queue uses."""
 
     @property
     def abandoned(self) -> bool:
-        """Whether nobody waits for this job any more."""
+        """Whether no caller waits for this job any more."""
 
 
 JobT = TypeVar("JobT", bound=Queueable)
 
 COMMANDS_PER_POLL = 4
-"""So many commands may pass a due poll before the poll goes."""
+"""Most commands that may pass a due poll."""
 POLLS_PER_BACKGROUND = 8
-"""So many due polls may pass a background job before the job goes."""
+"""Most due polls that may pass a background job."""
 LANE_LIMITS = {Lane.STOP: 256, Lane.COMMAND: 64, Lane.BACKGROUND: 64}
 
 
@@ -325,11 +324,11 @@ class ExchangeQueue(Generic[JobT]):
         self.polls.schedule(poller, at_s)
 
     def unschedule(self, poller: Poller[Any]) -> None:
-        """Forget a poller; unknown ones are ignored."""
+        """Remove a poller; unknown ones are ignored."""
         self.polls.unschedule(poller)
 
     def stop_waits(self) -> bool:
-        """Tell whether a stop is queued that somebody waits for."""
+        """Tell whether a stop is queued whose caller still waits."""
         return any(not stop.abandoned for stop in self._jobs[Lane.STOP])
 
     def next_due_s(self) -> float:
@@ -362,7 +361,7 @@ class ExchangeQueue(Generic[JobT]):
         return self.polls.look_ahead(at_s)
 
     def drain(self) -> list[JobT]:
-        """Forget all pollers; remove and return all jobs, stops first."""
+        """Remove all pollers; remove and return all jobs, stops first."""
         self.polls = PollQueue(self._choose)
         drained = [self._probe] if self._probe else []
         self._probe = None
@@ -381,20 +380,20 @@ class ExchangeQueue(Generic[JobT]):
 
 
 MOST_DRIFT = 0.001
-"""Of a cycle's length: far more than crystals differ."""
+"""Largest deviation of a cycle, as a fraction of its nominal length: far more than crystals differ."""
 LONGEST_GAP_S = 1.0
-"""After a longer pause the number of cycles in between is uncertain: the phase is taken anew."""
+"""Longest pause, seconds, over which cycles are counted; after a longer one the phase is measured again."""
 ENOUGH = 4
-"""Replies, before a prediction is used."""
+"""Replies observed before a prediction is used."""
 FORGETTING = 0.1
 """Least weight of a new reply in the phase."""
 FORGETTING_DRIFT = 0.005
 """Least weight of a new reply in the length of the cycle."""
 MOST_SCATTER = 0.15
-"""Of a cycle: where replies scatter more, as behind some USB adapters, nothing can be predicted."""
+"""Largest scatter of replies for predictions, as a fraction of a cycle; some USB adapters scatter more."""
 GUARD_UP, GUARD_DOWN = 0.06, 0.002
-"""Of a cycle: how much more time is kept in hand after a cycle was missed, and how much less after each one that was
-not: about one in thirty is."""
+"""Steps of the guard time, as fractions of a cycle: up after a missed cycle, down after each other one, so that about
+one in thirty is missed."""
 MOST_GUARD = 0.5
 
 
@@ -404,7 +403,7 @@ class PhaseTracker:
     Weights are those of a least-squares fit through all replies so far, until forgetting sets in.
 
     Attributes:
-        locked: predictions are worth something.
+        locked: enough replies with little scatter, so predictions are used.
     """
 
     __slots__ = ("_count", "_cycle_s", "_period_s", "_scatter_s", "_tick_s", "locked")
@@ -448,10 +447,9 @@ class PhaseTracker:
 
 
 class PhaseOrder:
-    """The nodes of one line: who would make it wait least.
+    """Choice of the node for which the line would wait least.
 
-    A part of each cycle is kept in hand for a host that sends later than it means to and notes replies late; how much
-    is learnt from the cycles that were missed.
+    A guard time covers a host that sends and reads late; its length follows from the cycles that were missed.
     """
 
     def __init__(self, cycle: ServoCycle) -> None:
@@ -463,7 +461,7 @@ class PhaseOrder:
         self._expected_s: dict[int, float] = {}
 
     def choose(self, pollers: Sequence[Poller[Any]], now_s: float) -> Poller[Any]:
-        """Return the one whose answer would begin first after its request; the first one if none is known well."""
+        """Return the one whose reply would begin first after its request; the first one if none can be predicted."""
         best, shortest_s = pollers[0], float("inf")
         guard_s = self.guard_s
         for poller in pollers:
@@ -480,9 +478,9 @@ class PhaseOrder:
         """Return when the line is likely to be free again behind a request that is over at an instant.
 
         Args:
-            node: who is asked.
-            asked_at_s: when the request is over, in loop time.
-            reply_s: what the reply takes at the line's nominal rate.
+            node: receiver of the request.
+            asked_at_s: end of the request, in loop time.
+            reply_s: duration of the reply at the line's nominal rate.
         """
         tracker = self._trackers.get(node)
         wait_s = tracker.wait_s(asked_at_s) if tracker and tracker.locked else self._cycle_s / 2

@@ -17,9 +17,9 @@ def _no_probe(_avoid: AbstractSet[int]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Resync:
-    """The fence between a reply that went wrong and the next request; the family's driver supplies it.
+    """The resynchronisation between a lost reply and the next request; the family's driver supplies it.
 
-    The bus waits until the line has been quiet for `quiet_s`, sends `flush`, waits `settle_s`, drops what has come in,
+    The bus waits until the line has been quiet for `quiet_s`, sends `flush`, waits `settle_s`, discards the input,
     and runs the probe: an exchange whose reply is known beforehand and has an unusual length, so that a late reply
     cannot pass for it.
 
@@ -27,7 +27,7 @@ class Resync:
         flush: bytes that end any half-received packet and draw no reply.
         quiet_s: silence after which no late reply can come any more.
         settle_s: pause after the flush.
-        probe: returns such an exchange with a node outside the given ones if it can, None when it knows no node. Its
+        probe: returns such an exchange with a node outside the given ones if it can, None when there is no node. Its
             `decode` raises `BadReply` when the reply is not the known one.
     """
 
@@ -38,7 +38,7 @@ class Resync:
 
 
 class Probe(Turn):
-    """The line's own exchange behind the fence."""
+    """The line's own exchange at the end of a resynchronisation."""
 
     __slots__ = ("passed",)
     proves = True
@@ -66,14 +66,14 @@ class Probe(Turn):
 
 PROBE_ROUNDS = 3
 LONGEST_FENCE = 20
-"""A line that never falls silent is flushed after so many quiet times all the same."""
+"""Longest wait for silence, in multiples of `quiet_s`; a line that is never silent is flushed after that."""
 
 
 class Fence:
-    """What must happen before a line is used again.
+    """Progress of a resynchronisation: the steps before a line is used again.
 
     Attributes:
-        in_step: nothing has happened since the last proof that leaves it open whose a reply is.
+        in_step: since the last proof nothing has happened that makes it uncertain to which request a reply belongs.
     """
 
     def __init__(self, resync: Resync) -> None:
@@ -83,25 +83,25 @@ class Fence:
         self._since_s = 0.0
 
     def doubt(self) -> None:
-        """Something has happened: the line must prove that it is in step."""
+        """Require a proof that the line is in step."""
         self._rounds_left, self.in_step = PROBE_ROUNDS, False
 
     def proven(self) -> None:
-        """The known reply has come."""
+        """Note that the known reply has arrived."""
         self._rounds_left, self.in_step = 0, True
 
     def raised(self, now_s: float) -> float:
-        """Begin to wait for silence; return until when, if no byte comes."""
+        """Begin to wait for silence; return the end of the wait if no byte arrives, in loop time."""
         self._since_s = now_s
         return now_s + self._resync.quiet_s
 
     def disturbed(self, now_s: float) -> float:
-        """Note bytes in the silence; return until when to wait now."""
+        """Note bytes during the silence; return the new end of the wait, in loop time."""
         quiet_s = self._resync.quiet_s
         return min(now_s + quiet_s, self._since_s + LONGEST_FENCE * quiet_s)
 
     def probe(self, avoid: AbstractSet[int], now_s: float) -> Probe | None:
-        """Return the next proof to attempt; None when none is needed, or when no node is known that could give one."""
+        """Return the next proof to attempt; None when none is needed, or when there is no node to probe."""
         if self.in_step:
             return None
         exchange = self._resync.probe(avoid)

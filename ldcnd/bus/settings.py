@@ -1,24 +1,24 @@
-"""What a bus must know of its line before it opens it."""
+"""Settings of a bus, complete before it opens its line."""
 
 from dataclasses import dataclass
 
 from ldcnd.wirelog.recorder import KEPT_BYTES, KEPT_S
 
 LINGER_S = 0.001
-"""The line stays with a packet that must not be repeated for as long as its true reply can come, and so much longer:
-adapters pass bytes on a little late."""
+"""Extra time that the line waits for the true reply to a packet that must not be repeated, seconds: adapters pass bytes
+on a little late."""
 
 HOST_LATE_S = 0.001
-"""By so much later than it should have a packet has left the host at most, also through an adapter on USB."""
+"""Maximum delay between writing a packet and its first bit on the wire, seconds, also through an adapter on USB."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServoCycle:
-    """What decides when drives answer that do so at the end of a cycle, each of its own.
+    """Servo cycle of drives that reply at the end of a cycle; the cycles of the drives are not synchronised.
 
     Attributes:
-        length_s: nominal.
-        stretch: by how much the bytes of a reply take longer than at the line's nominal rate.
+        length_s: nominal length, in seconds.
+        stretch: duration of the bytes of a reply, as a multiple of that at the line's nominal rate.
     """
 
     length_s: float
@@ -27,7 +27,7 @@ class ServoCycle:
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """What the bus must know of its line.
+    """Settings of one line.
 
     Attributes:
         name: as in the configuration.
@@ -36,7 +36,7 @@ class BusSettings:
         margin_s: added to every reply's deadline: host scheduling and adapter latency.
         attempts: how often a repeatable command is sent in all.
         echo: the adapter returns our own bytes before the reply.
-        paced: bytes take real time on this line, so that what comes too early is foreign; false only for
+        paced: bytes take real time on this line, so that bytes that come too early are foreign; false only for
             far ends that answer faster than the baud rate allows.
         cycle: of the drives, to order polls by; None when they have none, or when polls are not to be ordered by it.
         recorded_s: how far back the flight recorder reaches.

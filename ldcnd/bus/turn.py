@@ -1,4 +1,4 @@
-"""What goes on the wire next and who must hear how it went."""
+"""An exchange with the receiver of its outcome."""
 
 import asyncio
 from abc import ABC, abstractmethod
@@ -22,12 +22,12 @@ class Turn(ABC):
     """One exchange on its way over the wire; exactly one of the outcomes is reported for each time it is sent.
 
     Attributes:
-        exchange: what is sent.
-        lane: where it waited.
-        wanted_at_s: since when, in loop time.
+        exchange: request and expected reply.
+        lane: the lane in which it waited.
+        wanted_at_s: when it was queued or due, in loop time.
         then_baud: the rate to use from the end of this exchange on; None for the present one.
         at_baud: the rate of this exchange alone; None for the line's.
-        laborious: much is done with the reply.
+        laborious: processing the reply takes long.
     """
 
     __slots__ = ("at_baud", "exchange", "laborious", "lane", "then_baud", "wanted_at_s")
@@ -48,15 +48,15 @@ class Turn(ABC):
 
     @abstractmethod
     def lost(self, error: BusError) -> bool:
-        """Learn that no reply will ever be trusted; return whether to send the exchange again."""
+        """Note that no reply is valid any more; return whether to send the exchange again."""
 
     @abstractmethod
     def rejected(self) -> bool:
-        """Learn that the node did not execute the packet; return whether to send it again."""
+        """Note that the node did not execute the packet; return whether to send it again."""
 
 
 class PollTurn(Turn):
-    """A poller's turn; it is never sent again, the poller's next turn comes soon enough."""
+    """A poll; it is never sent again, because the next poll comes soon enough."""
 
     __slots__ = ("order", "poller")
 
@@ -115,11 +115,11 @@ class Job(Turn):
 
     @property
     def abandoned(self) -> bool:
-        """Whether nobody waits any more."""
+        """Whether no caller waits for the outcome."""
         return self.future.done()
 
     def may_go(self) -> bool:
-        """Ask whether it may still be sent, now that its turn has come; otherwise the caller gets the reason."""
+        """Check the condition directly before sending; if it fails, the caller gets the reason."""
         if self.condition is None:
             return True
         try:
@@ -182,6 +182,6 @@ class Job(Turn):
 
 
 class StopProbe(Job):
-    """A harmless question in the place of a stop, to see how long one would wait."""
+    """A harmless exchange in the place of a stop, to measure how long a stop would wait."""
 
     __slots__ = ()

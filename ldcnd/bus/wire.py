@@ -76,7 +76,7 @@ class BusStatistics:
 
 
 class Echo:
-    """What was sent and has not come back yet."""
+    """Bytes that were sent and whose echo has not arrived yet."""
 
     __slots__ = ("_due",)
 
@@ -92,10 +92,10 @@ class Echo:
         self._due += data
 
     def strip(self, data: bytes) -> tuple[bytes, bytes] | None:
-        """Take our own bytes off the front, by count: a reply may look exactly like its request.
+        """Take our own bytes off the front, by count: a reply may equal its request.
 
         Returns:
-            The echo and what follows it; None when what came is not what was sent: nothing is expected back any more.
+            The echo and the bytes after it; None when it differs from what was sent: no more echo is expected then.
         """
         count = min(len(data), len(self._due))
         if data[:count] != self._due[:count]:
@@ -119,7 +119,7 @@ class Whole:
 
     Attributes:
         reply: these bytes.
-        surplus: what came behind them.
+        surplus: bytes after them.
         early: some came sooner than the wire can carry them.
     """
 
@@ -144,13 +144,13 @@ class Pieces:
         self._over_s = self._byte_s = 0.0
 
     def begin(self, sent_at_s: float, request_s: float, byte_s: float, reply_bytes: int) -> float:
-        """Forget what came; wait for the reply to a request; return the earliest instant at which it can be whole.
+        """Discard held bytes; wait for the reply to a request; return the earliest instant of the whole reply.
 
         Args:
-            sent_at_s: when that was handed over; minus infinity on a line where nothing can come too early.
+            sent_at_s: when the request was written; minus infinity on a line where nothing can come too early.
             request_s: how long it takes on the wire.
             byte_s: how long each byte of the reply takes.
-            reply_bytes: so many make it.
+            reply_bytes: length of the reply.
         """
         self.held, self.early = b"", False
         self._over_s, self._byte_s = sent_at_s + CLOCK_TOLERANCE * request_s, CLOCK_TOLERANCE * byte_s
@@ -179,8 +179,8 @@ NEVER_S = float("inf")
 class Watchdog:
     """Calls back once the deadline has passed.
 
-    Moving the deadline later costs an assignment: the timer fires at the old time, looks, and sleeps on. So a line
-    that answers in time creates a few timers a second, not one per exchange.
+    Moving the deadline later costs an assignment: the timer fires at the old time, compares, and is set again. So a
+    line that answers in time creates a few timers a second, not one per exchange.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, expired: Callable[[float], None]) -> None:
@@ -205,7 +205,7 @@ class Watchdog:
             self._timer = self._loop.call_at(at_s, self._look)
 
     def cancel(self) -> None:
-        """Forget the deadline and the timer."""
+        """Cancel the deadline and the timer."""
         self._deadline_s = self._timer_at_s = NEVER_S
         if self._timer:
             self._timer.cancel()
@@ -222,15 +222,15 @@ class Watchdog:
 
 
 class Wire:
-    """What a line has at its end: counts, logs, and knows how long bytes take.
+    """The host's end of a line: counts and logs bytes, and computes how long they take.
 
     Attributes:
         baud: the rate of all turns that have none of their own.
         byte_s: how long a byte takes now, in seconds.
         fixed_baud: the transport cannot change its rate.
         transport: the pipe.
-        echo: what is still to come back; None on a line without one.
-        log: the record of all that passes.
+        echo: bytes whose echo is still due; None on a line without echo.
+        log: the record of all bytes.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class Wire:
             self.baud = baud
 
     def discard_input(self) -> None:
-        """Forget what has come in and what is still to come back."""
+        """Discard the input and the echo that is still due."""
         self.transport.discard_input()
         self.forget_echo()
 
@@ -285,7 +285,7 @@ class Wire:
             self.echo.sent(data)
 
     def without_echo(self, data: bytes, now_s: float) -> bytes | None:
-        """Take our own bytes off what has come in; None when it should be our own bytes and is not."""
+        """Take our own bytes off the input; None when it should be our own bytes and is not."""
         if not self.echo:
             return data
         stripped = self.echo.strip(data)
