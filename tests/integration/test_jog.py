@@ -53,7 +53,7 @@ async def test_a_jog_runs_while_it_is_renewed_and_ends_when_it_is_not(dialect, v
         assert abs(let_go) == pytest.approx(10.0, abs=0.7)
         assert abs(await position(rig) - let_go) < 5.0 * ALIVE_S + RAMP_MM
         assert state.state is AxisState.STANDSTILL
-        assert state.last_error == "jog: nothing was heard of the hand that holds it for 0.4 s"
+        assert state.last_error == "jog: its hold was not renewed for 0.4 s"
 
 
 @dialects

@@ -101,10 +101,10 @@ class WaitingCommand:
 
 
 class AxisTurns:
-    """Who has one axis.
+    """Order of the commands of one axis.
 
     Attributes:
-        at_work: held by whoever carries out a command or a step.
+        at_work: held while a command or a step is carried out.
     """
 
     def __init__(self, axis: str) -> None:
@@ -147,7 +147,7 @@ class AxisTurns:
             waiting.refuse(error)
 
     def wake(self) -> None:
-        """Have the axis look whether there is something to do."""
+        """Wake the task of the axis to check for work."""
         self._woken.set()
 
     async def woken(self, deadline_s: float) -> None:
@@ -161,7 +161,7 @@ class AxisTurns:
 
 
 END_ITEMS = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
-"""Published with the reading that ends a command, whatever it was asked for."""
+"""Items published with the reading that ends a command, besides those requested."""
 
 
 def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str, _code: str | None) -> None:
@@ -169,9 +169,9 @@ def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str, _code
 
 
 LOOK_LATER_S = 0.005
-"""So much behind the start of a motion its line is told when to look for the end."""
+"""Delay between the start of a motion and the request for the reading at its end, seconds."""
 SETTLES_WITHIN_S = 0.25
-"""A shaft whose profile is done follows it by then."""
+"""Time within which a shaft follows its finished profile, seconds."""
 STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
 """Of two stops that no drive has confirmed, the stronger one is sent again."""
 
@@ -182,7 +182,7 @@ class AxisService:
     Attributes:
         stop_wanted: set when a stop waits to be sent again; its line sees to that.
         line_up: its line is ready for stops; while it is not, they wait for it.
-        returned: called when the drive answers again after it was out of reach, with what it does known.
+        returned: called when the drive replies again after it was out of reach, once its state is known.
         ask_at: has the drive read at an instant of the loop's clock, besides its ordinary polls.
     """
 
@@ -284,7 +284,7 @@ class AxisService:
         self._plausibility.reconfigure(config)
 
     async def recall(self, report: BringUpReport) -> None:
-        """Take up the reference that an earlier daemon has kept, if everything proves it; the line came up anew."""
+        """Take up the reference that an earlier daemon has kept, if everything proves it; the line has come up."""
         name = self.config.name
         reset = "its line was reset" if report.reset else ""
         interrupted = "its drive had lost power" if name in report.restarted else reset
@@ -320,11 +320,11 @@ class AxisService:
         self.telemetry.stale(self._clock.now_ns())
 
     def judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
-        """Take a reading if the drive can have got there; true when it has to be asked again first."""
+        """Take a reading if the drive can have got there; true when it has to be read again first."""
         tracker, gate = self.tracker, self._plausibility
         verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
         if verdict is Verdict.BELIEVED:
-            if gate.confirmed:  # what only the first of two readings was asked for is true as well
+            if gate.confirmed:  # items that only the first of two readings has are valid as well
                 if gate.zeroed:
                     self._changed_by_another(DRIVE_RESET, "its position counter has begun anew at 0")
                     tracker.referenced = False
@@ -341,12 +341,12 @@ class AxisService:
         return verdict is Verdict.ASK_AGAIN
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        """Digest a reading that is believed."""
+        """Process an accepted reading."""
         tracker, arrivals = self.tracker, self._arrivals
         was_away = self._seen and tracker.link is LinkState.DOWN
         self._seen = True
         if self._pending is not None and tracker.stop_pending:
-            self.stop_wanted.set()  # it answers again
+            self.stop_wanted.set()  # it replies again
         was_referenced = tracker.referenced
         if tracker.command:
             arrivals.reading = reading
@@ -375,7 +375,7 @@ class AxisService:
             self.reference.woken.set()
 
     def _audit(self, reading: AxisReading, timing: Timing) -> None:
-        """Say what this daemon has not done to the drive and the reading shows; the tracker has not seen it yet."""
+        """Report changes of the drive that this daemon has not made; the tracker has not seen the reading yet."""
         tracker = self.tracker
         if reading.altered != self._altered:
             self._altered = reading.altered
@@ -384,7 +384,7 @@ class AxisService:
         elif reading.profile_done or not reading.enabled or not self.stoppable:
             return
         elif tracker.at_rest and not tracker.command and self._turns.free and tracker.concerns(timing):
-            self._changed_by_another(DRIVE_CHANGED, "it began to move, and this daemon has not told it to")
+            self._changed_by_another(DRIVE_CHANGED, "it began to move without a command of this daemon")
 
     def _changed_by_another(self, fault: Fault, what: str) -> None:
         self.tracker.changed_by_another(fault)
@@ -535,7 +535,7 @@ class AxisService:
         return self._commands.holds.begin(command_id, request, self._clock.now_s())
 
     def renew_jog(self, request: Jog, command_id: str) -> CommandReply:
-        """Keep a jog alive, at the velocity that is asked for now; begins nothing.
+        """Keep a jog alive, at the velocity requested now; begins nothing.
 
         Raises:
             LeaseExpired: the jog is over.
@@ -576,8 +576,8 @@ class AxisService:
 
         Args:
             mode: how.
-            verb: what is asked, for the events.
-            by: whose command goes on afterwards; all others are void.
+            verb: the command, for the events.
+            by: permit of the command that goes on afterwards; all others are void.
         """
         if not self.stoppable:
             return False
@@ -595,7 +595,7 @@ class AxisService:
             self.telemetry.state(self._clock.now_ns())
 
     def _overtake(self, by: Permit | None) -> StopLatched:
-        """Make void what is queued and what was permitted, but to the one that asks for it; return the refusal."""
+        """Make all queued commands and permits void, except the caller's; return the refusal."""
         self._gate.overtake(by)
         self._changed.set()
         overtaken = self._gate.overtaken("a queued command")
@@ -608,7 +608,7 @@ class AxisService:
         return self._pending is not None and self.tracker.stop_pending
 
     async def send_pending_stop(self) -> None:
-        """Send a stop again that the drive has not confirmed, whatever is known of the axis."""
+        """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
         if self._unconfirmed() is None:
             return
         try:
@@ -631,11 +631,11 @@ class AxisService:
         self.telemetry.state(self._clock.now_ns())
 
     def _unconfirmed(self) -> StopMode | None:
-        """Return how it was told to stop, while no drive has confirmed that."""
+        """Return the mode of the stop that the drive has not confirmed yet; None without one."""
         return self._pending
 
     def switch_off(self) -> None:
-        """Have the motor switched off as the first thing that is sent to its drive."""
+        """Have the motor switched off by the first packet to its drive."""
         if self.stoppable:
             self._pending = StopMode.OFF
             self.tracker.stop_unconfirmed(self._clock.now_ns())
@@ -674,7 +674,7 @@ class AxisService:
             self._not_confirmed()
 
     def cannot_move(self) -> None:
-        """Its drive was reset or had no power: what it was told to stop has ended."""
+        """Note that the drive was reset or had no power: the motion to be stopped has ended."""
         self._inherited = False
         self._pending = None
         self.tracker.stop_confirmed()
@@ -714,7 +714,7 @@ class AxisService:
         try:
             return await self._commands.carry_out(turn, command)
         finally:
-            if self.tracker.settle:  # whoever waits for the reply goes first
+            if self.tracker.settle:  # the caller that waits for the reply goes first
                 asyncio.get_running_loop().call_later(LOOK_LATER_S, self._ask_soon)
 
     def _require_reachable(self) -> None:

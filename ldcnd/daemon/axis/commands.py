@@ -1,4 +1,4 @@
-"""What each command does to one axis: check, plan, talk to the drive, tell the tracker."""
+"""The commands of one axis: check, plan, send to the drive, update the tracker."""
 
 import math
 from dataclasses import replace
@@ -56,9 +56,9 @@ from ldcnd.model.commands import (
 from ldcnd.model.samples import AxisState, LinkState, Moving
 
 STEP_RETRY_S = 0.2
-"""A step whose packets were lost is taken again so much later,"""
+"""Delay before a step whose packets were lost is taken again, seconds,"""
 BLIND_RETRY_S = 1.0
-"""or so much later while the drive does not answer at all."""
+"""and the delay while the drive does not reply at all."""
 MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 """Trapezoids in the drive."""
 
@@ -240,7 +240,7 @@ class AxisCommands:
         self.procedure, self._retry_s, self.step_due = procedure, None, False
 
     async def _undertake(self, procedure: Procedure) -> CommandReply:
-        """Begin a procedure; it takes steps only from then on, also when nobody knows whether the drive has begun."""
+        """Begin a procedure; it takes steps only from then on, also when it is unknown whether the drive has begun."""
         try:
             reply = await procedure.begin()
         except OutcomeUnknown:

@@ -23,7 +23,7 @@ MOTION_STATES = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class AxisView:
-    """What the guards look at; faults are texts, and `position_lost` while one of them has lost the position."""
+    """State of an axis for the guards; faults are texts; `position_lost` while one of them has lost the position."""
 
     name: str
     unit: str
@@ -111,7 +111,7 @@ def check_stands(axis: AxisView) -> None:
 
 
 def check_referenced(axis: AxisView) -> None:
-    """Refuse an absolute position on an axis that does not know where it is."""
+    """Refuse an absolute position on an axis that is not referenced."""
     if not axis.referenced:
         kept = f"; what was kept of it was refused: {axis.reference_refused}" if axis.reference_refused else ""
         raise NotReferenced(

@@ -1,4 +1,4 @@
-"""What of an axis outlives the daemon: its reference, with what proves it, and the faults it has had. One file each.
+"""Data of an axis on disk: its reference, with the values that prove it, and its past faults. One file each.
 
 A reference is removed from the disk before anything may change it, and written again afterwards: a crash in between
 costs the reference, and a file never says more than was true when it was written.
@@ -23,16 +23,16 @@ ResultT = TypeVar("ResultT")
 
 
 class KeptReference(Frozen):
-    """Where position 0 is on the counter of a drive, and what must still be so for that to hold."""
+    """Position 0 on the counter of a drive, and the conditions under which it is valid."""
 
     format: int
-    """Of this file; another one is refused."""
+    """Format of this file; another one is refused."""
     written: int
-    """When, UTC in ns since 1970."""
+    """Time of writing, UTC in ns since 1970."""
     address: int
-    """Of the drive on its line."""
+    """Address of the drive on its line."""
     identity: str
-    """What the drive says it is."""
+    """Identity that the drive reports."""
     baud: int
     """Rate of the line: a drive that was reset is at another one."""
     scale: tuple[float, str, float | None]
@@ -40,13 +40,13 @@ class KeptReference(Frozen):
     origin: float
     """Position 0 on the drive's own counter."""
     mark: int
-    """What the drive's mark register holds; a reset clears it."""
+    """Value of the drive's mark register; a reset clears it."""
     enabled: bool
     """The position loop was closed."""
     low: int
-    """The drive's counter is here at least,"""
+    """Lower bound of the drive's counter,"""
     high: int
-    """and here at most: both are where it stands, or a motion under way lies between them."""
+    """and its upper bound: both are the position at rest, or a motion under way lies between them."""
 
 
 class FaultFile(Frozen):
@@ -59,7 +59,7 @@ class FaultFile(Frozen):
 class KeptFiles:
     """The files of one rig.
 
-    One thread writes them, so that they change in the order in which that was asked.
+    One thread writes them, so that they change in the order of the requests.
     """
 
     def __init__(self, directory: Path) -> None:

@@ -1,7 +1,7 @@
-"""How any command moves one axis: plan, load, ask whether it is still wanted, start, bring to rest.
+"""Motion of one axis, for all commands: plan, load, check the permit, start, bring to rest.
 
 A plan goes from a request in axis units to a motion in counts, checked against limits and quantised to the drive's
-registers. A preview is worked out by the very code that would do it, and not done.
+registers. A preview is computed by the same code, and nothing is sent.
 """
 
 import asyncio
@@ -187,11 +187,11 @@ def rest_of_profile_s(way: float, before: float, after: float, acceleration: flo
 
 
 class AxisMotion:
-    """The ways of one axis to move, shared by its commands and their procedures.
+    """Motions of one axis, shared by its commands and their procedures.
 
     Attributes:
         reading: the latest; None before the first.
-        target_counts: where the last motion was told to end; None when it had no end or something came after it.
+        target_counts: target of the last motion; None when it had no end or was followed by something else.
         approached: that motion came from the side that the configuration names.
         speed_share: of every velocity, by the speed override of the rig; 0 to 1.
     """
@@ -263,8 +263,8 @@ class AxisMotion:
     def unwrapped(self, position: float, direction: Direction | None = None) -> float:
         """Return the position, counted through all turns, to which a request means to go.
 
-        Without a modulo that is the position itself. With one it is counted from where the axis is told to be: a
-        position where it already is, to a count, is no way to go in any direction.
+        Without a modulo that is the position itself. With one it is counted from the commanded position: a position
+        equal to that, to a count, is no distance in any direction.
 
         Raises:
             NotSupported: a direction, and the axis has no modulo.
@@ -313,7 +313,7 @@ class AxisMotion:
 
         Args:
             goal: the motion to it.
-            velocity: that was asked for; None for the default of the axis.
+            velocity: the requested one; None for the default of the axis.
             acceleration: likewise.
 
         Raises:
@@ -453,8 +453,8 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
     Args:
         motion: of the axis.
         bus: its line.
-        request: what is asked.
-        obstacles: what else is in the way now.
+        request: the motion.
+        obstacles: the other obstacles now.
 
     Raises:
         MalformedRequest: it does not say which motion is meant.

@@ -1,10 +1,10 @@
-"""Permission to move one axis: the gate before every packet that can move its drive, and the only way to them.
+"""Permission to move one axis: the gate before every packet that can move its drive, and the only way to send them.
 
 A `Permit` is made when a command is admitted and travels with it. The rest of the daemon holds a `QuietDrive`, which
-has no call that can move; those are methods of the permit, and each of them asks for permission directly before its
-first packet, and the bus asks once more when the turn of each such packet has come. So a move that waited - for its
-turn, for the motion ahead of it, for the other members of its group, for a step of a homing, for the line - finds what
-is true when it would start, not what was true when it came.
+has no call that can move; those are methods of the permit. Each of them checks permission directly before its first
+packet, and the bus checks again when the turn of each such packet comes. So a move that waited (for its turn, for the
+motion ahead of it, for the other members of its group, for a step of a homing, for the line) is judged by the state at
+its start, not by the state at its arrival.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,18 +44,18 @@ def always() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Right:
-    """What must hold of the sender of a command, beside the state of the axis.
+    """Conditions on the sender of a command, besides the state of the axis.
 
     Attributes:
-        holds: asked before every motion of the command: its lease, no other daemon.
-        in_time: asked until its first motion has begun: its `not_after`.
+        holds: checked before every motion of the command: its lease, no other daemon.
+        in_time: checked until its first motion has begun: its `not_after`.
     """
 
     holds: Condition = always
     in_time: Condition = always
 
     def also(self, condition: Condition) -> "Right":
-        """Return the right of a sender of whom this must hold as well before every motion."""
+        """Return this right with one more condition, checked before every motion."""
 
         def both() -> None:
             self.holds()
@@ -65,11 +65,11 @@ class Right:
 
 
 UNCONDITIONAL = Right()
-"""Of what brings an axis to rest, and of callers inside the daemon."""
+"""Right of commands that bring an axis to rest, and of callers inside the daemon."""
 
 
 class QuietDrive(Protocol):
-    """What may be done to a drive without permission: nothing here can make it move."""
+    """Calls to a drive that need no permission: none of them can make it move."""
 
     spec: AxisSpec
     adc_full_scale: int | None
@@ -158,7 +158,7 @@ class Unmoved(Moves):
 
 
 class Permit:
-    """What one command may do to the drive of its axis; made by `Gate`."""
+    """Permission of one command to move the drive of its axis; made by `Gate`."""
 
     def __init__(self, gate: "Gate", right: Right, what: str) -> None:
         self._gate = gate
@@ -180,11 +180,11 @@ class Permit:
             raise self._gate.overtaken(self._what)
 
     def renew(self) -> None:
-        """Go on after a stop that this very command has asked for."""
+        """Go on after a stop that this command has requested itself."""
         self._epoch = self._gate.epoch
 
     def begun(self) -> None:
-        """Take note that the first motion has begun: from now on the command is not late any more."""
+        """Note that the first motion has begun: from now on `not_after` does not count."""
         self._begun = True
 
     def ask(self) -> None:
@@ -212,7 +212,7 @@ class Permit:
         self.to_move()()
 
     def to_move(self) -> Condition:
-        """Return what `ask_to_move` asks now, to be asked again when a packet's turn has come."""
+        """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
         energise, tracker = self._to_energise(), self._gate.tracker
 
         def condition() -> None:
@@ -223,7 +223,7 @@ class Permit:
         return condition
 
     def _to_energise(self) -> Condition:
-        """Return what is asked before the loop is closed."""
+        """Return the condition that is checked before the loop is closed."""
         begun = self._begun
 
         def condition() -> None:
@@ -283,7 +283,7 @@ class Permit:
             await drive.set_gains(gains)
 
     def _beginning(self, condition: Condition) -> only_while:
-        """Return the context of the packets that begin a motion; from now on the command is not late any more."""
+        """Return the context of the packets that begin a motion; from now on `not_after` does not count."""
         self.begun()
         return only_while(condition)
 
@@ -309,13 +309,13 @@ class Gate:
         return Permit(self, right, what)
 
     def overtake(self, by: Permit | None = None) -> None:
-        """Make all permits void, but the one that asks for it."""
+        """Make all permits void, except the caller's."""
         self.epoch += 1
         if by is not None:
             by.renew()
 
     def close(self) -> None:
-        """Make all permits void for good."""
+        """Make all permits void permanently."""
         self.closed = True
 
     def ending(self) -> ShuttingDown:
@@ -324,7 +324,7 @@ class Gate:
         return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
 
     def overtaken(self, what: str) -> StopLatched:
-        """Return the refusal of what a stop has overtaken."""
+        """Return the refusal of a command that a stop has overtaken."""
         name = self.tracker.name
         return StopLatched(
             f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
@@ -332,7 +332,7 @@ class Gate:
 
 
 async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
-    """Have axes walk their paths; every member's permission is asked directly before the packet that starts.
+    """Start axes on their paths; every member's permission is checked directly before the packet that starts.
 
     Raises:
         LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
@@ -350,13 +350,13 @@ async def start_path(network: Network, names: frozenset[str], permits: Sequence[
 async def start_together(
     network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
 ) -> None:
-    """Start axes in the same servo cycle; every member's permission is asked directly before the packet that starts.
+    """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
 
     Args:
         network: of their line.
         motions: by axis name.
         permits: of all members.
-        announce: called between the last question and the first packet.
+        announce: called between the last check and the first packet.
 
     Raises:
         LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.

@@ -1,9 +1,9 @@
 """Whether a reading can be true, given the one before it. Pure; time is an input.
 
-A reply has a checksum of one byte: of replies that noise has changed, one in some hundreds passes it. So what the
-drive cannot have done since the last reading that was believed is asked again, before anyone acts on it: a position
-that is not where the velocities lead, another velocity than the axis can have by now, any change of the status. A
-change that is true costs one exchange; one that is not never leaves this module.
+A reply has a checksum of one byte: of replies changed by noise, one in some hundreds passes it. So a reading that the
+drive cannot have reached since the last accepted reading is requested again before it is used: a position to which the
+velocities do not lead, a velocity that the axis cannot have by now, any change of the status. A true change costs one
+exchange; a false one never leaves this module.
 """
 
 from dataclasses import dataclass
@@ -15,28 +15,28 @@ from ldcnd.drivers.scaling import Scale
 from ldcnd.exchange import Timing
 
 NOISE_COUNTS = 16
-"""A closed loop hunts by some counts around its target."""
+"""Movement of a closed loop around its target, counts."""
 ACCELERATIONS = 2.0
-"""An axis accelerates so many times as fast as it may, at most, before a reading is asked for again."""
+"""Highest acceleration accepted without a second reading, as a multiple of the axis's acceleration limit."""
 JUMP_SPEEDS = 2.0
-"""No closed loop moves faster than so many times the highest velocity of its axis."""
+"""Highest speed of a closed loop, as a multiple of the highest velocity of its axis."""
 OPEN_LOOP_SPEEDS = 8.0
 """The same for a shaft that is turned by hand, or by a load."""
 APART_S = 0.1
-"""Two readings that were asked for one after the other are not further apart, unless commands hold the line up."""
+"""Longest time between two consecutive readings, seconds, unless commands delay the line."""
 ROUNDS = 4
-"""So many readings in a row that contradict each other count as one lost reply."""
+"""Consecutive contradicting readings that count as one lost reply."""
 
 _COUNTER, _HALF = 1 << 32, 1 << 31
 
 
 class Verdict(Enum):
-    """What a reading is worth."""
+    """Result of judging a reading."""
 
     BELIEVED = "believed"
     ASK_AGAIN = "ask_again"
     LOST = "lost"
-    """It was asked again several times, and each reading contradicts the others."""
+    """It was requested several times, and each reading contradicts the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +51,11 @@ class PlausibilityGate:
     """Judges the readings of one axis, in the order in which they were taken.
 
     Attributes:
-        jumped: the reading that was believed last is where no motion can have led since the one before.
+        jumped: no motion can have led from the accepted reading before the last one to the last one.
         zeroed: the drive's counter has gone to about 0, and no motion has led there: reset; with `confirmed`.
-        foreign: the reading that was judged last, and not believed, is where no motion can have led: it may be another
-            drive's.
-        confirmed: the reading that the one that was believed last has confirmed, and when; None if it needed no other.
-        withheld: readings that were not believed, so far.
+        foreign: the last reading was not accepted, and no motion can have led to it: it may be another drive's.
+        confirmed: the reading that the last accepted one has confirmed, and when; None if it needed none.
+        withheld: number of readings not accepted so far.
     """
 
     def __init__(self, config: AxisConfig, scale: Scale) -> None:
@@ -68,7 +67,7 @@ class PlausibilityGate:
         self._known: _Seen | None = None
         self._doubtful: _Seen | None = None
         self._rounds = 0
-        self._sure = False  # nothing jumps away from the very first reading, which is believed as it is
+        self._sure = False  # nothing jumps away from the very first reading, which is accepted as it is
         self._scale = scale
         self.reconfigure(config)
 
@@ -87,8 +86,8 @@ class PlausibilityGate:
         """Judge a reading.
 
         Args:
-            reading: what the drive said.
-            timing: when.
+            reading: from the drive.
+            timing: of that reading.
             standing: the axis was at rest, and nothing was commanded since.
         """
         known = self._known
@@ -158,7 +157,7 @@ class PlausibilityGate:
         return abs(_way(seen.reading, reading) - velocities / 2 * passed_s) <= reach
 
     def _is_zeroed(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
-        """Tell whether the counter has begun anew: a shaft that happens to come to rest at its 0 shows a velocity."""
+        """Tell whether the counter was reset to 0: a shaft that happens to come to rest at its 0 shows a velocity."""
         return reading.begun_anew and not seen.reading.begun_anew and not self._led_there(seen, reading, timing)
 
     def _is_jump(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:

@@ -1,4 +1,4 @@
-"""How often each item of one axis is asked for; merges what is due into one exchange."""
+"""Poll rates of the items of one axis; due items are merged into one exchange."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from ldcnd.exchange import Exchange, Timing
 from ldcnd.model.samples import TelemetryItem
 
 Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], bool]
-"""Takes a reading; true when it is not believed before the drive was asked again."""
+"""Takes a reading; true when it is not accepted before the drive was read again."""
 Missed = Callable[[BusError], None]
 
 
 AGAIN_S = 0.001
-"""What is asked again, or at an instant, goes before polls whose deadline is later than this."""
+"""Deadline of a repeated poll, or of one at a given instant, after its due time, in seconds."""
 NEVER_S = float("inf")
 LOOK_ITEMS = frozenset({TelemetryItem.POSITION})
-"""Read at an instant in between: where the axis is."""
+"""Items of a reading at a given instant between two polls."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Turn:
-    """What to ask, and when the poll and each of the slower items are due next."""
+    """An exchange, and when the poll and each of the slower items are due next."""
 
     exchange: Exchange[AxisReading]
     due_at_s: float
@@ -37,10 +37,11 @@ class AxisPoller(Poller[AxisReading]):
 
     Slower items ride along with the poll that is nearest to their own due time, so they are never more than half a poll
     period early or late, and the line carries one periodic exchange an axis. Deadlines are absolute: a late poll does
-    not shift the next one, and missed periods are skipped, not made up for. A single look in between can be asked for.
+    not shift the next one, and missed periods are skipped, not made up for. A single reading between two polls can be
+    requested.
 
     Attributes:
-        rates_hz: how often each item is asked for.
+        rates_hz: poll rate of each item.
     """
 
     laborious = True
@@ -64,7 +65,7 @@ class AxisPoller(Poller[AxisReading]):
         self._deliver = deliver
         self._missed = missed
         self._prepared: _Turn | None = None
-        self._grid_s = self.due_at_s = start_at_s  # of the poll that is next, whatever is asked in between
+        self._grid_s = self.due_at_s = start_at_s  # of the next poll, whatever is read in between
         self._look_s = NEVER_S
         self.deadline_at_s = start_at_s + self._period_s
 
@@ -75,14 +76,14 @@ class AxisPoller(Poller[AxisReading]):
         self._fastest = frozenset(rates_hz) - frozenset(self._slower_s)
 
     def ask_at(self, at_s: float) -> None:
-        """Have the drive read at this instant as well; replaces an earlier wish that was not met yet."""
+        """Have the drive read at this instant as well; replaces an earlier request that was not met yet."""
         self._look_s = at_s
         if self._again is None and min(self._grid_s, at_s) != self.due_at_s:
             self._plan()
             self._reschedule(self)
 
     def _plan(self) -> None:
-        """Take the next slot: of the poll, or of the look if that comes first."""
+        """Take the next slot: of the poll, or of the requested reading if that comes first."""
         self.due_at_s = min(self._grid_s, self._look_s)
         self.deadline_at_s = self.due_at_s + (self._period_s if self._grid_s <= self._look_s else AGAIN_S)
 
@@ -91,7 +92,7 @@ class AxisPoller(Poller[AxisReading]):
         self._prepared = self._turn_at(at_s)
 
     def next_exchange(self, now_s: float) -> Exchange[AxisReading]:
-        """Return what is due, or what has to be asked again."""
+        """Return the exchange that is due, or the one to repeat."""
         turn, self._prepared = self._prepared, None
         if self._again:
             exchange, self._again = self._again, None
@@ -126,7 +127,7 @@ class AxisPoller(Poller[AxisReading]):
         return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
-        """Hand a reading over, and ask again at once if that is wanted."""
+        """Deliver a reading, and repeat the poll at once if the receiver requires it."""
         again = self._deliver(reply, reply.asked, timing)
         if not again and self._again is None:
             return

@@ -1,4 +1,4 @@
-"""The contract of what goes on after its command was accepted: a homing, a timed duty, a stream of set-points."""
+"""Interface of commands that go on after they were accepted: a homing, a timed duty, a stream of set-points."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class Turn:
 
     Attributes:
         command_id: names it everywhere.
-        verb: what is asked.
-        permit: the only way to what can move the drive.
+        verb: the command.
+        permit: the only way to the calls that can move the drive.
     """
 
     command_id: str
@@ -52,7 +52,7 @@ class Procedure(ABC):
 
     @abstractmethod
     def calls_for_step(self, reading: AxisReading) -> bool:
-        """Tell whether the next step is due; the reading was asked for after the latest step took effect."""
+        """Tell whether the next step is due; the reading was requested after the latest step took effect."""
 
     @abstractmethod
     async def step(self) -> bool:

@@ -25,26 +25,26 @@ from ldcnd.model.samples import AxisState
 LEAST_MARK = 100
 """A mark nearer to 0 could be a coincidence: a reset leaves 0."""
 NEAR_COUNTS = 32
-"""So far an axis at rest is from where it was, besides its settle window: loops hunt, shafts relax."""
+"""Largest displacement of an axis at rest besides its settle window, counts: loops hunt, shafts relax."""
 AS_AFTER_RESET = 2
-"""A counter as near to 0 may have been reset."""
+"""Largest count, either side of 0, of a counter that may have been reset."""
 REST_S = 0.5
-"""An axis that has come to rest is kept so much later."""
+"""Delay between the rest of an axis and the writing of its reference, seconds."""
 CHECK_S = 10.0
-"""Longest time after which a shaft that was turned by hand, or a mark that a capture has overwritten, is kept anew."""
+"""Longest time until the position of a shaft turned by hand, or a mark lost to a capture, is written, seconds."""
 READINGS = 3
 """A proof that fails is read again: one reading may be falsified by noise."""
 FAULTS_KEPT = 50
 END_TIME_S = 1.0
-"""Longest time that the end of the daemon takes longer for this."""
+"""Longest delay of the daemon's end for this, seconds."""
 STOPPING_S = 0.05
-"""Longest time between two looks at an axis that is coming to rest at the end of the daemon."""
+"""Longest time between two readings of an axis that comes to rest at the end of the daemon, seconds."""
 log = get_logger("axis")
 
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """What must not have changed of an axis besides what its drive shows.
+    """Properties of an axis that must not have changed, besides the values of its drive.
 
     Attributes:
         address: of the drive.
@@ -59,7 +59,7 @@ class Proof:
     scale: tuple[float, str, float | None]
 
     def differs(self, kept: KeptReference) -> str:
-        """Return what is not as it was, in words; empty when nothing is."""
+        """Return the difference in words; empty without one."""
         if kept.format != FORMAT:
             return f"it was kept by another version of the daemon (format {kept.format}, not {FORMAT})"
         for name, was, now in (
@@ -74,7 +74,7 @@ class Proof:
 
 
 def contradiction(kept: KeptReference, shown: Evidence, near_counts: float) -> str:
-    """Return in words what a drive shows that speaks against a reference; empty when nothing does.
+    """Return in words the value of a drive that contradicts a reference; empty when none does.
 
     Args:
         kept: the reference.
@@ -153,7 +153,7 @@ class ReferenceKeeper:
         Where that is not possible the drive gets another mark, with which no reference on the disk agrees.
 
         Raises:
-            WrongState: neither is possible; a restart would believe it.
+            WrongState: neither is possible; a restart would accept it.
         """
         self._generation += 1
         if self._files is None or self._drive is None or not self._on_disk:
@@ -237,7 +237,7 @@ class ReferenceKeeper:
             try:
                 shown = await drive.evidence()
             except LdcndError as error:
-                refusal = f"the drive could not be asked: {error.message}"
+                refusal = f"the drive could not be read: {error.message}"
                 continue
             refusal = contradiction(kept, shown, self._near_counts)
             if not refusal:

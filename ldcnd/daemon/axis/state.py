@@ -1,4 +1,4 @@
-"""What the daemon knows of one axis: digests readings and commands into PLCopen states. Pure; time is an input."""
+"""State of one axis: maps readings and commands to PLCopen states. Pure; time is an input."""
 
 import math
 from collections.abc import Callable
@@ -16,9 +16,9 @@ from ldcnd.model.meta import PastFault
 from ldcnd.model.samples import AxisState, FaultEntry, LinkState, Moving, Quality
 
 MISSES_UNTIL_DOWN = 3
-"""So many polls in a row must fail before the drive counts as gone."""
+"""Consecutive failed polls after which the drive counts as lost."""
 REST_S = 0.25
-"""A shaft that nobody is known to hold stands when its position has stayed within `REST_COUNTS` for so long."""
+"""Shortest time within `REST_COUNTS` that proves rest of a shaft without a profile of this daemon, seconds."""
 REST_COUNTS = 5
 """Highest less lowest position of a shaft at rest: a closed loop hunts by some counts. More than 20 counts/s never pass
 for rest."""
@@ -27,13 +27,13 @@ MOST_REST_S = 2.0
 LEAST_WINDOW_COUNTS = 5.0
 """A closed loop hunts by some counts."""
 WINDOW_OF_EL = 1 / 400
-"""Of the position error limit: what trips a drive is some hundred times what it should come to rest with."""
+"""Settle window as a fraction of the position error limit: that is some hundred times the error at rest."""
 LEAST_LOOK_S = 0.005
 """Shortest time between two readings of an axis that settles."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
 STOP_UNCONFIRMED = Fault(
     "stop_unconfirmed",
-    "a stop was asked for and the drive has not confirmed it; it is sent again until the drive does",
+    "a stop was requested and the drive has not confirmed it; it is sent again until the drive does",
     stops=False,
 )
 LOOP_OPENED = Fault("loop_opened", "the drive opened its position loop by itself; find out why, then send reset")
@@ -149,8 +149,8 @@ class ActiveCommand:
     """A motion under way.
 
     Attributes:
-        command_id: as told to the caller.
-        verb: what was asked.
+        command_id: as in the reply.
+        verb: the command.
         since_ns: when it was accepted, UTC.
         state: the axis state while it runs.
         completion: what ends it.
@@ -188,7 +188,7 @@ StateShown = tuple[
     Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None, float
 ]
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
-"""What a value read just now is worth, by the drive's link."""
+"""Quality of a value read just now, by the drive's link."""
 
 
 class RestJudge:
@@ -212,12 +212,12 @@ class RestJudge:
         self._quiet_s = REST_S
 
     def forget(self, *, rests: bool | None = None, commanded: bool = False) -> None:
-        """Begin anew: the drive was out of sight, or something was commanded."""
+        """Discard the readings so far: the drive was out of reach, or something was commanded."""
         self.rests, self.commanded = rests, commanded
         self._since_s, self._quiet_s = None, REST_S
 
     def observed(self, reading: AxisReading, at_s: float) -> None:
-        """Take a reading that was asked for at an instant."""
+        """Take a reading that was requested at an instant, in loop time."""
         position = reading.position_counts
         runs = reading.enabled and not reading.profile_done
         if runs or abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s:
@@ -254,7 +254,7 @@ class AxisTracker:
         Args:
             name: of the axis.
             unit: of the axis.
-            ended: told of every command that is over.
+            ended: called for every command that is over.
         """
         self._ended = ended
         self.name = name
@@ -281,10 +281,10 @@ class AxisTracker:
         self._effective_from_s = 0.0
         self._rest = RestJudge()
 
-    # -- what others ask ---------------------------------------------------------------------------------------------
+    # -- for other modules -------------------------------------------------------------------------------------------
 
     def view(self) -> AxisView:
-        """Return what the guards need to know."""
+        """Return the state for the guards."""
         return AxisView(
             self.name,
             self.unit,
@@ -326,7 +326,7 @@ class AxisTracker:
 
     @property
     def quality(self) -> Quality:
-        """What a value read just now is worth."""
+        """Quality of a value read just now."""
         return QUALITIES[self.link]
 
     @property
@@ -340,7 +340,7 @@ class AxisTracker:
         return self.enabled or (self.command is not None and self.command.opens_loop)
 
     def concerns(self, timing: Timing) -> bool:
-        """Tell whether a reading was asked for after the latest command took effect."""
+        """Tell whether a reading was requested after the latest command took effect."""
         return timing.sent_at_s >= self._effective_from_s
 
     # -- what was observed -------------------------------------------------------------------------------------------
@@ -358,7 +358,7 @@ class AxisTracker:
         if self.position_lost:
             self.referenced = False
         if timing.sent_at_s < self._effective_from_s:
-            return  # asked before the latest command took effect: says nothing about it
+            return  # requested before the latest command took effect: says nothing about it
         self._rest.observed(reading, timing.sent_at_s)
         if reading.cut_short and self.command:
             self._failure = reading.cut_short
@@ -509,7 +509,7 @@ class AxisTracker:
         self._rest.forget(rests=False, commanded=self._rest.commanded)
 
     def started(self, now_s: float) -> None:
-        """The drive acknowledged: only readings asked for from now on tell how the command goes."""
+        """Note the acknowledgement: only readings requested from now on count for the command."""
         self._effective_from_s = now_s
         if self.command and self.command.duration_s is not None:
             self._ends_at_s = now_s + self.command.duration_s
@@ -522,7 +522,7 @@ class AxisTracker:
             self._ends_at_s = now_s + rest_s
 
     def failing(self, reason: str) -> None:
-        """The active command will not end as it was asked, for this reason, once the axis has come to rest."""
+        """Note why the active command will fail once the axis has come to rest."""
         self._failure = reason
 
     def finished(self, error: str | None = None, *, settled: bool | None = None) -> None:
@@ -532,17 +532,17 @@ class AxisTracker:
         self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
 
     def latch_stop(self) -> None:
-        """A stop was asked for: nothing moves again before reset."""
+        """Latch a stop: nothing moves again before reset."""
         self.stop_latched = True
 
     def stop_unconfirmed(self, now_ns: int) -> None:
-        """A stop was asked for and no drive has confirmed it."""
+        """Note a stop that no drive has confirmed yet."""
         if not self.stop_pending:
             self.stop_pending = True
             self.active_faults = (*self.active_faults, _entry(STOP_UNCONFIRMED, now_ns))
 
     def stop_confirmed(self) -> None:
-        """The drive has confirmed what was asked for, or cannot be moving: it was reset, or had no power."""
+        """Note that the drive has confirmed the stop, or cannot be moving: it was reset, or had no power."""
         self.stop_pending = False
         self.active_faults = tuple(fault for fault in self.active_faults if fault.code != STOP_UNCONFIRMED.code)
 
@@ -562,7 +562,7 @@ class AxisTracker:
         self._rest.forget(rests=False, commanded=self._rest.commanded)
 
     def cleared(self, now_s: float) -> None:
-        """Reset of an axis that stands: latch and first cause are forgotten; the next readings tell what holds."""
+        """Reset of an axis that stands: latch and first cause are cleared; the next readings show what remains."""
         self._effective_from_s = now_s
         self.stop_latched = False
         self.position_lost = False

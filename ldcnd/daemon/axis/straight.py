@@ -140,7 +140,7 @@ def deviation_of(profiles: Sequence[Profile], skew_s: float = 0.0) -> float:
 
     Args:
         profiles: of the axes that move.
-        skew_s: one of them may start so much later than the others.
+        skew_s: largest delay between the starts of two of them, in seconds.
     """
     length = math.hypot(*(profile.way for profile in profiles))
     along = [profile.way / length for profile in profiles]

@@ -77,7 +77,7 @@ class AxisTelemetry:
         return value, int(turns)
 
     def reading(self, reading: AxisReading, asked: frozenset[TelemetryItem], t: int, t_error_ns: int) -> None:
-        """Publish what was asked for, and the state and the inputs if they changed."""
+        """Publish the requested items, and the state and the inputs if they changed."""
         quality, counts_per_unit = QUALITIES[self._tracker.link], self._counts_per_unit
         if TelemetryItem.POSITION in asked:
             counts, lag, turns = reading.position_counts, reading.following_error_counts, None
@@ -225,8 +225,8 @@ class Arrivals:
     """The commands of one axis that a reading has ended, until that reading is published.
 
     Attributes:
-        reading: the one that is being digested; None while none is.
-        over: what it has ended.
+        reading: the one being processed; None while none is.
+        over: the commands that it has ended.
     """
 
     def __init__(

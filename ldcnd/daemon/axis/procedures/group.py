@@ -95,7 +95,7 @@ class Meeting:
 
     @property
     def failure(self) -> BaseException | None:
-        """What kept the group from moving, before all else that followed from it."""
+        """The first error that kept the group from moving."""
         return self._started.exception() if self._started.done() else None
 
     def fail(self, error: LdcndError) -> None:
@@ -216,6 +216,6 @@ class GroupMember(Procedure):
 
 
 def _look(started: "asyncio.Future[None]") -> None:
-    """Take note of an error that no member is left to hear."""
+    """Retrieve an error that no member waits for, so that asyncio does not report it."""
     if not started.cancelled():
         started.exception()

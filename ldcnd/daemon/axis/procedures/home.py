@@ -28,7 +28,7 @@ log = get_logger("axis")
 DEFAULT_TIMEOUT_S = 60.0
 STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
 BEYOND = 1.1
-"""A search without a distance ends in the drive this much later than its time-out, in case nobody stops it."""
+"""Length of a search without a distance, as a multiple of its time-out: the drive ends it if this host does not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class HomeSequence(Procedure):
             guards.check_position(view, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
         off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
-        await motion.reference.forget()  # before the drive captures: what is kept would be of another origin
+        await motion.reference.forget()  # before the drive captures: the kept reference has another origin
         finds = search.find_velocity is not None and search.runs_onto_switch(motion.scale)
         await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
         return motion.reply(self.turn).model_copy(

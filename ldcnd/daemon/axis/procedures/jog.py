@@ -1,10 +1,10 @@
-"""A jog: it runs for as long as a hand is known to hold it, and in the drive never much farther than that.
+"""A jog: it runs for as long as its client renews the hold, and in the drive never much farther than that.
 
-The client says again and again that the jog is held; this daemon ends it as soon as it has heard nothing for
-`Jog.hold_s`. If the daemon dies, the drive ends it: every packet that runs the axis names a goal. PIC-SERVO SC takes a
-new goal in mid-move, so its goal is only ever twice `hold_s` ahead. Other drives must not get another trapezoid before
-they stand (PIC-SERVO manual, 4.4): their goal is `jog_reach_s` ahead, and a jog that is held for longer, or gets
-another velocity, comes to rest and goes on from there.
+The client renews the hold periodically; this daemon ends the jog as soon as no renewal has come for `Jog.hold_s`. If
+the daemon dies, the drive ends it: every packet that runs the axis names a goal. PIC-SERVO SC takes a new goal in
+mid-move, so its goal is only ever twice `hold_s` ahead. Other drives must not get another trapezoid before they stand
+(PIC-SERVO manual, 4.4): their goal is `jog_reach_s` ahead, and a jog that is held for longer, or gets another velocity,
+comes to rest and goes on from there.
 """
 
 import math
@@ -23,20 +23,20 @@ from ldcnd.model.commands import CommandReply, Jog
 from ldcnd.model.samples import AxisState
 
 REACH_HOLDS = 2.0
-"""How far ahead the goal of a drive that takes new ones is, in units of `hold_s`,"""
+"""Distance of the goal of a drive that accepts a new one in mid-move, in units of `hold_s`,"""
 EXTEND_HOLDS = 0.75
-"""and so long after one goal the next one is given."""
+"""and time between two goals, in the same unit."""
 
 
 class Hold:
-    """What is known of the hand that holds one jog.
+    """State of the hold of one jog.
 
     Attributes:
         axis: that it jogs.
         command_id: names the jog.
-        velocity: that is wanted now, in units a second.
+        velocity: requested now, in units a second.
         acceleration: likewise, in units a second squared; None for the default of the axis.
-        hold_s: the jog ends so long after it was heard of last.
+        hold_s: time from the last renewal to the end of the jog, in seconds.
         until_s: when it ends unless it is renewed, in loop time.
         begun: its procedure has taken it over.
         over: it has ended, and is not begun again.
@@ -49,7 +49,7 @@ class Hold:
         self._take(request, now_s)
 
     def renew(self, request: Jog, now_s: float) -> None:
-        """Take note that the jog is held, and of the velocity that is wanted now.
+        """Renew the hold, with the velocity requested now.
 
         Raises:
             LeaseExpired: it is over.
@@ -58,7 +58,7 @@ class Hold:
         self._take(request, now_s)
 
     def check(self, now_s: float) -> None:
-        """Refuse to move on when nothing was heard of the hand for too long; from then on the jog is over.
+        """Refuse to move on when no renewal has come in time; from then on the jog is over.
 
         Raises:
             LeaseExpired: the jog is over.
@@ -73,12 +73,12 @@ class Hold:
 
 
 def no_such_jog(axis: str, command_id: str) -> LeaseExpired:
-    """Return the refusal of what belongs to a jog that is over, or never was."""
+    """Return the refusal of a renewal of a jog that is over, or never was."""
     return LeaseExpired(
         f"axis {axis}: the jog {command_id} is over",
         axis=axis,
         value=command_id,
-        remedy=Remedy("let go, then {} anew", step("jog")),
+        remedy=Remedy("let go, then {} again", step("jog")),
     )
 
 
@@ -96,12 +96,12 @@ class Holds:
         return hold
 
     def get(self, command_id: str) -> Hold | None:
-        """Return a jog, unless it is forgotten."""
+        """Return a jog; None when it was removed."""
         return self._holds.get(command_id)
 
 
 class _Phase(Enum):
-    """What the drive does for a jog."""
+    """Phase of the drive in a jog."""
 
     RUNS = "runs"
     """It runs to a goal that is there to end it if this host dies."""
@@ -110,7 +110,7 @@ class _Phase(Enum):
     SLOWS = "slows"
     """It comes to rest, to go on at another velocity."""
     RESTS = "rests"
-    """What it did is over."""
+    """Its motion is over."""
 
 
 class HeldJog(Procedure):
@@ -127,7 +127,7 @@ class HeldJog(Procedure):
     @property
     @override
     def deadline_s(self) -> float:  # type: ignore[override]
-        """See `Procedure`: when the hand was heard of last, or when the drive gets its next goal."""
+        """See `Procedure`: when the hold expires, or when the drive gets its next goal."""
         return min(self._hold.until_s, self._extend_at_s)
 
     async def begin(self) -> CommandReply:
@@ -135,7 +135,7 @@ class HeldJog(Procedure):
 
         Raises:
             PositionLimit: the axis stands at the software limit ahead.
-            LeaseExpired: nothing was heard of the hand while the command waited.
+            LeaseExpired: no renewal came while the command waited.
         """
         guards.check_may_move(self._motion.tracker.view())
         try:
@@ -145,12 +145,12 @@ class HeldJog(Procedure):
             self._hold.begun = command is not None and command.command_id == self.turn.command_id
 
     def is_of(self, hold: Hold) -> bool:
-        """Tell whether this is the jog that a hand holds, and goes on."""
+        """Tell whether this is the jog of a hold, and goes on."""
         return self._hold is hold and not hold.over and not self.outlived(self._motion.tracker)
 
     @property
     def wants_step(self) -> bool:
-        """Whether what the hand wants is not what the drive does."""
+        """Whether the requested velocity differs from the drive's."""
         return self._phase in (_Phase.RUNS, _Phase.ENDS) and self._wanted != self._asked
 
     def calls_for_step(self, reading: AxisReading) -> bool:
@@ -167,7 +167,7 @@ class HeldJog(Procedure):
         hold, motion = self._hold, self._motion
         reading = motion.latest()
         if hold.over or motion.clock.now_s() >= hold.until_s:
-            return await self._stop(f"nothing was heard of the hand that holds it for {hold.hold_s:g} s")
+            return await self._stop(f"its hold was not renewed for {hold.hold_s:g} s")
         if reading.cut_short:
             return await self._stop(reading.cut_short)
         if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
@@ -195,7 +195,7 @@ class HeldJog(Procedure):
         plan, velocity, reach_s, at_limit = self._plan(motion.telemetry.position(here), *asked[:2])
         await self.turn.permit.load(plan.motion)
         self._wanted = asked
-        self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if nobody knows whether the drive has started
+        self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if it is unknown whether the drive has started
         extends = motion.driver.retargets and not at_limit
         self._extend_at_s = motion.clock.now_s() + EXTEND_HOLDS * self._hold.hold_s if extends else math.inf
         await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)

@@ -1,7 +1,7 @@
 """Several axes on one polyline: their drives walk through points that are sent to them ahead of time.
 
 Each member feeds its own drive, one packet when that has room for it, in the lane of commands: stops and polls go
-first. Permission is asked for every packet. What ends one member ends all: the one that finds out stops them.
+first. Permission is checked before every packet. An end of one member ends all: the first that notices stops them.
 """
 
 import asyncio
@@ -37,15 +37,15 @@ from ldcnd.model.samples import AxisState
 log = get_logger("axis")
 
 AHEAD_S = 1.0
-"""So much of the path the drives hold: what is left of it is walked if the daemon dies."""
+"""Part of the path that the drives hold in advance, seconds: they walk it to its end if the daemon dies."""
 LINE_SHARE = 0.5
 """Most of a line's time for feeding paths."""
 LEVEL_POINTS = 3
-"""So many points may a drive have more or less than expected: from its start to when that was seen."""
+"""Largest difference between the points in a drive and those expected: from its start to when that was seen."""
 CLOCK_SHARE = 0.0005
-"""By so much the clocks of a drive and of this host may differ."""
+"""Largest difference between the clock rates of a drive and of this host, as a fraction."""
 LATE_S = 1.0
-"""A path that runs so much longer than planned is stopped."""
+"""Longest overrun of a path before it is stopped, seconds."""
 
 
 class PathShareRequest(MoveAbsolute):
@@ -63,13 +63,13 @@ class PathShareRequest(MoveAbsolute):
 
     @property
     def path(self) -> "SharedPath":
-        """What all members have in common."""
+        """The path with its other members."""
         return self._path
 
 
 @dataclass(slots=True)
 class _Share:
-    """What one member has sent.
+    """Progress of one member.
 
     Attributes:
         member: the procedure of its axis.
@@ -85,7 +85,7 @@ class _Share:
 
 
 class SharedPath:
-    """What the members of one path have in common.
+    """State shared by the members of one path.
 
     Attributes:
         plan: the points; None before all members have come.
@@ -109,7 +109,7 @@ class SharedPath:
 
     @property
     def failure(self) -> BaseException | None:
-        """What kept it from beginning."""
+        """The error that kept it from beginning."""
         return self._started.exception() if self._started.done() else None
 
     def fail(self, error: LdcndError) -> None:

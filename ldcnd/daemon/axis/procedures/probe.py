@@ -17,7 +17,7 @@ from ldcnd.model.commands import CommandReply, HomeMethod, Probe, ProbeStop
 from ldcnd.model.samples import AxisState, LatchSample
 
 INDEX_SHARE = 0.75
-"""Of the velocity at which an index pulse lasts exactly one look of the drive: a shaft does not turn quite evenly."""
+"""Highest velocity as a fraction of that at which an index pulse lasts one servo cycle: shafts turn unevenly."""
 STOPS = {ProbeStop.SMOOTH: StopMode.SMOOTH, ProbeStop.ABRUPT: StopMode.ABRUPT}
 
 

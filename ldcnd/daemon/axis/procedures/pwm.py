@@ -58,7 +58,7 @@ class PwmRun(Procedure):
         return False
 
     def outlived(self, tracker: AxisTracker) -> bool:
-        """See `Procedure`; without a command nobody knows whether the motor still runs."""
+        """See `Procedure`; without a command it is unknown whether the motor still runs."""
         return tracker.command is not None and super().outlived(tracker)
 
     def _check_bounds(self) -> None:
