@@ -1,7 +1,7 @@
-"""What one exchange costs the line, in seconds, before any hardware is there. Pure: knows neither clock nor family.
+"""Time of one exchange on the line, in seconds, without hardware. Pure: independent of clock and family.
 
-An exchange is a request, a wait for the drive, a reply, and what the adapter and the host add before the next request
-can begin. Only the wait varies from one exchange to the next.
+An exchange is a request, a wait for the drive, a reply, and the delay of the adapter and the host before the next
+request can begin. Only the wait varies from one exchange to the next.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from ldcnd.bus.settings import LINGER_S
 from ldcnd.exchange import Exchange
 
 TURNAROUND_S = 0.000_25
-"""The host, from a reply's last byte to the next request's first: what 99 of 100 exchanges stay below on a small PC."""
+"""Host delay from a reply's last byte to the next request's first, seconds: the 99th percentile on a small PC."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class LineTiming:
         node_baud: rate at which drives answer; their clocks do not divide to exactly the nominal rate.
         bits_per_byte: 10 for 8N1 and for 7E1.
         turnaround_s: host, between a reply and the next request.
-        adapter_latency_s: what the adapter keeps each reply back.
+        adapter_latency_s: delay of each reply in the adapter.
     """
 
     host_baud: float
@@ -69,7 +69,7 @@ class Cost:
 
 
 def cost_of(exchange: Exchange[Any], timing: LineTiming) -> Cost:
-    """Price an exchange on a line.
+    """Return the time of an exchange on a line.
 
     Args:
         exchange: its reply, if the length varies, as long as expected.

@@ -1,7 +1,7 @@
-"""Whether a line can carry what is asked of it, and what room is left. Pure.
+"""Bus budget of one line: whether it can carry its polls, and the spare capacity. Pure.
 
-A plan holds when every poll is over before its next turn in the worst case, every drive taking as long as it may. What
-a lost reply costs is told apart: no schedule can promise deadlines on a line that loses packets.
+A plan holds when every poll is over before its next turn in the worst case, every drive taking as long as it may. The
+time of a lost reply is stated separately: no schedule can meet deadlines on a line that loses packets.
 """
 
 import math
@@ -14,22 +14,22 @@ from ldcnd.planning.response_times import FULL, PeriodicTask, load_of, meets_dea
 from ldcnd.planning.simulated_polling import Drive, mean_lengths_s
 
 STEPS = 16
-"""Halvings of an interval when a largest value is sought: far finer than anything that is measured."""
+"""Bisection steps when a largest value is sought: far finer than any measurement."""
 
 
 @dataclass(frozen=True, slots=True)
 class Poll:
-    """What is asked for periodically, in one exchange or a few.
+    """A periodic request, of one exchange or a few.
 
     Attributes:
-        axis: whose; the name of an I/O module, or words for a module that has none.
-        items: what it asks for in the worst case.
-        rate_hz: how often at most.
+        axis: its name; the name of an I/O module, or words for a module that has none.
+        items: items that it reads in the worst case.
+        rate_hz: highest rate.
         cost: with all these items.
-        mean_s: with what it asks for on average.
-        request_bytes: what is sent.
-        reply_bytes: what comes back at most.
-        exchanges: that it takes.
+        mean_s: with the items that it reads on average.
+        request_bytes: length of the request.
+        reply_bytes: longest reply.
+        exchanges: number that it takes.
         address: of a module that is no axis.
     """
 
@@ -56,14 +56,14 @@ class Poll:
 
 @dataclass(frozen=True, slots=True)
 class Urgent:
-    """What goes before polls, in seconds.
+    """Exchanges that go before polls, in seconds.
 
     Attributes:
         command_s: longest command exchange.
         stop_s: longest stop exchange.
         recovery_s: from a reply's deadline to the instant at which the line may be used by a stop: the flush.
         margin_s: by which a reply's deadline exceeds its longest time.
-        search_s: longest question to a drive that has been lost; it is asked while one is missing only.
+        search_s: longest exchange of the search for a lost drive; only while one is missing.
         probe: of the stop lane; None for none.
     """
 
@@ -77,13 +77,13 @@ class Urgent:
 
 @dataclass(frozen=True, slots=True)
 class LinePlan:
-    """What a line promises.
+    """Result for one line.
 
     Attributes:
-        polls: what is asked of it.
+        polls: its polls.
         responses_s: for each of them, from being due to being over at the latest, without commands.
         load: share of the line that polls take at worst, `mean_load` on average.
-        commands_per_s: so many evenly spaced commands fit in before a poll misses its turn in the worst case.
+        commands_per_s: highest rate of evenly spaced commands at which no poll misses its turn in the worst case.
         stop_wait_s: from queueing a stop to its first bit at the latest, on a line that is in step.
         stop_s: to the end of its reply.
         stop_after_loss_s: to the end of its reply when the exchange on the wire is lost.
@@ -116,11 +116,11 @@ class LinePlan:
 def plan_line(
     polls: Sequence[Poll], urgent: Urgent, *, by_deadline: bool = True, cycle: ServoCycle | None = None
 ) -> LinePlan:
-    """Work out what a line promises.
+    """Compute the budget of a line.
 
     Args:
-        polls: what is asked of it.
-        urgent: what goes before them.
+        polls: its polls.
+        urgent: exchanges that go before them.
         by_deadline: the earliest deadline goes first; otherwise axes take turns, exchange by exchange.
         cycle: of the drives, where polls with the same deadline are ordered by it.
     """

@@ -1,7 +1,7 @@
-"""From a configuration to what its lines promise, before anything is opened.
+"""From a configuration to the budgets of its lines, before anything is opened.
 
-A plan that cannot hold is refused with the smallest changes that would make it hold, unless the line is told to skip
-polls. Reckoned with the longest replies and waits; see docs/explanation/timing.md for the analysis.
+A plan that cannot hold is refused with the smallest changes that would make it hold, unless the line is configured to
+skip polls. Computed with the longest replies and waits; see docs/explanation/timing.md for the analysis.
 """
 
 import math
@@ -30,7 +30,7 @@ def require_plan(config: RigConfig) -> RigBudget:
     """Return the plan of a rig.
 
     Raises:
-        ConfigError: a line cannot carry what is asked of it; says by how much, and what would make it fit.
+        ConfigError: a line cannot carry its polls; says by how much, and which changes would make it fit.
     """
     plan = plan_rig(config)
     refused = [bus for bus in plan.buses if not bus.holds and bus.overload == "refuse"]
@@ -66,7 +66,7 @@ def plan_bus(bus: BusConfig) -> BusPlan:
 
 
 def demand_of(bus: BusConfig) -> Demand:
-    """Return what a line is asked to carry; without probes if nothing but them would make polls miss their turns."""
+    """Return the exchanges of a line; without probes if only they would make polls miss their turns."""
     demand = FAMILIES[bus.family].plan(bus)
     return demand.without_probes if not demand.fits and demand.without_probes.fits else demand
 

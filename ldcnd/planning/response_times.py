@@ -22,7 +22,7 @@ _ALMOST = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class PeriodicTask:
-    """Something that is due every so often and should be over by its next turn.
+    """A periodic task that should be over by its next turn.
 
     Attributes:
         period_s: least time between two turns.

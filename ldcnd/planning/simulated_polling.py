@@ -1,7 +1,7 @@
-"""How long polls take on average that are ordered by servo cycles: rehearsed, as no formula is known. Pure.
+"""Average duration of polls that are ordered by servo cycles: simulated, as no formula is known. Pure.
 
-The very queue and order of the bus ask drives that are made up, with cycles that lie and drift at random. What comes
-out depends on how many polls are due at the same time, and so on all rates together.
+The queue and order of the bus poll simulated drives, with cycles of random phase and drift. The result depends on how
+many polls are due at the same time, and so on all rates together.
 """
 
 import math
@@ -22,18 +22,18 @@ LEARNING = 10
 COUNTED, FEWEST = 20, 200
 """Polls of each drive on average that count, and of all together at least."""
 REHEARSALS = 3
-"""How much the line waits depends on how the cycles happen to lie: by a tenth of a cycle for 31 drives."""
+"""Number of runs: the wait depends on the random phases, by a tenth of a cycle for 31 drives."""
 DRIFT = 50e-6
-"""By so much crystals differ."""
+"""Largest difference of crystals, as a fraction."""
 _NOTHING: Exchange[None] = Exchange(0, b"", 0, lambda _: ReplyVerdict.INTACT, lambda _: None, 0.0, repeatable=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """One drive, and what is asked of it.
+    """One drive, with its poll.
 
     Attributes:
-        rate_hz: how often.
+        rate_hz: rate of the poll.
         cost: of its poll, with the reply as long as it is on average.
     """
 
@@ -45,7 +45,7 @@ class Drive:
 def mean_lengths_s(drives: tuple[Drive, ...], cycle: ServoCycle, seed: int = 1) -> Sequence[float]:
     """Return how long the polls of each drive occupy the line on average, in seconds, in the order of the drives.
 
-    Some fifty milliseconds of work for 31 drives; a line that cannot do all that is asked of it polls without a pause.
+    Some fifty milliseconds of work for 31 drives; an overloaded line polls without a pause.
     """
     dice = random.Random(seed)  # noqa: S311 - for cycles that are made up
     lengths_s: list[list[float]] = [[] for _ in drives]
@@ -96,7 +96,7 @@ class _Poller(Poller[None]):
         self._phase_s = dice.uniform(0.0, cycle.length_s)
 
     def answer(self, now_s: float) -> Timing:
-        """Return what the bus would make of the reply to a request that leaves now."""
+        """Return the timing of the reply to a request that leaves now."""
         cost = self.drive.cost
         over_s = now_s + cost.request_s
         begins_s = self._phase_s + math.ceil((over_s - self._phase_s) / self._cycle_s) * self._cycle_s

@@ -1,1 +1,1 @@
-"""What simulated lines of every family share: time, bytes, faults, motors."""
+"""Parts shared by simulated lines of every family: time, bytes, faults, motors."""

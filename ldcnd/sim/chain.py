@@ -1,11 +1,11 @@
 """A simulated line: modules in daisy-chain order, the host's line to all of them, the reply line they share.
 
 Time is an input everywhere: nothing here waits or reads a clock, so that an event loop, a virtual clock or a process
-that paces a pseudo-terminal can drive the same chain. One chain knows one clock for all its life.
+that paces a pseudo-terminal can drive the same chain. One chain uses one clock throughout.
 
-Wiring (LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1): full duplex; a module hears the host while its address
-input is low, which is the address output of the module before it, so that the level of one output only concerns the
-next module; two modules that answer at the same time spoil each other's bytes.
+Wiring (LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1): full duplex; a module receives from the host while its
+address input is low, which is the address output of the module before it, so that the level of one output only concerns
+the next module; two modules that reply at the same time corrupt each other's bytes.
 """
 
 import heapq
@@ -39,7 +39,7 @@ class Delivery(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What a module begins to send.
+    """A transmission that a module begins.
 
     Attributes:
         starts_at_s: when the first start bit begins.
@@ -52,12 +52,12 @@ class Reply:
 
 
 class Module(ABC):
-    """What sits on a line.
+    """A device on a line.
 
     Attributes:
         baud: the rate at which it listens and answers.
-        address_out: whether it lets the next module hear the host.
-        latched: whether it hears the host whatever the module before it does.
+        address_out: whether it enables the next module to receive.
+        latched: whether it receives independently of the module before it.
         yields_to_host: whether its transmission ends as soon as the host sends.
         next_event_s: when `advance` must be called next; `NEVER_S` when the module only waits for the host.
     """
@@ -73,7 +73,7 @@ class Module(ABC):
         """Take a byte of the host whose stop bit ended at that instant; None stands for a framing error."""
 
     def takes_whole(self, data: bytes) -> bool:  # noqa: ARG002 - the general answer
-        """Tell whether these bytes, heard without a gap, cannot make anything happen before the last one has ended.
+        """Tell whether these bytes, received without a gap, have no effect before the last one has ended.
 
         Only then `hear_all` may be called.
         """
@@ -85,7 +85,7 @@ class Module(ABC):
             self.hear(value, starts_at_s + number * byte_s)
 
     def catch_up(self, to_s: float) -> None:  # noqa: B027 - most modules have nothing to do between events
-        """Do now what would otherwise be done when the host asks next; changes nothing that can be seen."""
+        """Do work now that would otherwise be done at the host's next request; changes nothing visible."""
 
     @abstractmethod
     def advance(self, to_s: float) -> Reply | None:
@@ -94,7 +94,7 @@ class Module(ABC):
 
 @dataclass(slots=True)
 class _Request:
-    """Bytes of the host on their way."""
+    """Bytes on their way from the host."""
 
     values: deque[int | None]
     starts_at_s: float
@@ -114,7 +114,7 @@ class _Transmission:
     """Bytes on their way to the host.
 
     Attributes:
-        on_wire: False for what an adapter holds back, echoes or repeats.
+        on_wire: False for bytes that an adapter holds back, echoes or repeats.
         yields: ends as soon as the host sends.
         gone: how many of the bytes were delivered, dropped or swallowed.
     """
@@ -146,10 +146,10 @@ class Chain:
     """Modules in daisy-chain order, the first one next to the host.
 
     Attributes:
-        modules: for looking behind the line; fixed.
+        modules: for inspection; fixed.
         baud: the host's rate.
         wire_busy_s: for how long bytes have been on either line so far.
-        on_loss: told the reason when the adapter disappears; set by the open line.
+        on_loss: called with the reason when the adapter disappears; set by the open line.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class Chain:
             self._transmissions.append(_Transmission(data, starts_at_s, byte_s, on_wire=False, yields=False))
 
     def next_event_s(self) -> float | None:
-        """Return when `advance` has something to do next, or None while everybody waits for the host."""
+        """Return when `advance` has something to do next, or None while all modules wait for the host."""
         at_s = self._next_inner_event_s()
         if self._requests:
             at_s = min(at_s, self._requests[0].ends_at_s)
@@ -203,7 +203,7 @@ class Chain:
         return None if at_s == NEVER_S else at_s
 
     def advance(self, now_s: float) -> list[tuple[float, bytes]]:
-        """Let time pass; return what reached the host, each piece with the instant at which it was complete."""
+        """Let time pass; return the bytes that reached the host, each piece with the instant of its end."""
         while True:
             byte_at_s = self._requests[0].next_at_s if self._requests else NEVER_S
             inner_at_s = self._next_inner_event_s()
@@ -215,7 +215,7 @@ class Chain:
                 self._spread_byte(byte_at_s)
 
     def discard(self, now_s: float) -> None:
-        """Drop what has reached the host's port; bytes that are still on the wire will arrive."""
+        """Drop the bytes in the host's port; bytes that are still on the wire will arrive."""
         for transmission in self._transmissions:
             transmission.drop(transmission.complete(now_s))
         self._sweep()
@@ -223,7 +223,7 @@ class Chain:
     # -- what happens by itself --------------------------------------------------------------------------------------
 
     def schedule(self, at_s: float, action: Callable[[float], None]) -> None:
-        """Let something happen to the modules at an instant of the line's clock; it is told the instant."""
+        """Schedule an action on the modules at an instant of the line's clock; it gets the instant."""
         heapq.heappush(self._agenda, (at_s, next(self._agenda_numbers), action))
 
     # -- the adapter -------------------------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ class Chain:
         return now_s >= self._unplugged_until_s
 
     def unplug(self, now_s: float, for_s: float = math.inf) -> None:
-        """Take the adapter away: what is on either line is lost, the modules live on."""
+        """Remove the adapter: bytes on either line are lost, the modules keep running."""
         self._unplugged_until_s = now_s + for_s
         self._requests.clear()
         self._transmissions.clear()
@@ -266,7 +266,7 @@ class Chain:
                     self._begin(reply, module)
 
     def _spread_byte(self, at_s: float) -> None:
-        """Let every module hear one byte of the host."""
+        """Pass one byte of the host to every module."""
         request = self._requests[0]
         value = request.values.popleft()
         request.starts_at_s += request.byte_s
@@ -283,7 +283,7 @@ class Chain:
             hears = module.address_out
 
     def _spread_request(self, request: _Request) -> bool:
-        """Let every module hear all of a request at once, where that makes no difference; tell whether it did.
+        """Pass a whole request to every module at once, where that makes no difference; tell whether it did.
 
         Nearly every request is a single packet, and most modules have nothing to do with it.
         """
@@ -310,7 +310,7 @@ class Chain:
         return self.baud * (1.0 - BAUD_TOLERANCE), self.baud * (1.0 + BAUD_TOLERANCE)
 
     def _interrupt(self, at_s: float) -> None:
-        """End the transmissions of those that listen to the host as soon as it sends."""
+        """End the transmissions of modules that yield to the host."""
         if not self._transmissions:
             return
         for transmission in self._transmissions:
@@ -343,7 +343,7 @@ class Chain:
         self._sweep()
 
     def _collide(self, late: _Transmission) -> None:
-        """Merge what overlaps: the host frames the earlier bytes and reads them wrong, the later ones are swallowed."""
+        """Merge overlapping transmissions: the host frames the earlier bytes, misread; the later ones are lost."""
         for early in self._transmissions:
             if not early.on_wire or early.ends_at_s <= late.starts_at_s:
                 continue

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class FaultKind(StrEnum):
-    """What can happen to one request or one reply, or to the line when a request is sent."""
+    """Kinds of faults of one request or one reply, or of the line when a request is sent."""
 
     REQUEST_LOST = "request_lost"
     REQUEST_BYTE_LOST = "request_byte_lost"
@@ -22,7 +22,7 @@ class FaultKind(StrEnum):
     UNPLUGGED = "unplugged"
     """The adapter disappears when the request is sent."""
     ECHO = "echo"
-    """The host hears its own request."""
+    """The host receives its own request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class FaultyRequest:
 
     Attributes:
         values: the bytes that reach the modules; None in the place of a lost one.
-        echoed: the host hears what it sent.
+        echoed: the host receives its own bytes.
         unplugged_s: for how long the adapter disappears; 0 when it stays.
     """
 
@@ -83,7 +83,7 @@ class FaultInjector:
         self._dice = random.Random(plan.seed)  # noqa: S311 - reproducible on purpose
 
     def request(self, data: bytes, at_s: float) -> FaultyRequest:
-        """Return what becomes of a request."""
+        """Return the request after its faults."""
         if not self._faults:
             return FaultyRequest(tuple(data))
         struck = self._strike(at_s)
@@ -98,7 +98,7 @@ class FaultInjector:
         return FaultyRequest(tuple(values), FaultKind.ECHO in struck, unplugged.longest_s if unplugged else 0.0)
 
     def reply(self, data: bytes, at_s: float) -> FaultyReply:
-        """Return what becomes of a reply; empty when nothing of it is left."""
+        """Return the reply after its faults; empty when nothing of it is left."""
         if not self._faults:
             return FaultyReply(data)
         struck = self._strike(at_s)

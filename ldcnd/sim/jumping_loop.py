@@ -98,7 +98,7 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         return self._jumping.now_s
 
     def _write_to_self(self) -> None:
-        """Wake the loop, from a thread or a signal handler: the next look is a real one."""
+        """Wake the loop, from a thread or a signal handler: the next select is a real one."""
         super()._write_to_self()  # type: ignore[misc] # known to asyncio's loops, not to their types
         self._jumping.poked = True
 
@@ -108,7 +108,7 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         callback: Callable[..., object],
         *args: Any,  # noqa: ANN401 - whatever the callback takes
     ) -> None:
-        """Handle a signal: from now on every look is a real one, for a signal writes to the pipe by itself."""
+        """Handle a signal: from now on every select is a real one, because a signal writes to the pipe by itself."""
         super().add_signal_handler(sig, callback, *args)
         self._jumping.signalled = True
 

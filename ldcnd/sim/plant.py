@@ -1,7 +1,7 @@
 """The machine on a simulated drive's shaft: DC motor, load, encoder, limit switches, index pulse, potentiometer.
 
-Time is counted in steps of one servo cycle; the drive says for how many steps which duty was on the motor. Nothing here
-knows a protocol. The motor has no inductance: its current follows the voltage at once, as seen from a servo cycle.
+Time is counted in steps of one servo cycle; the drive says for how many steps which duty was on the motor. This module
+is independent of protocols. The motor has no inductance: within a servo cycle its current follows the voltage at once.
 """
 
 import math
@@ -67,7 +67,7 @@ class Shaft:
         stalled: something holds it.
         current_limited: the motor would have drawn more current in the last step than the amplifier gives.
         slack_counts: how far the motor has turned forward within the backlash, 0 to all of it.
-        delay_steps: for so many steps, at most, the motor goes on with what it got before.
+        delay_steps: largest number of steps for which the motor goes on with the previous output.
     """
 
     def __init__(self, plant: MotorPlant, step_s: float) -> None:
@@ -143,7 +143,7 @@ class Shaft:
         self.velocity_counts = velocity
 
     def _delayed(self, duty: float | None) -> float | None:
-        """Return what reaches the motor now: between two outputs in the share in which the dead time lies there."""
+        """Return the output that reaches the motor now, interpolated between two outputs by the dead time."""
         on_the_way = self._on_the_way
         on_the_way.append(duty)
         earlier = on_the_way.popleft()

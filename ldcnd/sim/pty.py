@@ -25,15 +25,15 @@ from ldcnd.transport.line_discipline import actual_baud
 
 SPIN_S = 150e-6
 LONGEST_SLEEP_S = 0.05
-"""How long a request to stop may stay unnoticed."""
+"""Longest delay of a request to stop, seconds."""
 READ_BYTES = 4096
 
 
 class LineObserver(Protocol):
-    """Gets what passes through the terminal; instants are seconds since it was opened."""
+    """Receives all bytes of the terminal; instants are seconds since it was opened."""
 
     def sent(self, at_s: float, data: bytes, baud: int | None) -> None:
-        """Take bytes that the host wrote, and its rate, as far as the line knows it."""
+        """Take bytes that the host wrote, and its rate, None when the line cannot tell it."""
 
     def received(self, at_s: float, data: bytes) -> None:
         """Take bytes that were delivered to the host."""
@@ -94,7 +94,7 @@ class PtyLine:
         os.close(self._slave)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Serve the host until `stop` says so; it is asked at least every 50 ms."""
+        """Serve the host until `stop` returns true; it is called at least every 50 ms."""
         while not stop():
             self._wait()
             self._take_requests()
@@ -129,7 +129,7 @@ class PtyLine:
                 self._observer.received(self._now_s(), due)
 
     def _catch_up(self) -> None:
-        """Use the host's turn for one module after another, so that one that was not asked for long answers in time."""
+        """Use the host's turn to advance one module after another, so that a long unused one replies in time."""
         if self._chain.next_event_s() is None:
             next(self._modules).catch_up(self._now_s())
 
@@ -153,7 +153,7 @@ def serve_pty(
         chain: built with the same `baud_check`.
         link: symbolic link to make to the terminal.
         baud_check: frames at another rate than a module's are garbage to it.
-        stop: asked at least every 50 ms whether to end. Without it SIGTERM and SIGINT end it; then only the main
+        stop: called at least every 50 ms; true ends it. Without it SIGTERM and SIGINT end it; then only the main
             thread may call.
         opened: called with the terminal's path once it can be used.
         observer: gets all bytes that pass.

@@ -1,1 +1,1 @@
-"""What suits an axis, found from its traces; one package per family, pure functions without I/O."""
+"""Gains for an axis, computed from its traces; one package per family, pure functions without I/O."""

@@ -167,7 +167,7 @@ STOP_CONTROLS = {
 
 
 def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusItem:
-    """Return the status items that a drive is asked for when these telemetry items are wanted."""
+    """Return the status items that a drive must send for these telemetry items."""
     mask = STATE_ITEMS
     if TelemetryItem.ADC in items:
         mask |= StatusItem.ADC
@@ -204,7 +204,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
 
     def forget(self) -> None:
-        """The drive was reset or lost power: nothing that was sent before holds any more."""
+        """Note that the drive was reset or lost power: nothing that was sent before holds any more."""
         self.state.restarted()
         self._book.reset()
         self._initialised = False
@@ -240,7 +240,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
     # -- reading -----------------------------------------------------------------------------------------------------
 
     def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
-        """See `Readable`. Whether the analog sensor was lost can only be told with its value."""
+        """See `Readable`. The loss of the analog sensor shows only in its value."""
         senses = self.profile.analog_target and self.state.known.absolute is not False
         prepared = self._readings.get((items, senses))
         if prepared is None:
@@ -346,7 +346,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         self.state.cleared()
 
     async def _initialise_registers(self) -> None:
-        """Do what the LS-182AP manual asks for once after a reset: amplifier off, no distance to go."""
+        """Do what the LS-182AP manual requires once after a reset: amplifier off, no distance to go."""
         status = await self._bus.execute(commands.read_status(self._node, StatusItem.POSITION | StatusItem.AUX))
         if status.aux is None or status.aux & AuxFlag.SERVO_ON:
             return  # taken over with its loop closed: initialised long ago
@@ -405,7 +405,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         return quantised(motion, self.state.servo_divisor, self.profile)
 
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
-        """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: moving on is what is asked for.
+        """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
 
         Raises:
             NotSupported: an analog target on a drive without absolute positioning.
@@ -484,7 +484,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         log.info("position counter set back", axis=self.spec.name, counts=before)
 
     async def _arm(self, motion: Motion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
-        """Arm the capture that is asked for, or the one that stops the motion at the limit switch ahead, or none.
+        """Arm the requested capture, or the one that stops the motion at the limit switch ahead, or none.
 
         It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode"). Only the drive's home
         register changes: the reference is the host's.

@@ -50,7 +50,7 @@ MODELS = MappingProxyType(
         )
     }
 )
-"""By the name of the profile: the dialect, and how the module is when nothing else is asked for."""
+"""By the name of the profile: the dialect, and the default settings of the module."""
 OLD_NAMES = MappingProxyType(
     {
         "ls182ap": "ls-182ap",
@@ -68,7 +68,7 @@ OLD_NAMES = MappingProxyType(
 
 
 def model(name: str) -> tuple[Profile, ModuleSettings]:
-    """Return the dialect of a module and how it is when nothing else is asked for.
+    """Return the dialect of a module and its default settings.
 
     Args:
         name: as in `MODELS` or `OLD_NAMES`.
@@ -149,7 +149,7 @@ class ChainSpec:
 
     Attributes:
         baud_check: bytes at another rate than a module's are garbage to it. Without it every module understands the
-            host at any rate, for ports that do not know the rate.
+            host at any rate, for ports without a rate.
         seed: of the modules' phases and drifts.
         events: in any order.
     """

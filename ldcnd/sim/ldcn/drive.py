@@ -124,11 +124,11 @@ class SimulatedDrive(SimulatedModule):
 
     @property
     def dialect(self) -> Profile:
-        """A CMC knows its own commands only after Stop Motor with bit 5."""
+        """A CMC accepts its own commands only after Stop Motor with bit 5."""
         return self._advanced if self._is_advanced else self._compatible
 
     def restart(self) -> None:
-        """Everything but the shaft and its troubles starts anew."""
+        """Restart everything but the shaft and its faults."""
         if self.profile.pic_ae_diagnostics:
             self.stage = LogosolPower()
         else:
@@ -287,7 +287,7 @@ class SimulatedDrive(SimulatedModule):
             self.addressed()
 
     def addressed(self) -> None:
-        """What was saved for the start-up energises the motor now."""
+        """Energise the motor as saved for the start-up."""
         start_up, self._energised_by_address = self._energised_by_address, StartUp(0)
         if start_up & StartUp.AMPLIFIER_ON:
             self.stage.enable(on=True)
@@ -297,7 +297,7 @@ class SimulatedDrive(SimulatedModule):
     # -- commands ----------------------------------------------------------------------------------------------------
 
     def _renumber(self, position: int) -> None:
-        """Name the present position anew: 0; on PIC-SERVO SC also relative to home, or any number."""
+        """Set the present position: 0; on PIC-SERVO SC also relative to home, or any number."""
         loop, rule = self.loop, self.settings.reset_in_motion
         profiler = loop.trajectory
         moving = loop.servo_on and profiler.mode is ProfileMode.TRAPEZOIDAL and not profiler.done

@@ -45,7 +45,7 @@ IDENTITY_ONLY_ITEM_BYTES = (0, 0, 0, 0, 0, 2, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class IoWiring:
-    """What is connected to a PIC-I/O from the beginning.
+    """Wiring of a PIC-I/O at power-up.
 
     Attributes:
         low: lines, 1 to 12, that are held low from outside; the others are pulled up.

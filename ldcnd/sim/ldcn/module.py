@@ -1,4 +1,4 @@
-"""What every simulated LDCN/NMC module has in common: addresses, packets, status, rate, reset.
+"""Base of every simulated LDCN/NMC module: addresses, packets, status, rate, reset.
 
 A packet is executed at the end of the servo cycle in which it became complete, and the status packet starts there;
 every module has its own phase and drift of that grid. Decisions where the manuals leave room:
@@ -6,8 +6,8 @@ every module has its own phase and drift of that grid. Decisions where the manua
 * A byte of the host that arrives before the status packet has been sent makes a module drop that packet. The command
   itself waits in the buffer into which the next packet is received, and is overwritten by the address byte of any.
 * A framing error in the middle of a packet counts as a wrong checksum; outside of packets it is nothing.
-* Nothing is heard while the address input is high. It is a level, not a latch, unless a switch says otherwise: a module
-  behind one that was reset is deaf until that one has an address again.
+* Nothing is received while the address input is high. It is a level, not a latch, unless a switch says otherwise: a
+  module behind one that was reset is deaf until that one has an address again.
 
 Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface", "Addressing".
 """
@@ -43,9 +43,9 @@ class SimulatedModule(Module):
         address: individual address; 0 until one was set.
         group: group address, 128 to 255.
         leader: answers for its group.
-        items: what Define Status asked for.
+        items: status items selected by Define Status.
         overwritten: how many commands were lost because another packet came before they were executed.
-        unknown_bauds: how many codes of Set Baud Rate it did not know.
+        unknown_bauds: number of unknown codes in Set Baud Rate.
     """
 
     def __init__(self, profile: Profile, settings: ModuleSettings) -> None:
@@ -129,7 +129,7 @@ class SimulatedModule(Module):
 
     @property
     def dialect(self) -> Profile:
-        """What it understands at present; some devices learn more by a command."""
+        """Commands accepted at present; some devices accept more after a command."""
         return self.profile
 
     def power(self, *, on: bool, at_s: float) -> None:
@@ -154,7 +154,7 @@ class SimulatedModule(Module):
         """Restore what was saved, at power-up."""
 
     def save(self, start_up: int) -> None:
-        """Save the configuration, as the control byte of Hard Reset asks for."""
+        """Save the configuration, as the control byte of Hard Reset requests."""
 
     def addressed(self) -> None:
         """Do what is due when an address has been set."""
@@ -165,7 +165,7 @@ class SimulatedModule(Module):
 
     @abstractmethod
     def execute(self, command: ReceivedCommand) -> None:
-        """Execute a command that is not common to all modules; ignore what this one does not know."""
+        """Execute a command that is not common to all modules; ignore one that this module does not have."""
 
     @abstractmethod
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:

@@ -10,7 +10,7 @@ from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 
 
 class Condition(StrEnum):
-    """What can be wrong around a drive; set and cleared from outside while it runs."""
+    """Faults around a drive; set and cleared from outside while it runs."""
 
     STOP_INPUT = "stop_input"
     OVERVOLTAGE = "overvoltage"
@@ -32,7 +32,7 @@ class Condition(StrEnum):
 
 
 class Trip(Enum):
-    """What switched a Logosol power driver off; the value is the status byte's pattern in bits 3, 5 and 6."""
+    """Cause that switched a Logosol power driver off; the value is the status byte's pattern in bits 3, 5 and 6."""
 
     STOP_INPUT = StatusFlag.LIMIT2
     SHORT_OR_OVERVOLTAGE = StatusFlag.LIMIT1
@@ -172,7 +172,7 @@ class LogosolPower(PowerStage):
         self.check()
 
     def clear(self) -> None:
-        """Forget the latched cause, with Pic_ae = 0 only."""
+        """Clear the latched cause, with Pic_ae = 0 only."""
         if not self.enabled:
             self.latched = None
         self.check()

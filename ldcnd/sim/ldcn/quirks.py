@@ -11,7 +11,7 @@ from ldcnd.drivers.ldcn.profiles import CLOCK_HZ
 
 
 class CommandBuffer(StrEnum):
-    """What becomes of a command that waits for the end of the servo cycle when another packet begins."""
+    """Effect of a new packet on a command that waits for the end of the servo cycle."""
 
     OVERWRITTEN = "overwritten"
     """It is lost with the other packet's address byte, for this module or another (PIC-SERVO manual, 4.1)."""
@@ -20,7 +20,7 @@ class CommandBuffer(StrEnum):
 
 
 class PositionErrorClearing(StrEnum):
-    """What clears the sticky pos_error bit once the loop is closed."""
+    """Event that clears the sticky pos_error bit once the loop is closed."""
 
     BY_COMMAND = "by_command"
     """Clear Sticky Bits only, as both manuals say."""
@@ -37,7 +37,7 @@ class AnalogEnd(StrEnum):
 
 
 class UnknownBaud(StrEnum):
-    """What PIC-SERVO SC does with a code of Set Baud Rate that its data sheet does not list."""
+    """Effect of a code of Set Baud Rate that the data sheet of PIC-SERVO SC does not list."""
 
     KEPT = "kept"
     """It stays at its rate."""
@@ -46,7 +46,7 @@ class UnknownBaud(StrEnum):
 
 
 class ResetInMotion(StrEnum):
-    """What Reset Position does to the goal of a trapezoidal move that is under way."""
+    """Effect of Reset Position on the goal of a trapezoidal move that is under way."""
 
     GOAL_KEPT = "goal_kept"
     """The goal keeps its number, and so becomes another place."""
@@ -57,7 +57,7 @@ class ResetInMotion(StrEnum):
 
 
 class ExcludedOptions(StrEnum):
-    """What PIC-SERVO SC does with options of I/O Control that its data sheet does not allow together."""
+    """Effect of options of I/O Control that the data sheet of PIC-SERVO SC does not allow together."""
 
     OBEYED = "obeyed"
     """Each does what it does alone; of both kinds of limit protection, turning the motor off wins."""
@@ -68,7 +68,7 @@ class ExcludedOptions(StrEnum):
 
 
 class HalfPoint(StrEnum):
-    """What becomes of an odd byte at the end of Add Path Points."""
+    """Effect of an odd byte at the end of Add Path Points."""
 
     IGNORED = "ignored"
     COMPLETED = "completed"
@@ -77,7 +77,7 @@ class HalfPoint(StrEnum):
 
 
 class PathWithoutServo(StrEnum):
-    """What path mode does while the servo is off."""
+    """Behaviour of path mode while the servo is off."""
 
     WAITS = "waits"
     """Points are taken, a start does nothing."""
@@ -95,7 +95,7 @@ class RelativeTo(StrEnum):
 
 
 class PathOverflow(StrEnum):
-    """What happens to path points that the buffer has no room for."""
+    """Effect of path points that exceed the buffer."""
 
     DROP_EXCESS = "drop_excess"
     DROP_PACKET = "drop_packet"
@@ -104,7 +104,7 @@ class PathOverflow(StrEnum):
 
 
 class LimitInPath(StrEnum):
-    """What limit protection does to a path."""
+    """Effect of limit protection on a path."""
 
     ENDS_PATH = "ends_path"
     KEEPS_PATH_MODE = "keeps_path_mode"
@@ -126,9 +126,9 @@ class ModuleSettings:
         always_obeys_global_reset: obeys Hard Reset to FF in any group; PIC-SERVO up to version 5 and PIC-I/O do so only
             in group FF.
         yields_to_host: drops its reply as soon as the host sends, also one that is due.
-        command_buffer: what becomes of a command that has not been executed yet when another packet begins.
-        address_in_latched: once it has an address it hears the host, whatever the level of its address input.
-        unknown_baud: what PIC-SERVO SC does with a code of Set Baud Rate that it does not know.
+        command_buffer: effect of a new packet on a command that has not been executed yet.
+        address_in_latched: once it has an address it receives, whatever the level of its address input.
+        unknown_baud: effect of an unlisted code of Set Baud Rate on PIC-SERVO SC.
         undefined_status_bits: of a PIC-I/O's status byte, of which only bit 1 is defined.
         undefined_level_bits: of the upper half of a PIC-I/O's second input byte.
         synch_output_once: a PIC-I/O applies stored outputs once, not with each Synch Output.

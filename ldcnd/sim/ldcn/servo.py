@@ -10,7 +10,7 @@ PIC-SERVO SC, whose data sheet is silent about the factor. Deadband compensation
 Where the manuals leave room:
 
 * A servo rate divisor of 0, which no manual allows, counts as 256.
-* Encoder transitions faster than the model counts are lost for good; so are those of a stuck encoder.
+* Encoder transitions faster than the model counts are lost permanently; so are those of a stuck encoder.
 """
 
 import math
@@ -74,7 +74,7 @@ class HomeSearch:
 
 
 class ServoLoop:
-    """What the firmware does in every servo cycle, and the registers it works on.
+    """The firmware's work in every servo cycle, and its registers.
 
     Args:
         profile: the dialect.

@@ -1,8 +1,8 @@
-"""The wires between a host and simulated SmartSteps: who hears whom, what collides; one module of a simulated line.
+"""The wires between a host and simulated SmartSteps: receivers and collisions; one module of a simulated line.
 
-Four wires: every drive hears the host alone, the host hears the drives. Two wires: all hear all. A drive with unit
-number 0 never releases its transmitter, so on a pair that it shares nothing else gets through. One module stands for
-the whole cable, because its drives share pairs and may hear each other, which a daisy chain does not know.
+Four wires: every drive receives from the host alone, the host from the drives. Two wires: all receive from all. A drive
+with unit number 0 never releases its transmitter, so on a pair that it shares nothing else gets through. One module
+stands for the whole cable, because its drives share pairs and may receive from each other, unlike in a daisy chain.
 Source: manual 1 (4), (5) and 2.2 (6); the two-wire hazards follow from the formats in 2.2.
 """
 
@@ -60,7 +60,7 @@ class SimulatedCable:
         return heard
 
     def next_start_s(self) -> float | None:
-        """When a drive will next begin to send, as far as they know; None when all are silent."""
+        """When a drive will next begin to send, as determined so far; None when all are silent."""
         starts = [unit.next_start_s for unit in self.units if unit.next_start_s is not None]
         return min(starts, default=None)
 

@@ -286,7 +286,7 @@ class SimulatedDrive:
     # -- time --------------------------------------------------------------------------------------------------------
 
     def advance(self, to_s: float) -> None:
-        """Live until then, recording the trace points on the way."""
+        """Run until then, recording the trace points on the way."""
         while self.recorder.next_s is not None and self.recorder.next_s <= to_s:
             self._live(self.recorder.next_s)
             if self.recorder.record(self._trace_point):

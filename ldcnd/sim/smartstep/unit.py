@@ -1,4 +1,4 @@
-"""A simulated SmartStep on its line: hears characters, stays silent or answers, each thing at its time.
+"""A simulated SmartStep on its line: receives characters, stays silent or replies, each at its time.
 
 Time is an input: `receive` says when characters have arrived, `transmissions` what the unit has begun to send by then.
 Source: manual 2.1 "Basic specifications" (the silent cases), 2.2.
@@ -72,14 +72,14 @@ class SimulatedUnit:
 
     @property
     def next_start_s(self) -> float | None:
-        """When the unit will next begin to send, as far as it knows."""
+        """When the unit will next begin to send, as determined so far."""
         return self._pending.start_s if self._pending else None
 
     def receive(self, characters: bytes, at_s: float) -> None:
-        """Hear characters without a gap, the last of which was complete at that time.
+        """Receive characters without a gap, the last of which was complete at that time.
 
-        `parity.DAMAGED` stands for a parity or framing error. What arrives between a command and the end of its reply
-        is lost: the drive does one thing at a time.
+        `parity.DAMAGED` stands for a parity or framing error. Characters between a command and the end of its reply
+        are lost: the drive does one thing at a time.
         """
         self._settle(at_s)
         if not self._powered:

@@ -1,5 +1,5 @@
-"""What an axis is, from its traces, and which gains suit it: pure functions without I/O.
+"""Model of an axis from its traces, and gains for it: pure functions without I/O.
 
 Start with `plant.py`. `identify.py` finds a plant in traces of moves, `design.py` proposes gains for it, `response.py`
-tells what a move will look like. The control law is that of the simulated drive, so there is one of it.
+predicts a move. The control law is that of the simulated drive, so there is only one.
 """

@@ -2,8 +2,8 @@
 
 The loop is the one that the drive closes: position sampled once per servo tick, the output held until the next one, the
 plant's dead time added. `kp` and `kd` put the crossover where it is wanted with the phase that is wanted; `ki` acts a
-decade below; `il` lets it hold friction and load and no more. The proposal must then bear a move on plants at the edges
-of what is known of this one: where one overshoots, rings or gives up, the bandwidth is lowered.
+decade below; `il` lets it hold friction and load and no more. The proposal must then pass a move on plants at the edges
+of the interval of this one: where one overshoots, rings or trips, the bandwidth is lowered.
 """
 
 import math
@@ -22,9 +22,9 @@ MOST_GAIN = 0x7FFF
 MOST_OUTPUT = 250
 """Output limit; "usually, PWM value greater than 250 is not recommended" (LS-182AP manual)."""
 PHASE_MARGINS_DEG = (60.0, 45.0, 35.0, 30.0)
-"""Tried for the estimated plant."""
+"""Phase margins tried for the estimated plant, degrees."""
 LEAST_PHASE_DEG = 20.0
-"""Of each plant that it may be."""
+"""Least phase margin on each plant of the interval, degrees."""
 MOST_LEAD_DEG = 78.0
 """More phase than this is made of nearly nothing but the derivative, and holds no position."""
 GAIN_MARGIN_DB = 6.0
@@ -34,19 +34,19 @@ BANDWIDTHS_HZ = tuple(4.0 * 1.35**n for n in range(12))
 """Tried where none is wanted: 4 to 109 Hz."""
 STIFF_PHASE_DEG = 35.0
 STIFF_RESERVE_S = 0.0015
-"""What is left of the phase margin if the dead time is so much longer than soft traces tell."""
+"""Extra dead time that the phase margin must bear, seconds, beyond the estimate from soft traces."""
 LEAST_SPREAD = 0.05
 """An acceleration is taken to be known no better than to this share: loads change."""
 LEAST_ERROR_LIMIT = 50
-"""EL is three times the predicted following error and so many counts."""
+"""Counts added to three times the predicted following error for EL."""
 SAME_S = 0.001
-"""Moves that settle within so much of each other are as good: then the slower loop wins."""
+"""Largest difference of settling times that count as equal, seconds: then the slower loop wins."""
 INTEGRAL_RESERVE = 2.0
-"""The integral may hold so many times friction and load."""
+"""Limit of the integral, as a multiple of friction and load."""
 MOST_KICK_PWM = 32.0
-"""What one count of encoder noise may add to the output through `kd`."""
+"""Most output that one count of encoder noise may add through `kd`, PWM steps."""
 MOST_OVERSHOOT = 0.08
-"""Of the predicted move, on every plant at the edge of what is known; a measured one gets 0.15."""
+"""Largest overshoot of the predicted move, on every plant at the edge of the interval; a measured one gets 0.15."""
 MOST_TICK_SHARE = 0.05
 """A servo tick is no longer than this share of the crossover's period."""
 PREDICTED_S = 0.6
@@ -57,12 +57,12 @@ WINDOW_SHARE = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """How far a loop is from ringing.
+    """Stability margins of a loop.
 
     Attributes:
         crossover_hz: where its gain is 1.
-        phase_deg: what is left to -180 degrees there.
-        gain_db: what is left to 1 where its phase is -180 degrees; infinite where it never is.
+        phase_deg: distance to -180 degrees there.
+        gain_db: distance to 1 where its phase is -180 degrees; infinite where it never is.
     """
 
     crossover_hz: float
@@ -72,7 +72,7 @@ class Margins:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """Gains, and what they promise.
+    """Gains, with the predicted move.
 
     Attributes:
         gains: the registers.
@@ -123,7 +123,7 @@ def gains_for(
 
     Args:
         profile: the dialect.
-        plant: what the loop works on.
+        plant: of the loop.
         bandwidth_hz: the crossover.
         phase_margin_deg: the phase that is left there.
         integral_share: the integral acts below this share of the crossover.
@@ -253,7 +253,7 @@ def _is_safe(there: Margins) -> bool:
 
 
 def _edges(known: Identified) -> tuple[Plant, ...]:
-    """Return plants at the edge of what is known and a little beyond: strong, late and loose; weak; smooth."""
+    """Return plants at the edge of the interval and a little beyond: strong, late and loose; weak; smooth."""
     plant, spread = known.plant, known.interval
     change = max(spread.acceleration, LEAST_SPREAD * plant.acceleration)
     loose = plant.backlash_counts + spread.backlash_counts

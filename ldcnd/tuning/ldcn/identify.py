@@ -21,12 +21,12 @@ from ldcnd.tuning.ldcn.response import Floats, Move, Start, simulate
 CONFIDENCE_SIGMAS = 1.96
 """Half the width of an interval of 95 %, in standard deviations."""
 MOST_LATE_S = 0.06
-"""A move may begin so long before its first visible count."""
+"""Longest time between the begin of a move and its first visible count, seconds."""
 LATE_STEP_S = 0.002
 FEWEST_SAMPLES = 12
 ITERATIONS = 12
 MOST_CYCLES = 40.0
-"""Longest dead time that is looked for, servo cycles."""
+"""Longest dead time that the fit considers, servo cycles."""
 MOST_STEP = (1.0, 1.5, 20.0, 20.0, 3.0, 20.0)
 """Largest change of each value of a plant in one step of the fit."""
 GOOD_COUNTS = 1.0
@@ -45,7 +45,7 @@ class Record:
 
     Attributes:
         gains: the registers in force.
-        move: what the drive was told.
+        move: the commanded move.
         start: how the axis stood.
         times_s: of the samples, rising; when the move began is not known better than by the trace itself.
         positions: counts from the command position before the move.
@@ -65,7 +65,7 @@ class Identified:
     Attributes:
         plant: the best estimate.
         interval: half the width of the 95 % interval of each value, in its unit.
-        left_counts: standard deviation of what the plant does not explain.
+        left_counts: standard deviation of the residuals.
     """
 
     plant: Plant
@@ -80,7 +80,7 @@ def identify(profile: Profile, records: Sequence[Record], near: Plant | None = N
         profile: the dialect.
         records: at least one in each direction, each with enough output to accelerate visibly; stiffer gains tell more
             of the dead time, softer ones of the rest.
-        near: where to begin: what earlier records have told; without it the records themselves say.
+        near: start of the fit, from earlier records; without it the regression over the records.
 
     Raises:
         ValueOutOfRange: a record shows too little motion, or none of them fits any plant.

@@ -1,7 +1,7 @@
-"""What the position loop of a drive works on, in the quantities that a trace can tell: counts, seconds, PWM steps.
+"""Plant of a drive's position loop, in the quantities that a trace shows: counts, seconds, PWM steps.
 
-Voltage, winding and torque constant cannot be told apart by an encoder. What can is the acceleration that one step of
-the output makes, and what takes it away again.
+An encoder cannot distinguish voltage, winding and torque constant. It shows the acceleration by one step of the output,
+and the losses.
 """
 
 import math
@@ -60,7 +60,7 @@ class Plant:
 
     @classmethod
     def of(cls, motor: MotorPlant) -> "Plant":
-        """Return what an encoder sees of a simulated machine."""
+        """Return the plant that an encoder sees of a simulated machine."""
         counts_per_rad = motor.counts_per_rev / math.tau
         torque = motor.torque_nm_per_a
         nm_per_pwm = torque * motor.supply_v / motor.resistance_ohm / FULL_PWM

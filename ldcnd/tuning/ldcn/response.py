@@ -1,4 +1,4 @@
-"""What a move looks like: a plant under the drive's own control law, servo cycle by servo cycle, and its figures."""
+"""Response to a move: a plant under the drive's own control law, servo cycle by servo cycle, and its figures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ REST_CYCLES = 40
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A trapezoidal move, as it is asked of a drive.
+    """A trapezoidal move, as commanded.
 
     Attributes:
         distance_counts: from the command position, signed.
@@ -36,7 +36,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How an axis stands when a move begins.
+    """State of an axis at the begin of a move.
 
     Attributes:
         position_counts: from the command position: minus the following error.
@@ -73,9 +73,9 @@ def simulate(
 
     Args:
         profile: the dialect.
-        plant: what it drives.
+        plant: the motor with its load.
         gains: its registers.
-        move: what it is told.
+        move: the commanded move.
         duration_s: from the start of the move.
         start: how the axis stands before; settled on its command position when left out.
     """
@@ -113,14 +113,14 @@ def simulate(
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What a person compares of two moves.
+    """Figures of a move, for comparison.
 
     Attributes:
         overshoot: farthest beyond the goal, as a share of the distance.
         settling_s: from the end of the commanded motion until the position stays within the window.
         settled: it stays there for the last tenth of the record at least.
         following_error_counts: the largest.
-        error_counts: what is left at the end.
+        error_counts: the position error at the end.
     """
 
     overshoot: float
