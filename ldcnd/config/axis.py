@@ -76,7 +76,7 @@ counts."""
     timeout_s: float = Field(default=1.0, gt=0, le=60)
     """Longest time for that, from the end of the profile, in seconds."""
     unsettled: Literal["report", "fault"] = "report"
-    """What follows when it takes longer: report ends the motion as done with `settled` false, and an event; fault \
+    """Reaction when it takes longer: report ends the motion as done with `settled` false, and an event; fault \
 ends it as failed with the fault `not_settled`."""
 
     @model_validator(mode="after")
@@ -123,7 +123,7 @@ class ApproachConfig(Frozen):
 
 
 class LossPolicy(StrEnum):
-    """What an axis does when a client, the line or the daemon disappears."""
+    """Reaction of an axis to the loss of a client, the line or the daemon."""
 
     RUN_TO_TARGET = "run_to_target"
     """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive."""
@@ -136,7 +136,7 @@ class LossPolicy(StrEnum):
 
 
 class LossConfig(Frozen):
-    """What the axis does when a client, the line or the daemon disappears in mid-motion."""
+    """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
 
     client: LossPolicy = LossPolicy.HALT
     """The lease under which it moves was not renewed."""
@@ -221,7 +221,7 @@ other motions, also those of a group, do not."""
     """How its polls fare while the line cannot carry all of them: the highest go first; low ones give way, but still \
 come now and then."""
     loss: LossConfig = LossConfig()
-    """What the axis does when a client, the line or the daemon disappears in mid-motion."""
+    """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
     limit_switches: Literal["ignore", "stop"] = "ignore"
     """stop: the drive itself decelerates when a motion runs onto the limit switch ahead, also if the host is dead; \
 moving off a switch stays possible. Not for `track`, nor on drives that do not stop on their limit inputs."""

@@ -51,9 +51,9 @@ class SimulatedLineConfig(Frozen):
     name: Name
     """The name in `port = "sim:NAME"`."""
     seed: int = 1
-    """Of everything that is drawn by lot."""
+    """Seed of all random values."""
     fault: tuple[SimulatedFaultConfig, ...] = ()
-    """What may go wrong on the wires."""
+    """Faults of the wires."""
 
     def faults(self, starts_at_s: float) -> FaultPlan:
         """Return what may go wrong, counted from an instant of the line's clock."""

@@ -326,7 +326,7 @@ class AxisService:
         if verdict is Verdict.BELIEVED:
             if gate.confirmed:  # items that only the first of two readings has are valid as well
                 if gate.zeroed:
-                    self._changed_by_another(DRIVE_RESET, "its position counter has begun anew at 0")
+                    self._changed_by_another(DRIVE_RESET, "its position counter has restarted at 0")
                     tracker.referenced = False
                 elif gate.jumped and tracker.command is None:
                     log.error("position jumped", axis=self.config.name, counts=reading.position_counts)

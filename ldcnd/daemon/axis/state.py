@@ -56,7 +56,7 @@ REFERENCE_REFUSED = Fault(
 )
 DRIVE_RESET = Fault(
     "drive_reset",
-    "the drive's position counter has begun anew at 0: it was reset, or another program has set the counter; keep other"
+    "the drive's position counter has restarted at 0: it was reset, or another program has set the counter; keep other"
     " programs off the line, then send reset and home",
     loses_position=True,
 )

@@ -94,7 +94,7 @@ None where polls would miss their turns for it."""
     start: StartPolicy = StartPolicy.RESET
     """Whether the drives are reset at start, or taken over as they are; a line that was lost is always taken over."""
     adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
-    """What happens to a line that cannot be taken over when `start` requires it."""
+    """Fallback for a line that cannot be taken over when `start` requires it."""
     divisors: Literal["manual", "alternate"] = "manual"
     """The family of baud rate divisors: 57600 is 3.3 % fast with the manual's, 1.4 % slow with the alternate ones."""
     snapshot: bool = False
@@ -102,11 +102,11 @@ None where polls would miss their turns for it."""
     axis: tuple[LdcnAxisConfig, ...] = Field(min_length=1, max_length=31)
     """The drives that are axes."""
     module: tuple[ModuleConfig, ...] = Field(default=(), max_length=30)
-    """What is on the line besides the axes."""
+    """Modules on the line besides the axes."""
 
     @property
     def models(self) -> dict[int, str]:
-        """What is on the line, by address."""
+        """Models on the line, by address."""
         return super().models | {module.address: module.model for module in self.module}
 
     @property

@@ -117,11 +117,11 @@ class Quirks(Frozen):
     yields_to_host: bool | None = None
     """Whether it drops its reply as soon as the host sends."""
     command_buffer: CommandBuffer | None = None
-    """What becomes of a command that has not been executed yet when another packet begins."""
+    """Effect of a new packet on a command that has not been executed yet."""
     address_in_latched: bool | None = None
     """Whether it receives the host's packets once it has an address, whatever the level of its address input."""
     unknown_baud: UnknownBaud | None = None
-    """What PIC-SERVO SC does with an unknown code of Set Baud Rate."""
+    """Effect of an unlisted code of Set Baud Rate on PIC-SERVO SC."""
     undefined_status_bits: int | None = Field(default=None, ge=0, le=255)
     """Set in a PIC-I/O's status byte, of which only bit 1 is defined."""
     undefined_level_bits: int | None = Field(default=None, ge=0, le=15)
@@ -133,7 +133,7 @@ class Quirks(Frozen):
     stop_clears_velocity: bool | None = None
     """Whether stopping smoothly or abruptly sets the velocity register to 0."""
     position_error_clearing: PositionErrorClearing | None = None
-    """What clears the position error bit: Clear Sticky Bits only, or closing the loop, too."""
+    """Event that clears the position error bit: Clear Sticky Bits only, or closing the loop, too."""
     sense_counts_per_a: float | None = Field(default=None, ge=0)
     """A/D counts per ampere of motor current, PIC-SERVO."""
     encoder_counts_per_s: float | None = Field(default=None, ge=0)
@@ -153,17 +153,17 @@ class Quirks(Frozen):
     relative_to: RelativeTo | None = None
     """Which command position a relative goal is added to, PIC-SERVO SC: that of the load or of the start."""
     reset_in_motion: ResetInMotion | None = None
-    """What Reset Position does to the goal of a move that is under way."""
+    """Effect of Reset Position on the goal of a move that is under way."""
     home_shifts: bool | None = None
     """Whether Reset Position also shifts the captured home position."""
     aux_after_reset: bool | None = None
     """Whether auxiliary bit 4 is set after a reset, PIC-SERVO SC."""
     path_overflow: PathOverflow | None = None
-    """What happens to path points that the buffer has no room for."""
+    """Effect of path points that exceed the buffer."""
     half_point: HalfPoint | None = None
-    """What becomes of an odd byte behind path points."""
+    """Effect of an odd byte after path points."""
     path_without_servo: PathWithoutServo | None = None
-    """What path mode does while the servo is off."""
+    """Behaviour of path mode while the servo is off."""
     path_takes_points_in_motion: bool | None = None
     """Whether path points are taken during another motion, too."""
     path_starts_empty: bool | None = None
@@ -189,13 +189,13 @@ class Quirks(Frozen):
     path_ended_by_enable: bool | None = None
     """Whether Stop Motor with the enable bit alone ends a path."""
     excluded_options: ExcludedOptions | None = None
-    """What PIC-SERVO SC does with options that exclude each other."""
+    """Effect of options of I/O Control that exclude each other, PIC-SERVO SC."""
     gains_keep_multiplier: bool | None = None
     """Whether Set Gain without a step multiplier leaves that as it is, PIC-SERVO SC."""
     steps_hz: float | None = Field(default=None, ge=-1_000_000, le=1_000_000)
     """A pulse train at the step input of PIC-SERVO SC, negative in reverse."""
     limit_in_path: LimitInPath | None = None
-    """What limit protection does to a path, PIC-SERVO SC."""
+    """Effect of limit protection on a path, PIC-SERVO SC."""
     advanced_sticky: bool | None = None
     """Whether a CMC keeps its advanced features when a later Stop Motor lacks their bit."""
     items_before_advanced: bool | None = None
@@ -203,7 +203,7 @@ class Quirks(Frozen):
 
 
 class IoConfig(Frozen):
-    """What is connected to a PIC-I/O."""
+    """Wiring of a PIC-I/O."""
 
     low: tuple[LineNumber, ...] = ()
     """Lines held low from outside; the others are pulled up."""
@@ -232,11 +232,11 @@ class SimulatedModuleConfig(Frozen):
     behaviour: Quirks = Quirks()
     """Where the manuals allow variants."""
     conditions: tuple[Condition, ...] = ()
-    """What is wrong around the drive from the beginning."""
+    """Faults around the drive at power-up."""
     start_up: Byte | None = None
     """The byte of Hard Reset with which a PIC-SERVO SC was configured earlier; left out, its EEPROM is erased."""
     io: IoConfig | None = None
-    """What is connected to a PIC-I/O."""
+    """Wiring of a PIC-I/O."""
 
     @property
     def is_drive(self) -> bool:
@@ -340,13 +340,13 @@ class SimulatedChainConfig(Frozen):
     """A simulated line, the first module next to the host."""
 
     seed: int = 1
-    """Of everything that is drawn by lot."""
+    """Seed of all random values."""
     module: tuple[SimulatedModuleConfig, ...] = Field(default=(), max_length=31)
     """In daisy-chain order."""
     event: tuple[SimulatedEventConfig, ...] = ()
-    """What happens by itself."""
+    """Scheduled events."""
     fault: tuple[SimulatedFaultConfig, ...] = ()
-    """What may go wrong on the wires."""
+    """Faults of the wires."""
 
     @model_validator(mode="after")
     def _possible_events(self) -> Self:

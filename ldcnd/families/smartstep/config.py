@@ -59,9 +59,9 @@ class SmartStepTraceConfig(Frozen):
     byte_order: ByteOrder = ByteOrder.BIG
     """Which half of a word comes first in a string."""
     string_checksum: StringChecksum = StringChecksum.AUTO
-    """What the checksum of a string reply covers; auto takes every variant until the drive shows which."""
+    """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
     string_count_unit: CountUnit = CountUnit.BYTES
-    """What the count of a string reference counts."""
+    """Unit of the count in a string reference."""
     chunk_bytes: int = Field(default=200, ge=2, le=1000)
     """How much of the memory is read at once, even; 2 ms of the line for each byte."""
     verify: bool = True
@@ -159,7 +159,7 @@ class SmartStepUnitConfig(Frozen):
     trace: SmartStepTraceConfig = SmartStepTraceConfig()
     """How its recorder is taken to work."""
     verified: Mapping[str, Verification] = {}
-    """What a test on the drive has said about the assumptions of its profile, by their keys."""
+    """Results of tests on the drive for the assumptions of its profile, by their keys."""
 
     @model_validator(mode="before")
     @classmethod
@@ -179,7 +179,7 @@ class SmartStepUnitConfig(Frozen):
 
 
 class SimulatedEventConfig(Frozen):
-    """What happens to a simulated drive at an instant."""
+    """An event of a simulated drive at an instant."""
 
     at_s: float = Field(ge=0)
     """Seconds after the line began."""
@@ -201,9 +201,9 @@ class SimulatedVariantConfig(Frozen):
     response_s: float = Field(default=0.01, ge=0, le=5)
     """From a command to the first character of its reply; the manual allows 0.2."""
     string_checksum: StringChecksum = StringChecksum.HEADER
-    """What the checksum of a string reply covers."""
+    """Bytes that the checksum of a string reply covers."""
     string_count_unit: CountUnit = CountUnit.BYTES
-    """What the count of a string reference counts."""
+    """Unit of the count in a string reference."""
     longest_string_bytes: int = Field(default=1000, ge=2, le=1000)
     """More is an error in number of bytes."""
     trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
@@ -248,7 +248,7 @@ class SimulatedUnitConfig(Frozen):
     history: tuple[Annotated[int, Field(ge=0, le=WORD)], ...] = Field(default=(), max_length=10)
     """Alarm codes of its history, the newest first."""
     event: tuple[SimulatedEventConfig, ...] = ()
-    """What happens to it as time goes on."""
+    """Scheduled events."""
     variant: SimulatedVariantConfig = SimulatedVariantConfig()
     """How it behaves where the manual leaves room."""
 
@@ -314,7 +314,7 @@ class SmartStepAxisConfig(AxisConfig):
     rates: SlowRatesConfig = SlowRatesConfig()
     """How often each item is published."""
     smartstep: SmartStepUnitConfig = SmartStepUnitConfig()
-    """What only a SmartStep has."""
+    """Settings of a SmartStep only."""
 
     @model_validator(mode="before")
     @classmethod
