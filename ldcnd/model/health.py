@@ -46,7 +46,7 @@ class StopWaitHealth(Frozen):
     """How long a single stop waits for the line, to its first bit: measured by questions in its place."""
 
     bound_s: float | None = Field(ge=0)
-    """What the plan promises while no reply is lost; null where the line has no plan."""
+    """Upper bound by the plan while no reply is lost; null where the line has no plan."""
     probes: int = Field(ge=0)
     """How often it was measured since the daemon started."""
     p99_s: float = Field(ge=0)
@@ -146,7 +146,7 @@ class DaemonHealth(Frozen):
 
 
 class Verdict(StrEnum):
-    """What a finding means."""
+    """Meaning of a finding."""
 
     FINE = "fine"
     LOOK = "look"
@@ -161,12 +161,12 @@ class Finding(Frozen):
     axis: str
     """The drive, or the line where it is no single one."""
     what: str
-    """What was examined."""
+    """The subject of the check."""
     verdict: Verdict
-    """What the result means."""
+    """Meaning of the result."""
     text: str
     """The result, for a person."""
     verifies: str | None = None
     """The assumption of the drive's profile that it says something about."""
     remedy: str | None = None
-    """What to type, or to write into the configuration, to put it right."""
+    """Command, or entry of the configuration, that corrects it."""

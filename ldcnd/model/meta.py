@@ -39,7 +39,7 @@ class CommandInfo(Frozen):
     key: str
     """Key of the request: `@cmd/<axis>/<verb>`, or `@cmd/_/<verb>` when it concerns the rig."""
     summary: str
-    """What it does."""
+    """Effect of the request."""
     request_schema: str
     """Name of the payload's schema under `meta/schema/`."""
     reply_schema: str
@@ -92,11 +92,11 @@ class BusInfo(Frozen):
     problem: str
     """Why it is not up; empty while it is."""
     remarks: tuple[str, ...]
-    """What deserves attention although it is up."""
+    """Warnings although it is up."""
     started_by: Literal["reset", "adoption"] | None = None
     """Whether the drives were reset, so that positions count from 0, or taken over as they were; null while down."""
     modules: tuple[ModuleInfo, ...] = ()
-    """What was found on the line, by address; empty while that is not known."""
+    """Modules found on the line, by address; empty while that is not known."""
     exchanges: int
     """Requests sent since the daemon started, the other counters likewise."""
     replies: int
@@ -170,7 +170,7 @@ class PastFault(Frozen):
     code: str
     """Stable code of the fault."""
     text: str
-    """What it means and what to do."""
+    """Meaning and remedy."""
     since: int
     """When the daemon first saw it, UTC in ns since 1970."""
     source: str
@@ -191,7 +191,7 @@ class AxisInfo(Frozen):
     model: str
     """The configured drive model."""
     identity: str | None
-    """What the drive said it is; null while it has not answered."""
+    """The identity that the drive reported; null while it has not answered."""
     unit: str
     """Unit of all its values; "count" when no scale is configured."""
     counts_per_unit: float | None
@@ -215,7 +215,7 @@ class AxisInfo(Frozen):
     monitors: tuple[str, ...] = ()
     """The monitors it publishes below `monitor/`."""
     trace_channels: tuple[str, ...] = ()
-    """What a trace can record."""
+    """The channels that a trace can record."""
     priority: PollPriority = "normal"
     """How its polls fare while its line cannot carry all of them."""
     registers: tuple[RegisterInfo, ...] = ()

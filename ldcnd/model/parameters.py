@@ -38,9 +38,9 @@ class DigitInfo(Frozen):
     digit: int = Field(ge=0, le=3)
     """Its place from the right: 2 is Pn000.2."""
     title: str
-    """What it sets."""
+    """The setting that it selects."""
     values: Mapping[str, str]
-    """What its values mean, by their hexadecimal digit; empty where they are numbers or not known."""
+    """Meanings of its values, by their hexadecimal digit; empty where they are numbers or not known."""
     confidence: str
     """Where that comes from: S the manual, X a related drive, M recollection."""
 
@@ -63,7 +63,7 @@ class ParameterInfo(Frozen):
     digits: bool
     """Four separate settings, to be read as hexadecimal digits."""
     digit_meanings: tuple[DigitInfo, ...] = ()
-    """What is known of the digits."""
+    """Descriptions of the digits, where known."""
     power_cycle: bool | None
     """A change takes effect at the next power-on only; null where it is not known."""
     confidence: str | None
@@ -74,7 +74,7 @@ class ParameterList(CommandReply):
     """The parameters of a drive, in the manual's order."""
 
     parameters: tuple[ParameterInfo, ...]
-    """What is known of each."""
+    """Description of each."""
 
 
 class ParameterValue(Frozen):
@@ -103,15 +103,15 @@ class ParameterReply(CommandReply):
     """One parameter, after reading or writing it."""
 
     value: ParameterValue
-    """What both memories hold now."""
+    """The present values in both memories."""
     written: bool = False
     """A write was sent to the drive; false also for a write that found the value there already."""
     remarks: tuple[str, ...] = ()
-    """What deserves attention."""
+    """Warnings, for a person."""
 
 
 class DriveFacts(Frozen):
-    """What a drive is, beside its parameters."""
+    """Facts about a drive, besides its parameters."""
 
     driver_type: int
     """8800H; the manual gives R7D-APL and R7D-APH the same word."""
@@ -131,7 +131,7 @@ class ParameterDump(CommandReply):
     values: tuple[ParameterValue, ...]
     """In the manual's order; those that the drive does not have are left out."""
     facts: DriveFacts | None = None
-    """What the drive is."""
+    """Facts about the drive."""
 
 
 class PlannedWrite(Frozen):
@@ -144,9 +144,9 @@ class PlannedWrite(Frozen):
     memory: Memory
     """Where it goes."""
     before: int
-    """What the memory holds now."""
+    """The present value in the memory."""
     value: int
-    """What it is to hold: for Pn000 with the unit number that the drive has."""
+    """The new value: for Pn000 with the unit number that the drive has."""
     effective: str
     """When it takes effect, as far as is known."""
     digits: tuple[str, ...] = ()
@@ -161,14 +161,14 @@ class PlannedParameters(Frozen):
     problems: tuple[str, ...] = ()
     """Why they must not be sent."""
     remarks: tuple[str, ...] = ()
-    """What deserves attention."""
+    """Warnings, for a person."""
 
 
 class ParameterPlan(CommandReply):
-    """What it takes to make a drive hold certain values; nothing has been written."""
+    """The writes that give a drive certain values; nothing has been written."""
 
     plan: PlannedParameters
-    """The writes, and what speaks against them."""
+    """The writes, and the reasons against them."""
 
 
 class CounterReply(CommandReply):
@@ -177,9 +177,9 @@ class CounterReply(CommandReply):
     counter: CounterName
     """Which."""
     value: int
-    """What it counts now, signed; 0 unless pulses have come in since."""
+    """Its present count, signed; 0 unless pulses have come in since."""
     remarks: tuple[str, ...] = ()
-    """What deserves attention."""
+    """Warnings, for a person."""
 
 
 class EepromCount(CommandReply):
@@ -206,7 +206,7 @@ class AlarmReport(CommandReply):
     """The present alarm and the history that the drive keeps over power-off."""
 
     present: AlarmEntry
-    """What stands now."""
+    """The present alarm."""
     history: tuple[AlarmEntry, ...]
     """Ten entries, the newest first as far as is known."""
 
@@ -217,13 +217,13 @@ class AssumptionInfo(Frozen):
     key: str
     """Its name in the profile."""
     question: str
-    """What is assumed or asked."""
+    """The assumption, or the open question."""
     confidence: str
     """Where the assumption comes from, by the marks of the reference page."""
     verification: str
-    """What a test on the drive has said: assumed, verified or contradicted."""
+    """Result of a test on the drive: assumed, verified or contradicted."""
     setting: str | None
-    """What the profile assumes; null where it has no switch for it."""
+    """The setting that the profile assumes; null where it has no switch for it."""
 
 
 class DriveProfile(CommandReply):
@@ -232,7 +232,7 @@ class DriveProfile(CommandReply):
     model: str
     """The configured model."""
     identity: str | None
-    """What the drive said it is; null while it has not answered."""
+    """The identity that the drive reported; null while it has not answered."""
     self_hearing: bool
     """The drive takes its own replies for commands: nothing may be written on such wires."""
     assumptions: tuple[AssumptionInfo, ...]

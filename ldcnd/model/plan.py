@@ -1,4 +1,4 @@
-"""What the lines of a rig promise before anything is opened: served on `meta/budget`."""
+"""Bus budgets of a rig before anything is opened: served on `meta/budget`."""
 
 from typing import Literal
 
@@ -29,9 +29,9 @@ class PollPlan(Frozen):
     address: int
     """Its node address."""
     request_bytes: int
-    """What is sent."""
+    """Length of the request."""
     reply_bytes: int
-    """What comes back at most."""
+    """Longest reply."""
     rate_hz: float
     """How often: as often as its fastest item."""
     longest_s: float
@@ -41,7 +41,7 @@ class PollPlan(Frozen):
     holds: bool
     """It is always over before its next turn."""
     items: tuple[ItemPlan, ...]
-    """What it carries."""
+    """The items that it carries."""
     priority: PollPriority = "normal"
     """How it fares while the line cannot carry all polls; what is promised does not depend on it."""
 
@@ -78,7 +78,7 @@ class BusPlan(Frozen):
     holds: bool
     """No poll can come too late."""
     overload: str
-    """What happens if not: refuse or skip."""
+    """Reaction if not: refuse or skip."""
     remedies: tuple[str, ...]
     """The smallest changes that would make it hold; empty when it does."""
     polls: tuple[PollPlan, ...]

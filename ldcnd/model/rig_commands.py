@@ -124,7 +124,7 @@ class MoveTogetherReply(Frozen):
 
 
 class GroupMoves(Frozen):
-    """What the axes of a group are to do together."""
+    """The moves of the axes of a group."""
 
     moves: tuple[AxisMove, ...] = Field(min_length=2, max_length=31)
     """Exactly the members of a group, each once."""
@@ -206,7 +206,7 @@ class AxisShare(Frozen):
 
 
 class PreviewTogetherReply(Frozen):
-    """What the moves would be; nothing was sent: the reply to `@cmd/_/preview_together`."""
+    """The moves as they would be; nothing was sent: the reply to `@cmd/_/preview_together`."""
 
     shares: tuple[AxisShare, ...]
     """One for each axis, in the order of the request."""
@@ -269,7 +269,7 @@ class FrozenPosition(Frozen):
 
 
 class CapturedInputs(Frozen):
-    """What an I/O module had at its inputs at the instant of a snapshot."""
+    """Inputs of an I/O module at the instant of a snapshot."""
 
     module: str
     """The module."""
@@ -352,7 +352,7 @@ class SetIo(Command[IoReply]):
 
 
 class IoTimer(StrEnum):
-    """What the counter of an I/O module counts."""
+    """Input of the counter of an I/O module."""
 
     OFF = "off"
     """Nothing: it keeps its count."""
@@ -371,7 +371,7 @@ class SetIoTimer(Command[IoReply]):
     module: str
     """Which module, by its configured name."""
     mode: IoTimer
-    """What is counted."""
+    """Input of the counter."""
     prescale: Literal[1, 2, 4, 8] = 1
     """Edges or clocks for each count."""
     lease: str | None = None
@@ -397,7 +397,7 @@ class RehearsalReply(Frozen):
     axis: str
     """The axis."""
     policy: str
-    """What its configuration says for this loss."""
+    """The configured policy for this loss."""
 
 
 class Rehearse(Command[RehearsalReply]):
@@ -427,9 +427,9 @@ class WireLogReply(Frozen):
     zero: int
     """The wall time at which the records' clock was 0, UTC in ns since 1970."""
     started: float
-    """What that clock showed when the daemon was started, in seconds."""
+    """Reading of that clock when the daemon was started, in seconds."""
     now: float
-    """What that clock showed when this was answered, in seconds."""
+    """Reading of that clock at this reply, in seconds."""
     first_record: int = Field(ge=0)
     """Number of the first record in `lines`; records are counted since the daemon started."""
     next_record: int = Field(ge=0)

@@ -60,7 +60,7 @@ class TelemetryItem(StrEnum):
 
 
 class Sample(Frozen):
-    """What every telemetry payload carries."""
+    """Fields of every telemetry payload."""
 
     t: int
     """When the value was true, UTC in ns since 1970."""
@@ -125,7 +125,7 @@ class InputsSample(Sample):
 
 
 class LatchSample(Sample):
-    """What a probe has latched; published once for each probe that found something."""
+    """Position latched by a probe; published once for each probe that found something."""
 
     value: float
     """Position in axis units."""
@@ -137,7 +137,7 @@ class LatchSample(Sample):
     """The edge lies up to this far before `value`, in axis units: the way of a servo cycle at the probe's velocity, and
     a count. What the input circuit delays comes on top."""
     sources: tuple[str, ...]
-    """What it can have been."""
+    """The possible sources of the latch."""
     command_id: str
     """Of the probe."""
 
@@ -165,7 +165,7 @@ class FaultEntry(Frozen):
     code: str
     """Stable code of the fault."""
     text: str
-    """What it means and what to do."""
+    """Meaning and remedy."""
     since: int
     """When the daemon first saw it, UTC in ns since 1970."""
     source: str
@@ -177,7 +177,7 @@ class FaultEntry(Frozen):
 
 
 class FaultSample(Sample):
-    """What is wrong with the axis."""
+    """Faults of the axis."""
 
     active: tuple[FaultEntry, ...]
     """Faults that stand now."""

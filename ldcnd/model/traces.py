@@ -42,7 +42,7 @@ class TriggerKind(StrEnum):
 
 
 class TraceTrigger(Frozen):
-    """What a trace waits for."""
+    """The condition for which a trace waits."""
 
     channel: str
     """One of the recorded channels."""
@@ -96,7 +96,7 @@ class TraceChannel(Frozen):
 
 
 class DriveTraceInfo(Frozen):
-    """What a drive's recorder was set to and how its memory was read, so that raw words can be read again later."""
+    """Settings of a drive's recorder and the reading of its memory, so that raw words can be decoded again later."""
 
     objects: tuple[int, int]
     """Words of 5000H and 5001H."""
@@ -127,9 +127,9 @@ class DriveTraceInfo(Frozen):
     byte_order: str
     """Which half of a word was taken to come first."""
     string_checksum: str
-    """What the checksum of a string was found or taken to cover."""
+    """The bytes that the checksum of a string was found or taken to cover."""
     string_count_unit: str
-    """What the count of a string was taken to count."""
+    """The unit in which the count of a string was taken."""
     trigger_word_source: str
     """Where the trigger comes from: none, configured (the drive's, bits of 5004H), or host (polled, then started)."""
     command_pulse_gear: str
@@ -160,7 +160,7 @@ class TraceHeader(Sample):
     pre_trigger: int = Field(ge=0)
     """Number of samples before the trigger."""
     trigger: TraceTrigger | None = None
-    """What it waits or has waited for."""
+    """The condition for which it waits or has waited."""
     trigger_index: int | None = None
     """The sample at which the trigger was detected."""
     trigger_late_s: float = Field(default=0.0, ge=0)
@@ -171,7 +171,7 @@ class TraceHeader(Sample):
     chunks: int = Field(default=0, ge=0)
     """How many chunks there are; 0 until it is complete."""
     raw_columns: tuple[str, ...] = ()
-    """What the columns of `raw` in each chunk are."""
+    """Names of the columns of `raw` in each chunk."""
     drive: DriveTraceInfo | None = None
     """Settings and assumptions of a drive's own recorder; null for a trace by the host."""
 
@@ -201,7 +201,7 @@ class TraceReply(CommandReply):
     source: TraceSource
     """Who takes the samples."""
     channels: tuple[TraceChannel, ...]
-    """What is recorded."""
+    """The channels recorded."""
     interval_s: float
     """Time between two samples; 0 is as fast as the line allows."""
     samples: int
@@ -225,7 +225,7 @@ class TakeTrace(AxisCommand[TraceReply]):
     answer_s = ARMING_S
 
     channels: tuple[str, ...] = Field(min_length=1, max_length=MOST_CHANNELS)
-    """What to record; `meta/axes/<axis>` lists what the axis has."""
+    """The channels to record; `meta/axes/<axis>` lists those of the axis."""
     interval_s: Annotated[float, Field(gt=0)] | Literal["fastest"] = "fastest"
     """Time between two samples, in seconds, or "fastest"."""
     samples: int = Field(default=500, ge=2, le=MOST_SAMPLES)
@@ -236,7 +236,7 @@ class TakeTrace(AxisCommand[TraceReply]):
     """Largest magnitude expected of a channel, in its unit: a drive's recorder that can resolves it finer. Put back
     after the trace."""
     trigger: TraceTrigger | None = None
-    """What to wait for; a missing one starts at once."""
+    """The condition to wait for; a missing one starts at once."""
     timeout_s: float = Field(default=30.0, gt=0, le=LONGEST_WAIT_S)
     """Longest wait for the trigger, in seconds."""
 
