@@ -19,6 +19,8 @@ pytestmark = [
     pytest.mark.timeout(240),
 ]
 
+UPLOAD_MS = 120_000
+"""Maximum time of a trace of 500 samples on a line that is polled at two thirds of what it carries, milliseconds."""
 FAULTS_OF_A_DRIVE = """async ({ reset }) => {
   const { html, render } = await import('/static/html.js');
   const { FaultPanel } = await import('/static/pages/axis_faults.js');
@@ -140,6 +142,6 @@ async def test_a_drive_is_tuned_by_its_parameters_and_its_recorder(house):
         await desk.button("Record").click()
 
         row = desk.panel("Runs").get_by_role("row", name=re.compile("^1 "))
-        await expect(row).to_contain_text("Pn102 47")
+        await expect(row).to_contain_text("Pn102 47", timeout=UPLOAD_MS)
         top_speed = float(await row.get_by_role("cell").nth(2).inner_text())
         assert top_speed == pytest.approx(6.0, abs=1.0)  # 200 command units a second, geared by 4, of 8000 counts
