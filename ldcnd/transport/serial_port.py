@@ -120,15 +120,29 @@ async def open_serial_port(settings: SerialSettings) -> Transport:
         raise
     except PortFault as error:
         raise _explained(settings.path, error) from error
-    incoming = Incoming(settings.path)
+    try:
+        return await _connected(port, Incoming(settings.path))
+    except PortFault as error:
+        raise _explained(settings.path, error) from error
+
+
+async def _connected(port: "_Serial", incoming: Incoming) -> "SerialPort":
+    """Have the loop watch an open port; closes it if anything fails, or it would stay locked against this program too.
+
+    Raises:
+        PortFault: the port is gone already.
+    """
+    loop = asyncio.get_running_loop()
     try:
         stream, _ = await serial_asyncio.connection_for_serial(loop, lambda: incoming, port)
-    except PortFault as error:
-        port.close()
-        raise _explained(settings.path, error) from error
-    await asyncio.sleep(0)  # the stream begins to read in the loop's next turn, and would do so after a pause, too
-    stream.pause_reading()
-    return SerialPort(port, stream, incoming)
+        await asyncio.sleep(0)  # the stream begins to read in the loop's next turn, and would do so after a pause, too
+        stream.pause_reading()
+        return SerialPort(port, stream, incoming)
+    except BaseException:
+        if port.is_open:
+            loop.remove_reader(port.fileno())
+            port.close()
+        raise
 
 
 class _Serial(serial.Serial):

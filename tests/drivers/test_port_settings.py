@@ -1,12 +1,14 @@
 """What a port really is set to: rates that the driver does not make, direction control that it does not have."""
 
 import asyncio
+import errno
 import os
 import pty
 import re
 import tomllib
 import tty
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -29,7 +31,7 @@ from ldcnd.transport.line_discipline import (
     makes,
 )
 from ldcnd.transport.port_url import port_opener
-from ldcnd.transport.serial_port import SerialSettings, open_serial_port
+from ldcnd.transport.serial_port import SerialPort, SerialSettings, open_serial_port
 from tests.support.recording_receiver import RecordingReceiver
 from tests.support.rig import SIMULATED
 from tests.support.serial_drivers import rs485_port, uart_8250
@@ -82,6 +84,42 @@ async def test_change_to_a_rate_that_is_not_made_ends_the_port_and_names_the_one
     with pytest.raises(TransportLost, match="sends at 19200 instead of 230400 baud"):
         port.set_baud(230_400)
     await receiver.wait_lost()
+    await port.close()
+
+
+async def test_port_that_fails_right_after_it_was_opened_is_free_again(terminal, monkeypatch):
+    def is_gone(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(SerialPort, "__init__", is_gone)
+        with pytest.raises(TransportLost):
+            await open_serial_port(SerialSettings(terminal, 19_200))
+    port = await open_serial_port(SerialSettings(terminal, 19_200))
+
+    assert actual_baud(port._descriptor) == 19_200
+    await port.close()
+
+
+@pytest.mark.parametrize("steps", range(0, 400, 10))
+async def test_port_whose_opening_is_cancelled_at_any_step_is_free_again(terminal, steps):
+    opening = asyncio.create_task(open_serial_port(SerialSettings(terminal, 19_200)))
+    for _ in range(steps):
+        await asyncio.sleep(0)
+        if opening.done():
+            break
+    opening.cancel()
+    with suppress(asyncio.CancelledError):
+        await (await opening).close()
+    async with asyncio.timeout(20):
+        while True:  # what a worker thread has opened meanwhile is closed when it is done
+            try:
+                port = await open_serial_port(SerialSettings(terminal, 19_200))
+            except TransportLost:
+                await asyncio.sleep(0.01)
+            else:
+                break
+
     await port.close()
 
 

@@ -8,6 +8,7 @@ adopting the line, after its own death.
 import argparse
 import asyncio
 import contextlib
+import json
 import random
 import signal
 import statistics
@@ -17,12 +18,16 @@ import threading
 import time
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from http import HTTPStatus
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from typing_extensions import override
+from websockets.asyncio.client import connect
 
 import ldcnd
 from ldcnd.client.rig_client import RigClient
@@ -30,6 +35,7 @@ from ldcnd.model.commands import Power
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.pty import PtyLine
+from tests.support.browser import Browser, ask_over_tcp
 from tests.support.process import LDCND, ROOT, answering, client, free_port
 
 HOLD_S = 0.4
@@ -63,10 +69,16 @@ KINDS = {
     "program, SIGKILL": HOLD_S,
     "program, SIGSTOP": HOLD_S,
     "network": HOLD_S,
+    "page, SIGKILL": HOLD_S,
+    "page, SIGSTOP": HOLD_S,
+    "console, SIGKILL": HOLD_S,
+    "console, SIGSTOP": HOLD_S,
     "daemon, SIGKILL": 0.0,
     "daemon, SIGSTOP": 0.0,
 }
 """What dies, and how long after it the jog is ended at the latest; by the drive when the daemon dies."""
+HELD_EACH_S = 0.1
+"""Period in which a page says that its button is held, seconds, as the console's own script does."""
 
 
 def bound_s(kind: str, axis: str) -> float:
@@ -98,6 +110,10 @@ class WatchedLine(PtyLine):
             for drive in self._drives:
                 drive.catch_up(now_s)
             self.seen.append((time.monotonic(), tuple(drive.shaft.position_counts for drive in self._drives)))
+
+    def position_counts(self, axis: str) -> float:
+        """Return where a shaft was seen last."""
+        return self.seen[-1][1][list(DRIVES).index(axis)]
 
     def stood_at_s(self, axis: str) -> float:
         """Return since when a shaft is where it is now, by the monotonic clock."""
@@ -177,37 +193,47 @@ class Deaths:
         network = Network(self.port)
         async with await asyncio.start_server(network.serve, "127.0.0.1", 0) as server:
             through = server.sockets[0].getsockname()[1] if kind == "network" else self.port
-            program = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "tests.support.jog_deaths", "--jog", f"tcp/127.0.0.1:{through}", axis,
-                cwd=ROOT, stdout=PIPE, stderr=DEVNULL,
-            )  # fmt: skip
-            try:
-                assert program.stdout
-                async with asyncio.timeout(60):
-                    assert await program.stdout.readline() == b"jogs\n"
+            async with self._started(kind, f"tcp/127.0.0.1:{through}", axis) as processes:
                 await asyncio.sleep(self.dice.uniform(0.2, 1.6))
                 at_s = time.monotonic()
-                self._kill(kind, program, network)
+                self._kill(kind, processes, network)
                 await asyncio.sleep(bound_s(kind, axis) + self.host_s + SEEN_S)
                 late_s = self.line.stood_at_s(axis) - at_s
-            finally:
-                for process in (program, self.daemon if kind.startswith("daemon") else None):
-                    if process and process.returncode is None:
-                        process.kill()
-                        await process.wait()
-                network.close()
+            network.close()
         if kind.startswith("daemon"):
             self.daemon = None
         self.late_s.setdefault((kind, axis), []).append(late_s)
         return late_s
 
-    def _kill(self, kind: str, program: Process, network: Network) -> None:
+    @asynccontextmanager
+    async def _started(self, kind: str, endpoint: str, axis: str) -> AsyncIterator[dict[str, Process]]:
+        """Have a program, or a page of a console, that jogs the axis; yields what can be killed."""
+        processes = {"daemon": self.daemon} if self.daemon else {}
+        try:
+            what: tuple[str, ...] = ("--jog", endpoint, axis)
+            if kind.startswith(("page", "console")):
+                command = (*LDCND, "console", "--json", "-e", endpoint, "--listen", "127.0.0.1:0")
+                console = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=PIPE, stderr=DEVNULL)
+                processes["console"] = console
+                velocity = VELOCITY if self.line.position_counts(axis) < 0 else -VELOCITY
+                what = ("--page", json.loads(await _line_of(console))["link"], axis, f"{velocity}")
+            program = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "tests.support.jog_deaths", *what, cwd=ROOT, stdout=PIPE, stderr=DEVNULL
+            )
+            processes |= {"program": program, "page": program}
+            assert await _line_of(program) == b"jogs\n"
+            yield processes
+        finally:
+            for name, process in processes.items():
+                if process.returncode is None and (name != "daemon" or kind.startswith("daemon")):
+                    process.kill()
+                    await process.wait()
+
+    def _kill(self, kind: str, processes: Mapping[str, Process], network: Network) -> None:
         if kind == "network":
             network.cut = True
             return
-        victim = self.daemon if kind.startswith("daemon") else program
-        assert victim
-        victim.send_signal(signal.SIGKILL if kind.endswith("SIGKILL") else signal.SIGSTOP)
+        processes[kind.partition(",")[0]].send_signal(signal.SIGKILL if kind.endswith("SIGKILL") else signal.SIGSTOP)
 
     async def _ready(self, axis: str) -> None:
         """Have a daemon that serves the axis, and the loop of that closed."""
@@ -221,6 +247,12 @@ class Deaths:
             await answering(self.daemon, endpoint)
         async with client(f"tcp/127.0.0.1:{self.port}") as rig:
             await _powered(rig, axis)
+
+
+async def _line_of(process: Process) -> bytes:
+    assert process.stdout
+    async with asyncio.timeout(60):
+        return await process.stdout.readline()
 
 
 async def _powered(rig: RigClient, axis: str) -> None:
@@ -263,6 +295,26 @@ async def jog(endpoint: str, axis: str) -> None:
                 await jogging.held()
 
 
+async def jog_by_a_page(link: str, axis: str, velocity: float) -> None:
+    """Hold a page's button until killed: what the console's script says on its web socket."""
+    at = urlsplit(link)
+    assert at.hostname
+    assert at.port
+    browser = await Browser(partial(ask_over_tcp, at.hostname, at.port), f"http://{at.netloc}").enter(link)
+    headers = browser.headers({"origin": browser.origin})
+    del headers["host"]
+    async with connect(f"ws://{at.netloc}/api/page", additional_headers=headers, compression=None) as socket:
+        page = browser.forging(x_ldcnd_page=json.loads(await socket.recv())["page"])
+        async with asyncio.timeout(30):
+            while (await page.post("/api/rigs/deaths/control", {"axes": [axis]})).status != HTTPStatus.OK:
+                await asyncio.sleep(0.1)  # the rig is not connected yet
+        await socket.send(json.dumps({"jog": {"rig": "deaths", "axis": axis, "velocity": velocity}}))
+        print("jogs", flush=True)
+        while True:
+            await socket.send(json.dumps({"held": True}))
+            await asyncio.sleep(HELD_EACH_S)
+
+
 def table(late_s: dict[tuple[str, str], list[float]]) -> str:
     """Return what was measured."""
     lines = ["| what dies | drive | runs | median | maximum | bound |", "|---|---|---|---|---|---|"]
@@ -292,8 +344,13 @@ def main() -> None:
     parser.add_argument("runs", type=int, nargs="?", default=20)
     parser.add_argument("seed", type=int, nargs="?", default=22)
     parser.add_argument("--jog", nargs=2, metavar=("ENDPOINT", "AXIS"), help="jog until killed")
+    parser.add_argument("--page", nargs=3, metavar=("LINK", "AXIS", "VELOCITY"), help="the same by a console's page")
     asked = parser.parse_args()
-    asyncio.run(jog(*asked.jog) if asked.jog else measure(asked.runs, asked.seed))
+    if asked.page:
+        link, axis, velocity = asked.page
+        asyncio.run(jog_by_a_page(link, axis, float(velocity)))
+    else:
+        asyncio.run(jog(*asked.jog) if asked.jog else measure(asked.runs, asked.seed))
 
 
 if __name__ == "__main__":
