@@ -346,7 +346,7 @@ class WalksPaths(ABC):
 
     Attributes:
         path_period_s: between two points.
-        path_packet: so many points fit into one packet.
+        path_packet: maximum number of points in one packet.
         path_most_counts: largest step from one point to the next.
     """
 

@@ -166,7 +166,7 @@ class PathReply(Frozen):
     rate_hz: float
     """Points a second."""
     ahead_s: float
-    """If the daemon dies, the axes end within so much of the path."""
+    """Maximum time that the axes run on if the daemon dies, seconds."""
 
 
 class WalkPath(Command[PathReply]):

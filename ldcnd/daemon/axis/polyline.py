@@ -16,7 +16,7 @@ from ldcnd.errors import ValueOutOfRange
 TURN_SHARE = 0.5
 """Of an acceleration, for turning at corners; the rest is for the speed along the way, which may change there, too."""
 ROUNDING_COUNTS = 2
-"""So much of a change of step comes from rounding alone."""
+"""Change of step that comes from rounding alone."""
 TRIALS = 12
 MOST_POINTS = 50_000
 """Of one path: 27 minutes at the longer period."""

@@ -516,7 +516,7 @@ class AxisTracker:
         self._rest.forget(rests=False, commanded=True)
 
     def ends_after(self, rest_s: float, now_s: float, now_ns: int) -> None:
-        """The motion under way goes on at another speed, and its profile should end so much later."""
+        """Shift the expected end of the profile: the motion under way goes on at another speed."""
         if self.command:
             self.command = replace(self.command, duration_s=(now_ns - self.command.since_ns) / 1e9 + rest_s)
             self._ends_at_s = now_s + rest_s

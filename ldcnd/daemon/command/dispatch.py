@@ -7,7 +7,7 @@ from functools import partial
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.permit import UNCONDITIONAL, Permit, Right
-from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting, plans_on_line
+from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
 from ldcnd.daemon.axis.procedures.path import PathShareRequest, SharedPath
 from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
 from ldcnd.daemon.clock import Clock
@@ -450,22 +450,8 @@ async def move_together(
     line = _line_of(rig, moves)
     meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)
 
-    async def take_part(name: str, move: MoveAbsolute) -> CommandReply | LdcndError:
-        try:
-            return await execute(name, GroupMoveRequest.of(move, meeting))
-        except LdcndError as error:
-            meeting.fail(error)
-            return error
-
-    async with asyncio.TaskGroup() as group:
-        tasks = [group.create_task(take_part(name, move), name=f"group move {name}") for name, move in moves.items()]
-    replies = []
-    for task in tasks:
-        result = task.result()
-        if isinstance(result, LdcndError):
-            raise meeting.failure or result
-        replies.append(result)
-    return MoveTogetherReply(replies=tuple(replies), deviation=meeting.deviation)
+    requests = {name: GroupMoveRequest.of(move, meeting) for name, move in moves.items()}
+    return MoveTogetherReply(replies=await _all_of(requests, meeting, execute), deviation=meeting.deviation)
 
 
 async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:
@@ -482,22 +468,34 @@ async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:
     path = SharedPath(line.network, line.bus, frozenset(via), command.speed, command.max_deviation)
     moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis", "via"})) for move in command.moves}
 
-    async def take_part(name: str, move: MoveAbsolute) -> CommandReply | LdcndError:
+    requests = {name: PathShareRequest.of(move, via[name], path) for name, move in moves.items()}
+    return path.reply(await _all_of(requests, path, execute))
+
+
+async def _all_of(
+    requests: Mapping[str, AxisCommand[CommandReply]], rendezvous: Rendezvous, execute: Execute
+) -> tuple[CommandReply, ...]:
+    """Have each axis carry out its part; returns once all have started, and raises why none did."""
+
+    async def take_part(name: str, request: AxisCommand[CommandReply]) -> CommandReply | LdcndError:
         try:
-            return await execute(name, PathShareRequest.of(move, via[name], path))
+            return await execute(name, request)
         except LdcndError as error:
-            path.fail(error)
+            rendezvous.fail(error)
             return error
 
     async with asyncio.TaskGroup() as group:
-        tasks = [group.create_task(take_part(name, move), name=f"path {name}") for name, move in moves.items()]
+        tasks = [
+            group.create_task(take_part(name, request), name=f"{request.verb} {name}")
+            for name, request in requests.items()
+        ]
     replies = []
     for task in tasks:
         result = task.result()
         if isinstance(result, LdcndError):
-            raise path.failure or result
+            raise rendezvous.failure or result
         replies.append(result)
-    return path.reply(tuple(replies))
+    return tuple(replies)
 
 
 def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply:

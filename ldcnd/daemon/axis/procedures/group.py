@@ -5,6 +5,7 @@ others have arrived; then the line starts them together, or none of them moves.
 """
 
 import asyncio
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 from typing_extensions import override
@@ -66,8 +67,44 @@ def plans_on_line(
     return {name: motion.replanned(plan, line.motions[name]) for name, (motion, plan) in axes.items()}, line.deviation
 
 
-class Meeting:
-    """Where the members of one group move wait until all have their turns, and where it is started once.
+class Rendezvous(ABC):
+    """Where the members of one motion wait until all have their turns, and where it is started once."""
+
+    def __init__(self, names: frozenset[str]) -> None:
+        self._missing = set(names)
+        self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._started.add_done_callback(_look)
+
+    @property
+    def failure(self) -> BaseException | None:
+        """The first error that kept the axes from moving."""
+        return self._started.exception() if self._started.done() else None
+
+    def fail(self, error: LdcndError) -> None:
+        """Keep the axes from moving: a member cannot; without effect once they were started."""
+        if not self._started.done():
+            self._started.set_exception(error)
+
+    async def _arrived(self, name: str) -> None:
+        """Wait for the others, or start all as the last one."""
+        self._missing.discard(name)
+        if not self._missing and not self._started.done():
+            await self._start()
+        try:
+            async with asyncio.timeout(MEETING_S):
+                await asyncio.shield(self._started)
+        except TimeoutError:
+            late = WrongState(f"axes {', '.join(sorted(self._missing))} did not get their turn, so no axis was started")
+            self.fail(late)
+            raise late from None
+
+    @abstractmethod
+    async def _start(self) -> None:
+        """Start all members, or fail."""
+
+
+class Meeting(Rendezvous):
+    """Where the members of one group move meet.
 
     Attributes:
         deviation: how far from a straight line they get; None until they are started, and when they keep to none.
@@ -84,24 +121,12 @@ class Meeting:
             straight: they keep to a straight line.
             max_deviation: the line is refused if they would leave it by more, in axis units.
         """
+        super().__init__(names)
         self.deviation: float | None = None
         self._network = network
         self._straight = straight
         self._max_deviation = max_deviation
-        self._missing = set(names)
         self._members: dict[str, GroupMember] = {}
-        self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._started.add_done_callback(_look)
-
-    @property
-    def failure(self) -> BaseException | None:
-        """The first error that kept the group from moving."""
-        return self._started.exception() if self._started.done() else None
-
-    def fail(self, error: LdcndError) -> None:
-        """Keep the group from moving: a member cannot; without effect once it was started."""
-        if not self._started.done():
-            self._started.set_exception(error)
 
     async def join(self, name: str, member: "GroupMember") -> None:
         """Wait for the others; return once the drives have started.
@@ -111,17 +136,9 @@ class Meeting:
             LdcndError: as `Network.start_group`.
         """
         self._members[name] = member
-        self._missing.discard(name)
-        if not self._missing and not self._started.done():
-            await self._start()
-        try:
-            async with asyncio.timeout(MEETING_S):
-                await asyncio.shield(self._started)
-        except TimeoutError:
-            late = WrongState(f"axes {', '.join(sorted(self._missing))} did not get their turn, so no axis was started")
-            self.fail(late)
-            raise late from None
+        await self._arrived(name)
 
+    @override
     async def _start(self) -> None:
         try:
             if self._straight:

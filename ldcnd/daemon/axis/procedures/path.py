@@ -16,7 +16,7 @@ from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.permit import start_path, walking
 from ldcnd.daemon.axis.polyline import PathAxis, Walk, walk
 from ldcnd.daemon.axis.procedure import Procedure, Turn
-from ldcnd.daemon.axis.procedures.group import MEETING_S
+from ldcnd.daemon.axis.procedures.group import Rendezvous
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, Homes, Motion, StopMode
 from ldcnd.drivers.network import Network
@@ -84,7 +84,7 @@ class _Share:
     tripped: bool = False
 
 
-class SharedPath:
+class SharedPath(Rendezvous):
     """State shared by the members of one path.
 
     Attributes:
@@ -95,6 +95,7 @@ class SharedPath:
     def __init__(
         self, network: Network, bus: Bus, names: frozenset[str], speed: float | None, max_deviation: float | None
     ) -> None:
+        super().__init__(names)
         self.plan: Walk | None = None
         self.broken = ""
         self.begun_s = 0.0
@@ -104,18 +105,6 @@ class SharedPath:
         self._speed = speed
         self._max_deviation = max_deviation
         self._shares: dict[str, _Share] = {}
-        self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._started.add_done_callback(lambda future: None if future.cancelled() else future.exception())
-
-    @property
-    def failure(self) -> BaseException | None:
-        """The error that kept it from beginning."""
-        return self._started.exception() if self._started.done() else None
-
-    def fail(self, error: LdcndError) -> None:
-        """Keep it from beginning; without effect once it has."""
-        if not self._started.done():
-            self._started.set_exception(error)
 
     async def join(self, name: str, member: "PathMember") -> None:
         """Wait for the others; return once the drives walk.
@@ -125,16 +114,9 @@ class SharedPath:
             LdcndError: as `Network.start_path`.
         """
         self._shares[name] = _Share(member)
-        if self._names == self._shares.keys() and not self._started.done():
-            await self._start()
-        try:
-            async with asyncio.timeout(MEETING_S):
-                await asyncio.shield(self._started)
-        except TimeoutError:
-            late = WrongState("not all axes of the path got their turn, so none was started")
-            self.fail(late)
-            raise late from None
+        await self._arrived(name)
 
+    @override
     async def _start(self) -> None:
         fed = False
         try:

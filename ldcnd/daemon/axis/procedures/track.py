@@ -21,7 +21,7 @@ from ldcnd.model.samples import AxisState
 
 IDLE_PERIODS = 5
 SHORTEST_IDLE_S = 0.5
-"""A stream is over when no set-point has come for so many of its shortest periods, but not sooner than this."""
+"""A stream ends after this number of its shortest periods without a set-point, but not sooner than this."""
 EARLY = 0.5
 """A set-point may come this share of a period early; the mean rate is kept."""
 
