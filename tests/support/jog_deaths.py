@@ -218,10 +218,11 @@ class Deaths:
                 velocity = VELOCITY if self.line.position_counts(axis) < 0 else -VELOCITY
                 what = ("--page", json.loads(await _line_of(console))["link"], axis, f"{velocity}")
             program = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "tests.support.jog_deaths", *what, cwd=ROOT, stdout=PIPE, stderr=DEVNULL
+                sys.executable, "-m", "tests.support.jog_deaths", *what, cwd=ROOT, stdout=PIPE, stderr=PIPE
             )
             processes |= {"program": program, "page": program}
-            assert await _line_of(program) == b"jogs\n"
+            if await _line_of(program) != b"jogs\n":
+                raise AssertionError((kind, axis, (await program.communicate())[1].decode()))
             yield processes
         finally:
             for name, process in processes.items():
@@ -287,7 +288,7 @@ async def deaths(folder: Path, seed: int, host_s: float = 0.5) -> AsyncIterator[
 
 async def jog(endpoint: str, axis: str) -> None:
     """Jog until killed: the program that dies; to and fro, so that it stays where it is in the long run."""
-    async with ldcnd.connect(endpoint) as rig, rig.control(axis, client="hand", lease_s=60) as held:
+    async with ldcnd.connect(endpoint) as rig, rig.control(axis, client="hand", lease_s=60, force=True) as held:
         velocity = VELOCITY if float(held.position) < 0 else -VELOCITY
         async with held.jogging(velocity, hold_s=HOLD_S) as jogging:
             print("jogs", flush=True)
@@ -306,8 +307,10 @@ async def jog_by_a_page(link: str, axis: str, velocity: float) -> None:
     async with connect(f"ws://{at.netloc}/api/page", additional_headers=headers, compression=None) as socket:
         page = browser.forging(x_ldcnd_page=json.loads(await socket.recv())["page"])
         async with asyncio.timeout(30):
-            while (await page.post("/api/rigs/deaths/control", {"axes": [axis]})).status != HTTPStatus.OK:
-                await asyncio.sleep(0.1)  # the rig is not connected yet
+            while (
+                await page.post("/api/rigs/deaths/control", {"axes": [axis], "force": True})
+            ).status != HTTPStatus.OK:
+                await asyncio.sleep(0.1)  # the rig is not connected yet; what the program before held is taken
         await socket.send(json.dumps({"jog": {"rig": "deaths", "axis": axis, "velocity": velocity}}))
         print("jogs", flush=True)
         while True:
