@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.support.jog_deaths import DRIVES, KINDS, bound_s, deaths
+from tests.support.jog_deaths import DRIVES, KINDS, bound_s, deaths, table
 
 pytestmark = [pytest.mark.real_time, pytest.mark.timeout(300)]
 
@@ -19,10 +19,14 @@ async def test_a_jog_ends_when_the_program_or_the_daemon_is_killed(tmp_path):
 
 
 @pytest.mark.soak
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(5400)
 async def test_a_jog_ends_within_its_bound_after_every_death(tmp_path):
     async with deaths(tmp_path, SEED, host_s=1.0) as rig:
+        late: list[tuple[int, str, str, float]] = []
         for at in range(500):
             kind, axis = list(KINDS)[at % len(KINDS)], list(DRIVES)[at // len(KINDS) % len(DRIVES)]
             late_s = await rig.run(kind, axis)
-            assert late_s <= bound_s(kind, axis) + rig.host_s, (at, kind, axis)
+            if late_s > bound_s(kind, axis) + rig.host_s:
+                late.append((at, kind, axis, late_s))
+        print(f"seed {SEED}\n{table(rig.late_s)}")
+        assert not late
