@@ -118,7 +118,7 @@ class Remedy(str):
         made.steps = steps
         return made
 
-    def told(self, words: Callable[[Step], str]) -> str:
+    def phrased(self, words: Callable[[Step], str]) -> str:
         """Return the text with other words for its steps."""
         text = str(self)
         for each in self.steps:

@@ -10,7 +10,7 @@ from ldcnd.bus.poller import Poller
 from ldcnd.bus.queue import ExchangeQueue, Lane, PhaseOrder
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.turn import Job, PollTurn, StopProbe, Turn
+from ldcnd.bus.transaction import Job, PollTransaction, StopProbe, Transaction
 from ldcnd.bus.wire import BusStatistics
 from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
 from ldcnd.exchange import Exchange, Timing, condition_in_force
@@ -228,11 +228,11 @@ class Bus(Users):
         """Whether nothing is on the wire and nothing is waited for."""
         return self._line is not None and self._line.phase is Phase.IDLE
 
-    def turning(self, now_s: float) -> bool:
+    def on_time(self, now_s: float) -> bool:
         """Tell whether the bus does its work at `now_s`, in loop time: keeps a line moving, or tries to get one."""
         if self._line is None:
             return now_s <= self._tried_at_s + LONGEST_REOPEN_S + LONGEST_OPENING_S
-        return self._line.turning(now_s)
+        return self._line.on_time(now_s)
 
     @property
     def baud(self) -> int:
@@ -279,7 +279,7 @@ class Bus(Users):
             raise NotSupported(f"bus {self.settings.name}: the port does not make {baud} baud", value=baud)
 
     @property
-    def fence_s(self) -> float:
+    def quarantine_s(self) -> float:
         """Duration of a resynchronisation after a lost reply, in seconds."""
         probe = self.resync.probe(self._mute.failing())
         flush_s = len(self.resync.flush) * self.settings.bits_per_byte / self.baud
@@ -363,7 +363,7 @@ class Bus(Users):
     # -- for the line (see `Users`) ----------------------------------------------------------------------------------
 
     @override
-    def take(self, now_s: float) -> Turn | None:
+    def take(self, now_s: float) -> Transaction | None:
         job = self._queue.take_job(now_s)
         while job and not job.may_go():
             job = self._queue.take_job(now_s)
@@ -372,24 +372,24 @@ class Bus(Users):
             if poller is None:
                 return None
             wanted_at_s = poller.due_at_s
-            return PollTurn(poller, poller.next_exchange(now_s), wanted_at_s, self._order)
+            return PollTransaction(poller, poller.next_exchange(now_s), wanted_at_s, self._order)
         job.attempts_left -= 1
         if isinstance(job, StopProbe):
             self.statistics.stop_wait.add(now_s - job.wanted_at_s)
         return job
 
     @override
-    def sent(self, turn: Turn) -> None:
-        if isinstance(turn, PollTurn) and (poller := turn.poller) in self._pollers:
+    def sent(self, transaction: Transaction) -> None:
+        if isinstance(transaction, PollTransaction) and (poller := transaction.poller) in self._pollers:
             self._queue.polls.schedule(poller, poller.due_at_s)
 
     @override
-    def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
+    def prepare_next(self, transaction: Transaction, asked_at_s: float, byte_s: float) -> None:
         # to choose a poll and its items takes longer than all else between two packets
-        exchange = turn.exchange
+        exchange = transaction.exchange
         reply_s = exchange.reply_bytes * byte_s
         at_s = self._order.free_at_s(exchange.node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s
-        if poller := self._queue.polls.look_ahead(at_s):
+        if poller := self._queue.polls.choose_ahead(at_s):
             poller.prepare(at_s)
 
     @override
@@ -405,8 +405,8 @@ class Bus(Users):
         return self._mute.failing()
 
     @override
-    def answered(self, turn: Turn) -> None:
-        exchange, mute = turn.exchange, self._mute
+    def answered(self, transaction: Transaction) -> None:
+        exchange, mute = transaction.exchange, self._mute
         if not exchange.reply_bytes or exchange.node not in mute.misses:
             return
         if (also := mute.answered(exchange.node)) is not None:
@@ -415,12 +415,14 @@ class Bus(Users):
                     self._queue.schedule(poller, poller.due_at_s)
 
     @override
-    def missed(self, turn: Turn, now_s: float) -> None:
-        node = turn.exchange.node
+    def missed(self, transaction: Transaction, now_s: float) -> None:
+        node = transaction.exchange.node
         self._mute.missed(node)
-        if isinstance(turn, PollTurn):
-            pause_s = self._mute.pause_s(node, self.longest_s(turn.exchange) + self.settings.margin_s + self.fence_s)
-            self._schedule(turn.poller, max(turn.poller.due_at_s, now_s + pause_s))
+        if isinstance(transaction, PollTransaction):
+            pause_s = self._mute.pause_s(
+                node, self.longest_s(transaction.exchange) + self.settings.margin_s + self.quarantine_s
+            )
+            self._schedule(transaction.poller, max(transaction.poller.due_at_s, now_s + pause_s))
 
     def _schedule(self, poller: Poller[Any], at_s: float) -> None:
         """Give a poller its next turn, unless it was removed while its poll was on the wire."""
@@ -428,9 +430,9 @@ class Bus(Users):
             self._queue.schedule(poller, at_s)
 
     @override
-    def again(self, turn: Turn) -> None:
-        if isinstance(turn, Job):
-            self._queue.push_front(turn, turn.lane)
+    def again(self, transaction: Transaction) -> None:
+        if isinstance(transaction, Job):
+            self._queue.push_front(transaction, transaction.lane)
 
     @override
     def line_lost(self, reason: str) -> None:

@@ -5,7 +5,7 @@ noted, decoded and delivered. No task and no timer per exchange.
 
 No reply is ever credited to a later request. Replies of these lines carry no sequence number, so the line relies on
 three facts: bytes that arrive sooner than the wire can carry them belong to something older; nothing but the reply may
-follow a request; after any loss the line is resynchronised (`Fence`) before it is used again.
+follow a request; after any loss the line is resynchronised (`Quarantine`) before it is used again.
 """
 
 import asyncio
@@ -15,9 +15,9 @@ from typing import Protocol
 from typing_extensions import override
 
 from ldcnd.bus.queue import POLL
-from ldcnd.bus.resync import Fence, Probe, Resync
+from ldcnd.bus.resync import Probe, Quarantine, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
-from ldcnd.bus.turn import AT_ONCE, LANES, Turn
+from ldcnd.bus.transaction import AT_ONCE, LANES, Transaction
 from ldcnd.bus.wire import NEVER_S, BusStatistics, Pieces, Watchdog, Whole, Wire
 from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
 from ldcnd.exchange import ReplyVerdict, Timing
@@ -34,7 +34,7 @@ class Phase(Enum):
     """A packet that must not be repeated has its reply; a second one would prove that the first was not its own."""
     QUIET = "quiet"
     """After a request that draws no reply."""
-    FENCE = "fence"
+    QUARANTINE = "quarantine"
     """Waiting for late bytes to stop."""
     SETTLE = "settle"
     """The flush is on its way."""
@@ -44,17 +44,17 @@ class Phase(Enum):
 class Users(Protocol):
     """The interface of the bus that the line uses: its queue and its state of the nodes."""
 
-    def take(self, now_s: float) -> Turn | None:
-        """Remove and return the next turn, or None when nothing is due."""
+    def take(self, now_s: float) -> Transaction | None:
+        """Remove and return the next transaction, or None when nothing is due."""
 
-    def sent(self, turn: Turn) -> None:
-        """Note that a turn that was taken is on the wire."""
+    def sent(self, transaction: Transaction) -> None:
+        """Note that a transaction that was taken is on the wire."""
 
-    def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
-        """Prepare the next turn, while there is time.
+    def prepare_next(self, transaction: Transaction, asked_at_s: float, byte_s: float) -> None:
+        """Prepare the next transaction, while there is time.
 
         Args:
-            turn: on the wire.
+            transaction: on the wire.
             asked_at_s: when the last bit of its request leaves, in loop time.
             byte_s: how long a byte takes now.
         """
@@ -68,17 +68,17 @@ class Users(Protocol):
     def failing(self) -> set[int]:
         """Return the nodes that did not reply to their last exchange."""
 
-    def answered(self, turn: Turn) -> None:
-        """Note that the turn's node replied, or that no reply was due."""
+    def answered(self, transaction: Transaction) -> None:
+        """Note that the transaction's node replied, or that no reply was due."""
 
-    def missed(self, turn: Turn, now_s: float) -> None:
-        """Note that the turn's node did not reply; called before the turn's own `lost`."""
+    def missed(self, transaction: Transaction, now_s: float) -> None:
+        """Note that the transaction's node did not reply; called before the transaction's own `lost`."""
 
-    def again(self, turn: Turn) -> None:
-        """Give the turn back to the front of its lane."""
+    def again(self, transaction: Transaction) -> None:
+        """Give the transaction back to the front of its lane."""
 
     def line_lost(self, reason: str) -> None:
-        """Note the loss of the line; called once, after every turn on it has its outcome."""
+        """Note the loss of the line; called once, after every transaction on it has its outcome."""
 
 
 NOT_PLAIN = 0
@@ -112,19 +112,19 @@ class Line(Receiver):
         self._transport, self._log = transport, wire_log
         self._users = users
         self._resync = resync
-        self._fence = Fence(resync)
+        self._quarantine = Quarantine(resync)
         self._statistics = statistics
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
-        self._turn: Turn | None = None
+        self._transaction: Transaction | None = None
         self._distrusted = False
         self._sent_at_s = 0.0
         self._pieces = Pieces()
-        self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain turn
+        self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain transaction
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
         transport.attach(self)
 
-    def turning(self, now_s: float) -> bool:
+    def on_time(self, now_s: float) -> bool:
         """Tell whether the line acts on time: the time of its next action is always set, and is not past."""
         if self.phase is Phase.IDLE:
             return not self._users.stop_waits() and now_s <= self._users.next_due_s() + LATE_S
@@ -135,7 +135,7 @@ class Line(Receiver):
         """Check the queue: something was added to it."""
         if self.phase is Phase.IDLE:
             self._next()
-        elif self.phase is Phase.FENCE and self._users.stop_waits():
+        elif self.phase is Phase.QUARANTINE and self._users.stop_waits():
             self._watchdog.set(self._loop.time())
 
     def distrust(self) -> None:
@@ -145,13 +145,13 @@ class Line(Receiver):
         its exchange must not be repeated.
         """
         if self.phase is Phase.IDLE:
-            self._fence.doubt()
-            self._raise_fence(self._loop.time())
-        elif self.phase is Phase.REPLY and self._turn and self._turn.exchange.repeatable:
+            self._quarantine.require()
+            self._begin_quarantine(self._loop.time())
+        elif self.phase is Phase.REPLY and self._transaction and self._transaction.exchange.repeatable:
             self._distrusted, self._missing = True, NOT_PLAIN
 
     def close(self, reason: str, *, for_good: bool = False) -> None:
-        """Leave the line; the turn on the wire, if any, is lost. Safe to call twice.
+        """Leave the line; the transaction on the wire, if any, is lost. Safe to call twice.
 
         Args:
             reason: for the errors.
@@ -161,11 +161,13 @@ class Line(Receiver):
             return
         self.phase = Phase.CLOSED
         self._watchdog.cancel()
-        turn, self._turn = self._turn, None
-        if for_good and turn and turn.lane is POLL:
-            turn = None
-        if turn and turn.lost(ReplyTimeout(f"node {turn.exchange.node}: {reason} before the reply came")):
-            self._users.again(turn)
+        transaction, self._transaction = self._transaction, None
+        if for_good and transaction and transaction.lane is POLL:
+            transaction = None
+        if transaction and transaction.lost(
+            ReplyTimeout(f"node {transaction.exchange.node}: {reason} before the reply came")
+        ):
+            self._users.again(transaction)
         self._users.line_lost(reason)
 
     # -- receiver ----------------------------------------------------------------------------------------------------
@@ -181,11 +183,11 @@ class Line(Receiver):
 
     @override
     def data_received(self, data: bytes) -> None:
-        now_s, turn = self._loop.time(), self._turn
-        if turn and len(data) == self._missing and now_s >= self._whole_from_s:
+        now_s, transaction = self._loop.time(), self._transaction
+        if transaction and len(data) == self._missing and now_s >= self._whole_from_s:
             reply = self._pieces.held + data
-            if turn.exchange.check(reply) is ReplyVerdict.INTACT:
-                self._complete_plain(turn, reply, data, now_s)
+            if transaction.exchange.check(reply) is ReplyVerdict.INTACT:
+                self._complete_plain(transaction, reply, data, now_s)
                 return
         self._take_apart(data, now_s)
 
@@ -198,158 +200,164 @@ class Line(Receiver):
             self._collided(data, now_s)
             return
         data = own_taken_off
-        if (turn := self._turn) and data and self.phase is Phase.LINGER:
+        if (transaction := self._transaction) and data and self.phase is Phase.LINGER:
             self.wire.note(WireEvent.RECEIVED, now_s, data, "follows a reply")
-            self._distrust(turn, self._kept[0] + data, "was followed by another one", now_s)
+            self._distrust(transaction, self._kept[0] + data, "was followed by another one", now_s)
             return
-        if data and (turn is None or self.phase is not Phase.REPLY):
+        if data and (transaction is None or self.phase is not Phase.REPLY):
             self._stray(data, now_s)
             return
-        while turn and data:
-            whole = self._pieces.add(turn.exchange, data, now_s)
+        while transaction and data:
+            whole = self._pieces.add(transaction.exchange, data, now_s)
             if whole is None:
                 self.wire.note(WireEvent.PART, now_s, data)
                 if was_plain and not self._pieces.early:
-                    self._missing = turn.exchange.reply_bytes - len(self._pieces.held)
+                    self._missing = transaction.exchange.reply_bytes - len(self._pieces.held)
                 self._transport.expect(max(ANY, self._missing))
                 return
-            verdict = turn.exchange.check(whole.reply)
+            verdict = transaction.exchange.check(whole.reply)
             if verdict is not ReplyVerdict.FOREIGN:
-                self._judge(turn, whole, verdict, data, now_s)
+                self._judge(transaction, whole, verdict, data, now_s)
                 return
             self.wire.stray(data[: len(data) - len(whole.surplus)], now_s, "foreign reply")
             data = whole.surplus
 
-    def _judge(self, turn: Turn, whole: Whole, verdict: ReplyVerdict, arrived: bytes, now_s: float) -> None:
+    def _judge(
+        self, transaction: Transaction, whole: Whole, verdict: ReplyVerdict, arrived: bytes, now_s: float
+    ) -> None:
         """Accept a reply, wait for a better one, or reject it."""
         flaw = "came too early" if whole.early else _FLAWS.get(verdict, "")
         why = "came with surplus bytes" if whole.surplus else flaw
         self.wire.note(WireEvent.RECEIVED, now_s, arrived, why)
         if self._distrusted:
-            self._distrust(turn, whole.reply, "may be to something older", now_s)
+            self._distrust(transaction, whole.reply, "may be to something older", now_s)
         elif whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
-            self._distrust(turn, whole.reply + whole.surplus, why, now_s)
-        elif not turn.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(turn)):
+            self._distrust(transaction, whole.reply + whole.surplus, why, now_s)
+        elif not transaction.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(transaction)):
             # not accepted before no other reply can come
             self.phase, self._kept = Phase.LINGER, (whole.reply, now_s)
             self._watchdog.set(until_s)
         elif verdict is ReplyVerdict.REJECTED:
-            self._rejected(turn)
+            self._rejected(transaction)
         else:
-            self._complete(turn, whole.reply, now_s)
+            self._complete(transaction, whole.reply, now_s)
 
-    def _true_reply_by_s(self, turn: Turn) -> float:
+    def _true_reply_by_s(self, transaction: Transaction) -> float:
         """Return until when the node's own reply may still arrive after another one; minus infinity when unpaced."""
         if not self._settings.paced:
             return -NEVER_S
-        return self._sent_at_s + self.wire.longest_s(turn.exchange) + LINGER_S
+        return self._sent_at_s + self.wire.longest_s(transaction.exchange) + LINGER_S
 
-    def _settle(self, turn: Turn, reply: bytes, now_s: float) -> None:
-        if turn.exchange.check(reply) is ReplyVerdict.REJECTED:
-            self._rejected(turn)
+    def _settle(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
+        if transaction.exchange.check(reply) is ReplyVerdict.REJECTED:
+            self._rejected(transaction)
         else:
-            self._complete(turn, reply, now_s)
+            self._complete(transaction, reply, now_s)
 
-    def _complete_plain(self, turn: Turn, reply: bytes, arrived: bytes, now_s: float) -> None:
+    def _complete_plain(self, transaction: Transaction, reply: bytes, arrived: bytes, now_s: float) -> None:
         """Write the next request before anything else: until then the wire is idle, afterwards there is time."""
         sent_at_s, failure = self._sent_at_s, ""
         following = self._users.take(now_s)
         if following and not following.at_baud:
             failure = self._put(following, self._loop.time())
-            if turn.laborious:
+            if transaction.slow_to_deliver:
                 self._transport.push()
         else:
-            self._turn, self.phase = None, Phase.IDLE
+            self._transaction, self.phase = None, Phase.IDLE
         self._statistics.bytes_in += len(arrived)
         self._log.add(now_s, WireEvent.RECEIVED, arrived)
-        timing = self.wire.replied(turn, reply, sent_at_s, now_s)
-        self._users.answered(turn)
+        timing = self.wire.replied(transaction, reply, sent_at_s, now_s)
+        self._users.answered(transaction)
         if following is None:
             self._next(AT_ONCE)
         elif following.at_baud:
             self._send(following, now_s, AT_ONCE[following.lane])
         else:
-            self._attend(following, AT_ONCE[following.lane], failure, early=int(turn.laborious))
-        turn.completed(reply, timing)
-        if self._turn and self._missing and turn.lane is POLL:  # callers that wait for a reply get it first
+            self._attend(following, AT_ONCE[following.lane], failure, early=int(transaction.slow_to_deliver))
+        transaction.completed(reply, timing)
+        if (
+            self._transaction and self._missing and transaction.lane is POLL
+        ):  # callers that wait for a reply get it first
             byte_s = self.wire.byte_s
-            self._users.look_ahead(self._turn, self._sent_at_s + len(self._turn.exchange.request) * byte_s, byte_s)
+            self._users.prepare_next(
+                self._transaction, self._sent_at_s + len(self._transaction.exchange.request) * byte_s, byte_s
+            )
 
-    def _complete(self, turn: Turn, reply: bytes, now_s: float) -> None:
+    def _complete(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
-        timing = self.wire.replied(turn, reply, self._sent_at_s, now_s)
-        if isinstance(turn, Probe):
-            self._probed(turn, reply, timing, now_s)
+        timing = self.wire.replied(transaction, reply, self._sent_at_s, now_s)
+        if isinstance(transaction, Probe):
+            self._probed(transaction, reply, timing, now_s)
             return
-        self._users.answered(turn)
-        self._release(turn, turn.then_baud)
+        self._users.answered(transaction)
+        self._release(transaction, transaction.then_baud)
         self._next(AT_ONCE)
-        turn.completed(reply, timing)
+        transaction.completed(reply, timing)
 
-    def _release(self, turn: Turn, then_baud: int | None = None) -> None:
+    def _release(self, transaction: Transaction, then_baud: int | None = None) -> None:
         """Free the line, at the rate that it has from now on."""
-        self._turn, self.phase = None, Phase.IDLE
-        if then_baud or turn.at_baud:
+        self._transaction, self.phase = None, Phase.IDLE
+        if then_baud or transaction.at_baud:
             self._tune(then_baud or self.wire.baud)
 
-    def _rejected(self, turn: Turn) -> None:
+    def _rejected(self, transaction: Transaction) -> None:
         """The node did not execute our packet: the line is in step, and sending again is always safe."""
         self._statistics.rejected_packets += 1
-        self._users.answered(turn)
-        if turn.rejected():
-            self._send_again(turn)
-        self._release(turn)
+        self._users.answered(transaction)
+        if transaction.rejected():
+            self._send_again(transaction)
+        self._release(transaction)
         self._next()
 
     # -- losses ------------------------------------------------------------------------------------------------------
 
-    def _distrust(self, turn: Turn, reply: bytes, why: str, now_s: float) -> None:
+    def _distrust(self, transaction: Transaction, reply: bytes, why: str, now_s: float) -> None:
         self._statistics.corrupt_replies += 1
-        self._lose(turn, BadReply(f"node {turn.exchange.node}: reply {reply.hex(' ')} {why}"), now_s)
+        self._lose(transaction, BadReply(f"node {transaction.exchange.node}: reply {reply.hex(' ')} {why}"), now_s)
 
-    def _lose(self, turn: Turn, error: BusError, now_s: float) -> None:
-        """Settle the turn whose reply cannot be valid any more, and resynchronise the line."""
-        self._users.missed(turn, now_s)
-        if not isinstance(turn, Probe):
-            self._fence.doubt()
+    def _lose(self, transaction: Transaction, error: BusError, now_s: float) -> None:
+        """Settle the transaction whose reply cannot be valid any more, and resynchronise the line."""
+        self._users.missed(transaction, now_s)
+        if not isinstance(transaction, Probe):
+            self._quarantine.require()
         # before the resynchronisation, which a stop that is sent again cuts short
-        if turn.lost(error):
-            self._send_again(turn)
-        self._release(turn)
-        self._raise_fence(now_s)
+        if transaction.lost(error):
+            self._send_again(transaction)
+        self._release(transaction)
+        self._begin_quarantine(now_s)
 
-    def _send_again(self, turn: Turn) -> None:
+    def _send_again(self, transaction: Transaction) -> None:
         self._statistics.resent += 1
-        self._users.again(turn)
+        self._users.again(transaction)
 
     def _collided(self, data: bytes, now_s: float) -> None:
         """Handle an echo that differs from what was sent."""
-        if self._turn and self.phase is Phase.REPLY:
+        if self._transaction and self.phase is Phase.REPLY:
             why = "follows an echo that differs: collision"
             self.wire.note(WireEvent.RECEIVED, now_s, data, why)
-            self._distrust(self._turn, data, why, now_s)
+            self._distrust(self._transaction, data, why, now_s)
         else:
             self._stray(data, now_s)
 
     def _stray(self, data: bytes, now_s: float) -> None:
         """Handle bytes outside a reply: late ones in a resynchronisation, otherwise a sign of being out of step."""
         self.wire.stray(data, now_s)
-        if self.phase is Phase.FENCE and not self._users.stop_waits():
-            self._watchdog.set(self._fence.disturbed(now_s))
+        if self.phase is Phase.QUARANTINE and not self._users.stop_waits():
+            self._watchdog.set(self._quarantine.disturbed(now_s))
         elif self.phase is Phase.IDLE:
-            self._fence.doubt()
-            self._raise_fence(now_s)
+            self._quarantine.require()
+            self._begin_quarantine(now_s)
 
-    def _raise_fence(self, now_s: float) -> None:
+    def _begin_quarantine(self, now_s: float) -> None:
         if self.phase is Phase.CLOSED:
             return
         self._distrusted = False
         self._statistics.resynchronisations += 1
         self.wire.note(WireEvent.RESYNC, now_s)
-        self.phase = Phase.FENCE
+        self.phase = Phase.QUARANTINE
         self._transport.expect(ANY)
         self.wire.forget_echo()
-        silent_s = self._fence.raised(now_s)
+        silent_s = self._quarantine.raised(now_s)
         self._watchdog.set(now_s if self._users.stop_waits() else silent_s)
 
     def _flush(self, now_s: float) -> None:
@@ -366,7 +374,7 @@ class Line(Receiver):
         """After the flush: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
         self.wire.discard_input()
         self.phase = Phase.IDLE
-        probe = None if self._users.stop_waits() else self._fence.probe(self._users.failing(), now_s)
+        probe = None if self._users.stop_waits() else self._quarantine.probe(self._users.failing(), now_s)
         if probe:
             self._send(probe, now_s, "probe")
         else:
@@ -379,7 +387,7 @@ class Line(Receiver):
             self.wire.note(WireEvent.RECEIVED, now_s, remark=why)
             self._distrust(probe, reply, why, now_s)
             return
-        self._fence.proven()
+        self._quarantine.proven()
         self._users.answered(probe)
         self._release(probe)
         self._next()
@@ -391,46 +399,48 @@ class Line(Receiver):
         if self.phase is not Phase.IDLE:
             return
         now_s = self._loop.time()
-        if not (self._fence.in_step or self._users.stop_waits()):
-            self._raise_fence(now_s)  # only a stop may use a line that is not proven to be in step
+        if not (self._quarantine.in_step or self._users.stop_waits()):
+            self._begin_quarantine(now_s)  # only a stop may use a line that is not proven to be in step
             return
-        if turn := self._users.take(now_s):
-            self._send(turn, now_s, remarks[turn.lane])
+        if transaction := self._users.take(now_s):
+            self._send(transaction, now_s, remarks[transaction.lane])
         else:
             self._transport.expect(ANY)
             self._watchdog.set(self._users.next_due_s())
 
-    def _send(self, turn: Turn, now_s: float, remark: str) -> None:
-        if turn.at_baud:
-            self._turn = turn
-            self._tune(turn.at_baud, for_good=False)
+    def _send(self, transaction: Transaction, now_s: float, remark: str) -> None:
+        if transaction.at_baud:
+            self._transaction = transaction
+            self._tune(transaction.at_baud, for_good=False)
             if self.phase is Phase.CLOSED:
                 return
-        self._attend(turn, remark, self._put(turn, now_s))
+        self._attend(transaction, remark, self._put(transaction, now_s))
 
-    def _put(self, turn: Turn, now_s: float) -> str:
+    def _put(self, transaction: Transaction, now_s: float) -> str:
         """Write a request and do nothing else; return why the line was lost over it, if it was."""
-        self._turn, self._sent_at_s = turn, now_s
-        self.phase = Phase.REPLY if turn.exchange.reply_bytes else Phase.QUIET
+        self._transaction, self._sent_at_s = transaction, now_s
+        self.phase = Phase.REPLY if transaction.exchange.reply_bytes else Phase.QUIET
         try:
-            self._transport.write(turn.exchange.request)
+            self._transport.write(transaction.exchange.request)
         except TransportLost as error:
             return error.message
         return ""
 
-    def _attend(self, turn: Turn, remark: str, failure: str, *, early: int = 0) -> None:
+    def _attend(self, transaction: Transaction, remark: str, failure: str, *, early: int = 0) -> None:
         """Note a request that has just been written, and prepare for its reply.
 
         When processing takes long, the line is woken `early` bytes before the end, so that caches are warm.
         """
-        exchange, settings, wire, now_s = turn.exchange, self._settings, self.wire, self._sent_at_s
+        exchange, settings, wire, now_s = transaction.exchange, self._settings, self.wire, self._sent_at_s
         request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
         self._whole_from_s = self._pieces.begin(
             now_s if settings.paced else -NEVER_S, request_s, wire.byte_s, exchange.reply_bytes
         )
-        # a whole intact reply is all that it takes to go on to the next turn
-        goes_on = exchange.repeatable and not (exchange.total_bytes or turn.then_baud or turn.at_baud or turn.proves)
-        plain = exchange.reply_bytes and goes_on and self._fence.in_step and not settings.echo
+        # a whole intact reply is all that it takes to go on to the next transaction
+        goes_on = exchange.repeatable and not (
+            exchange.total_bytes or transaction.then_baud or transaction.at_baud or transaction.proves
+        )
+        plain = exchange.reply_bytes and goes_on and self._quarantine.in_step and not settings.echo
         self._missing = exchange.reply_bytes if plain else NOT_PLAIN
         self._transport.expect(max(ANY, self._missing - early))
         answer_s = reply_s + settings.margin_s + self._transport.lag_s if exchange.reply_bytes else 0.0
@@ -440,7 +450,7 @@ class Line(Receiver):
         self._log.add(now_s, WireEvent.SENT, exchange.request, remark)
         if wire.echo is not None:
             wire.echo.sent(exchange.request)
-        self._users.sent(turn)
+        self._users.sent(transaction)
         if failure:
             self.transport_lost(failure)
 
@@ -458,31 +468,31 @@ class Line(Receiver):
         match self.phase:
             case Phase.IDLE:
                 self._next()
-            case Phase.REPLY if self._turn:
-                self._timed_out(self._turn, now_s)
-            case Phase.LINGER if self._turn:
-                self._settle(self._turn, *self._kept)
-            case Phase.QUIET if self._turn:
-                self._quiet_over(self._turn, now_s)
-            case Phase.FENCE:
+            case Phase.REPLY if self._transaction:
+                self._timed_out(self._transaction, now_s)
+            case Phase.LINGER if self._transaction:
+                self._settle(self._transaction, *self._kept)
+            case Phase.QUIET if self._transaction:
+                self._quiet_over(self._transaction, now_s)
+            case Phase.QUARANTINE:
                 self._flush(now_s)
             case Phase.SETTLE:
                 self._flushed(now_s)
 
-    def _timed_out(self, turn: Turn, now_s: float) -> None:
+    def _timed_out(self, transaction: Transaction, now_s: float) -> None:
         self._transport.collect()
-        if self._turn is not turn or self.phase is not Phase.REPLY:
+        if self._transaction is not transaction or self.phase is not Phase.REPLY:
             return  # the reply was there after all
         self._statistics.timeouts += 1
-        got = f"{len(held)} of {turn.exchange.reply_bytes} bytes" if (held := self._pieces.held) else "nothing"
-        error = ReplyTimeout(f"node {turn.exchange.node} on bus {self._settings.name} sent {got} in time")
+        got = f"{len(held)} of {transaction.exchange.reply_bytes} bytes" if (held := self._pieces.held) else "nothing"
+        error = ReplyTimeout(f"node {transaction.exchange.node} on bus {self._settings.name} sent {got} in time")
         self.wire.note(WireEvent.TIMEOUT, now_s, remark=error.message)
-        self._lose(turn, error, now_s)
+        self._lose(transaction, error, now_s)
 
-    def _quiet_over(self, turn: Turn, now_s: float) -> None:
+    def _quiet_over(self, transaction: Transaction, now_s: float) -> None:
         """An exchange without a reply is complete once the line may be used again."""
-        timing = self.wire.silent(turn, self._sent_at_s, now_s)
-        self._users.answered(turn)
-        self._release(turn, turn.then_baud)
+        timing = self.wire.silent(transaction, self._sent_at_s, now_s)
+        self._users.answered(transaction)
+        self._release(transaction, transaction.then_baud)
         self._next()
-        turn.completed(b"", timing)
+        transaction.completed(b"", timing)

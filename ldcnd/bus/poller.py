@@ -43,7 +43,7 @@ class Poller(ABC, Generic[ReplyT]):
         deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
         priority: its rank while the line cannot carry all polls; does not change while it waits for a slot.
         rates_hz: rate at which it reads each telemetry item; empty for one that reads none.
-        laborious: processing a reply takes long, so the next request is sent first; see `Line`.
+        slow_to_deliver: processing a reply takes long, so the next request is sent first; see `Line`.
     """
 
     node: int
@@ -51,7 +51,7 @@ class Poller(ABC, Generic[ReplyT]):
     deadline_at_s: float = 0.0
     priority: Priority = Priority.NORMAL
     rates_hz: Mapping[TelemetryItem, float] = MappingProxyType({})
-    laborious: bool = False
+    slow_to_deliver: bool = False
 
     def prepare(self, at_s: float) -> None:
         """Prepare the next exchange, which takes time; the next slot is expected at about that instant."""

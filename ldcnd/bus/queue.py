@@ -178,7 +178,7 @@ class PollQueue:
         self._behind = False
         return False
 
-    def look_ahead(self, at_s: float) -> Poller[Any] | None:
+    def choose_ahead(self, at_s: float) -> Poller[Any] | None:
         """Choose among the polls due at about `at_s`; None when none is due, or one is chosen already."""
         if self._ahead or not self.is_due(at_s):
             return None
@@ -356,9 +356,9 @@ class ExchangeQueue(Generic[JobT]):
         self.polls_in_a_row += 1
         return None
 
-    def look_ahead(self, at_s: float) -> Poller[Any] | None:
+    def choose_ahead(self, at_s: float) -> Poller[Any] | None:
         """Choose the next poll ahead, see `PollQueue`; jobs may still go before it."""
-        return self.polls.look_ahead(at_s)
+        return self.polls.choose_ahead(at_s)
 
     def drain(self) -> list[JobT]:
         """Remove all pollers; remove and return all jobs, stops first."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ldcnd.bus.queue import Lane
-from ldcnd.bus.turn import Turn
+from ldcnd.bus.transaction import Transaction
 from ldcnd.errors import BadReply, BusError
 from ldcnd.exchange import Exchange, Timing
 
@@ -37,7 +37,7 @@ class Resync:
     probe: Callable[[AbstractSet[int]], Exchange[Any] | None] = _no_probe
 
 
-class Probe(Turn):
+class Probe(Transaction):
     """The line's own exchange at the end of a resynchronisation."""
 
     __slots__ = ("passed",)
@@ -56,20 +56,20 @@ class Probe(Turn):
         self.passed = True
 
     def lost(self, error: BusError) -> bool:  # noqa: ARG002 - part of the contract
-        """See `Turn`; the line probes again by itself."""
+        """See `Transaction`; the line probes again by itself."""
         return False
 
     def rejected(self) -> bool:
-        """See `Turn`; an intact refusal proves nothing, the line probes again by itself."""
+        """See `Transaction`; an intact refusal proves nothing, the line probes again by itself."""
         return False
 
 
 PROBE_ROUNDS = 3
-LONGEST_FENCE = 20
+LONGEST_QUARANTINE = 20
 """Longest wait for silence, in multiples of `quiet_s`; a line that is never silent is flushed after that."""
 
 
-class Fence:
+class Quarantine:
     """Progress of a resynchronisation: the steps before a line is used again.
 
     Attributes:
@@ -82,7 +82,7 @@ class Fence:
         self._rounds_left = 0
         self._since_s = 0.0
 
-    def doubt(self) -> None:
+    def require(self) -> None:
         """Require a proof that the line is in step."""
         self._rounds_left, self.in_step = PROBE_ROUNDS, False
 
@@ -98,7 +98,7 @@ class Fence:
     def disturbed(self, now_s: float) -> float:
         """Note bytes during the silence; return the new end of the wait, in loop time."""
         quiet_s = self._resync.quiet_s
-        return min(now_s + quiet_s, self._since_s + LONGEST_FENCE * quiet_s)
+        return min(now_s + quiet_s, self._since_s + LONGEST_QUARANTINE * quiet_s)
 
     def probe(self, avoid: AbstractSet[int], now_s: float) -> Probe | None:
         """Return the next proof to attempt; None when none is needed, or when there is no node to probe."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.turn import Turn
+from ldcnd.bus.transaction import Transaction
 from ldcnd.errors import TransportLost
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.transport.transport import Transport
@@ -300,19 +300,19 @@ class Wire:
         if self.echo:
             self.echo.clear()
 
-    def replied(self, turn: Turn, reply: bytes, sent_at_s: float, now_s: float) -> Timing:
+    def replied(self, transaction: Transaction, reply: bytes, sent_at_s: float, now_s: float) -> Timing:
         """Count an intact reply; return when it was true."""
         statistics = self._statistics
-        request_s, reply_s = len(turn.exchange.request) * self.byte_s, len(reply) * self.byte_s
+        request_s, reply_s = len(transaction.exchange.request) * self.byte_s, len(reply) * self.byte_s
         sent_s = sent_at_s + request_s
         statistics.replies += 1
         statistics.wire_busy_s += request_s + reply_s
-        statistics.latency[turn.lane].add(max(0.0, now_s - turn.wanted_at_s))
+        statistics.latency[transaction.lane].add(max(0.0, now_s - transaction.wanted_at_s))
         return Timing(sent_at_s, sent_s, max(now_s - reply_s, sent_s), now_s)
 
-    def silent(self, turn: Turn, sent_at_s: float, now_s: float) -> Timing:
+    def silent(self, transaction: Transaction, sent_at_s: float, now_s: float) -> Timing:
         """Count a request that draws no reply; return when it took effect."""
-        request_s = len(turn.exchange.request) * self.byte_s
+        request_s = len(transaction.exchange.request) * self.byte_s
         self._statistics.wire_busy_s += request_s
         return Timing(sent_at_s, sent_at_s + request_s, now_s, now_s)
 

@@ -89,7 +89,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def _remedy(error: LdcndError) -> list[str]:
-    return [f"  {error.remedy.told(lambda step: typed(step, error.axis))}"] if error.remedy else []
+    return [f"  {error.remedy.phrased(lambda step: typed(step, error.axis))}"] if error.remedy else []
 
 
 def _single(group: BaseExceptionGroup[BaseException]) -> BaseException:

@@ -26,7 +26,7 @@ def command(target: Target, axis: str) -> None:
     lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]
     for cause in reply.causes:
         known = remedy_of(cause)
-        remedy = known and known.told(lambda step: typed(step, axis))
+        remedy = known and known.phrased(lambda step: typed(step, axis))
         lines.append(f"  {cause.text}{f': {remedy}' if remedy else ''}")
         if cause.page:
             lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")

@@ -45,7 +45,7 @@ class DaemonConfig(Frozen):
 
 
 class CapturesConfig(Frozen):
-    """The captures of lines on which something has gone wrong: a drive's fault, a loss, a line that does not turn."""
+    """The captures of lines on which something has gone wrong: a drive's fault, a loss, a line that acts too late."""
 
     directory: Path | None = None
     """Where captures are written; `captures` in `state_dir` if that is set, else nothing is written."""

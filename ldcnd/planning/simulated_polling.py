@@ -75,7 +75,7 @@ def _rehearse(
         poller.next_exchange(now_s)
         queue.schedule(poller, poller.due_at_s)
         timing = poller.answer(now_s)
-        queue.look_ahead(order.free_at_s(poller.node, timing.true_from_s, poller.reply_s))
+        queue.choose_ahead(order.free_at_s(poller.node, timing.true_from_s, poller.reply_s))
         order.observe(poller.node, timing)
         over_s = timing.received_at_s + poller.drive.cost.overhead_s
         if number >= learning:

@@ -10,7 +10,7 @@ from typing import Literal
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
-from ldcnd.bus.turn import AT_ONCE, LANES
+from ldcnd.bus.transaction import AT_ONCE, LANES
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES

@@ -24,7 +24,7 @@ FIRST_NUMBER = 0x8000
 """Callers' numbers start here, a poller's below."""
 NODES = 3
 LATENCY_S = 0.0008
-"""Below the settling time of the fence: what an adapter keeps longer, no fence can keep out."""
+"""Below the settling time of the quarantine: what an adapter keeps longer, no quarantine can keep out."""
 HEALED_S = 30.0
 
 

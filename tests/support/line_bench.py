@@ -7,7 +7,7 @@ from ldcnd.bus.line import Line
 from ldcnd.bus.queue import Lane
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.turn import Turn
+from ldcnd.bus.transaction import Transaction
 from ldcnd.bus.wire import BusStatistics
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
@@ -22,8 +22,8 @@ FENCE_S = toy.RESYNC.quiet_s + len(toy.FLUSH) * BYTE_S + toy.RESYNC.settle_s
 MARGIN_S = 0.005
 
 
-class RecordingTurn(Turn):
-    """A turn that notes in its users' story what it hears."""
+class RecordingTransaction(Transaction):
+    """A transaction that notes in its users' story what it hears."""
 
     def __init__(self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND):
         super().__init__(exchange, lane, 0.0)
@@ -53,42 +53,42 @@ class PlainUsers:
 
     def __init__(self) -> None:
         self.story: list[str] = []
-        self.waiting: deque[RecordingTurn] = deque()
+        self.waiting: deque[RecordingTransaction] = deque()
         self.mute: set[int] = set()
         self.taken_at_s: list[float] = []
 
-    def take(self, now_s: float) -> Turn | None:
-        stops = [turn for turn in self.waiting if turn.lane is Lane.STOP]
-        turn = stops[0] if stops else self.waiting[0] if self.waiting else None
-        if turn:
-            self.waiting.remove(turn)
+    def take(self, now_s: float) -> Transaction | None:
+        stops = [transaction for transaction in self.waiting if transaction.lane is Lane.STOP]
+        transaction = stops[0] if stops else self.waiting[0] if self.waiting else None
+        if transaction:
+            self.waiting.remove(transaction)
             self.taken_at_s.append(now_s)
-        return turn
+        return transaction
 
-    def sent(self, turn: Turn) -> None:
+    def sent(self, transaction: Transaction) -> None:
         pass
 
-    def look_ahead(self, turn: Turn, asked_at_s: float, byte_s: float) -> None:
+    def prepare_next(self, transaction: Transaction, asked_at_s: float, byte_s: float) -> None:
         pass
 
     def next_due_s(self) -> float:
         return float("inf")
 
     def stop_waits(self) -> bool:
-        return any(turn.lane is Lane.STOP for turn in self.waiting)
+        return any(transaction.lane is Lane.STOP for transaction in self.waiting)
 
     def failing(self) -> set[int]:
         return self.mute
 
-    def answered(self, turn: Turn) -> None:
-        self.story.append(f"answered {turn.exchange.node}")
+    def answered(self, transaction: Transaction) -> None:
+        self.story.append(f"answered {transaction.exchange.node}")
 
-    def missed(self, turn: Turn, now_s: float) -> None:
-        self.story.append(f"missed {turn.exchange.node}")
+    def missed(self, transaction: Transaction, now_s: float) -> None:
+        self.story.append(f"missed {transaction.exchange.node}")
 
-    def again(self, turn: Turn) -> None:
-        assert isinstance(turn, RecordingTurn)
-        self.waiting.appendleft(turn)
+    def again(self, transaction: Transaction) -> None:
+        assert isinstance(transaction, RecordingTransaction)
+        self.waiting.appendleft(transaction)
 
     def line_lost(self, reason: str) -> None:
         self.story.append(f"line lost: {reason}")
@@ -118,16 +118,16 @@ class Bench:
         reply_bytes: int = toy.REPLY_BYTES,
         response_s: float = toy.RESPONSE_S,
         repeatable: bool = True,
-        laborious: bool = False,
-    ) -> RecordingTurn:
+        slow_to_deliver: bool = False,
+    ) -> RecordingTransaction:
         """Queue an exchange of that number."""
         exchange = toy.exchange(number, reply_bytes=reply_bytes, response_s=response_s, repeatable=repeatable)
-        turn = RecordingTurn(exchange, self.users.story, lane)
-        turn.then_baud, turn.at_baud = then_baud, at_baud
-        turn.laborious = laborious
-        self.users.waiting.append(turn)
+        transaction = RecordingTransaction(exchange, self.users.story, lane)
+        transaction.then_baud, transaction.at_baud = then_baud, at_baud
+        transaction.slow_to_deliver = slow_to_deliver
+        self.users.waiting.append(transaction)
         self.line.kick()
-        return turn
+        return transaction
 
     @property
     def story(self) -> list[str]:

@@ -99,7 +99,7 @@ def test_what_was_prepared_for_a_turn_that_has_passed_is_not_asked():
 
 
 def test_the_poll_of_an_axis_counts_as_much_work():
-    assert poller({POSITION: 1.0}).laborious
+    assert poller({POSITION: 1.0}).slow_to_deliver
 
 
 def test_the_deadline_of_a_poll_is_when_the_next_one_is_due():

@@ -166,7 +166,7 @@ async def test_a_babbling_line_does_not_hold_back_a_stop():
     assert stop.at_s - asked_s == pytest.approx(len(toy.FLUSH) * BYTE_S + toy.RESYNC.settle_s)
 
 
-async def test_a_stop_that_nobody_waits_for_any_more_opens_no_gap_in_the_fence():
+async def test_a_stop_that_nobody_waits_for_any_more_opens_no_gap_in_the_quarantine():
     rig = Rig()
 
     async with running(rig) as callers:

@@ -123,7 +123,7 @@ async def test_half_a_line_that_falls_mute_costs_the_other_half_little_and_is_ba
     await polled(rig, [greedy, *mute], 30.0, switch_on)
 
     settled = [at_s for poller in mute for at_s in poller.asked_at_s if 15.0 <= at_s < 30.0]
-    lost_s = 0.0152  # of one poll that nobody answers, fence included
+    lost_s = 0.0152  # of one poll that nobody answers, resynchronisation included
     assert len(settled) * lost_s / 15.0 < 0.05
     first_s = [next(at_s for at_s in poller.asked_at_s if at_s >= found_s[0]) for poller in mute]
     assert min(first_s) < found_s[0] + LONGEST_BACKOFF_S
@@ -211,12 +211,12 @@ async def test_the_first_caller_after_a_poll_waits_for_that_poll_only():
     assert took_s < 2 * exchange_s + 1e-6
 
 
-@pytest.mark.parametrize("laborious", [True, False])
-async def test_only_a_poller_with_much_to_do_has_the_next_request_leave_first(monkeypatch, *, laborious: bool):
+@pytest.mark.parametrize("slow_to_deliver", [True, False])
+async def test_only_a_poller_with_much_to_do_has_the_next_request_leave_first(monkeypatch, *, slow_to_deliver: bool):
     rig = Rig()
     pollers = [ToyPoller(1, 0.0001), ToyPoller(2, 0.0001)]
     for poller in pollers:
-        poller.laborious = laborious
+        poller.slow_to_deliver = slow_to_deliver
     pushed_with: list[int] = []
 
     def delivered() -> int:
@@ -230,4 +230,4 @@ async def test_only_a_poller_with_much_to_do_has_the_next_request_leave_first(mo
 
     assert delivered() > 10
     # once for each reply, before it is delivered
-    assert pushed_with == (list(range(delivered())) if laborious else [])
+    assert pushed_with == (list(range(delivered())) if slow_to_deliver else [])

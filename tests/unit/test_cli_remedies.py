@@ -60,7 +60,7 @@ def test_steps_travel_with_an_error_and_are_said_by_each_face():
     received = rebuild_error(error_reply(LeaseHeld("axis x is controlled by ada", axis="x", remedy=remedy)))
 
     assert received.remedy == "wait until it is released, or acquire it with force"
-    assert received.remedy.told(lambda each: typed(each, "x")) == (
+    assert received.remedy.phrased(lambda each: typed(each, "x")) == (
         "wait until it is released, or ldcnd lease hold --axis x --force -- COMMAND"
     )
     assert typed(step("power", on=True), "x") == "ldcnd axis power x on"

@@ -55,7 +55,7 @@ def test_a_register_is_unknown_while_it_is_being_written():
     book = RegisterBook(LS_182AP)
     book.reset()
 
-    book.doubt(["kp"])
+    book.invalidate(["kp"])
     assert (book.value("kp"), book.written("kp")) == (None, False)
 
     book.wrote({"kp": 350})
@@ -66,7 +66,7 @@ def test_a_register_that_the_device_lacks_is_on_no_record():
     book = RegisterBook(LS_182AP)
 
     book.wrote({"cl": 5})
-    book.doubt(["cl"])
+    book.invalidate(["cl"])
 
     assert "cl" not in {register.name for register in book.all()}
     assert (book.value("cl"), book.written("cl")) == (None, False)

@@ -6,7 +6,7 @@ from ldcnd.bus.line import Phase
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support import toy_family as toy
-from tests.support.line_bench import MARGIN_S, REPLY_S, REQUEST_S, Bench, RecordingTurn, settle
+from tests.support.line_bench import MARGIN_S, REPLY_S, REQUEST_S, Bench, RecordingTransaction, settle
 from tests.support.scripted_line import Say
 
 
@@ -125,7 +125,7 @@ async def test_an_early_foreign_reply_does_not_spoil_the_right_one():
     assert bench.story == ["completed 1"]
 
 
-async def test_a_rejected_packet_is_sent_again_at_once_without_a_fence():
+async def test_a_rejected_packet_is_sent_again_at_once_without_a_quarantine():
     bench = Bench()
     bench.replies({1: [Say(toy.reply(1, kind=toy.REJECTED))]})
 
@@ -154,7 +154,7 @@ async def test_a_reply_may_tell_its_own_length():
     bench.wire.bytewise = True
     bench.replies({1: [Say(toy.reply(1))]})
 
-    bench.users.waiting.append(RecordingTurn(own_length, bench.users.story))
+    bench.users.waiting.append(RecordingTransaction(own_length, bench.users.story))
     bench.line.kick()
     await settle()
 
@@ -216,7 +216,7 @@ async def test_an_exchange_at_another_rate_leaves_the_line_at_its_own():
     assert bench.story == ["completed 1", "completed 2"]
 
 
-async def test_the_fence_of_an_exchange_at_another_rate_is_at_the_lines_own():
+async def test_the_quarantine_of_an_exchange_at_another_rate_is_at_the_lines_own():
     bench = Bench()
     bench.replies({1: []})
 
@@ -405,7 +405,7 @@ async def test_stray_bytes_are_seen_on_a_line_that_has_come_to_rest():
 
     bench.wire.say(b"\xf0")
 
-    assert bench.line.phase is Phase.FENCE
+    assert bench.line.phase is Phase.QUARANTINE
     assert bench.statistics.stray_bytes == 1
     assert [record.event for record in bench.log.records()][-2:] == [WireEvent.STRAY, WireEvent.RESYNC]
 
@@ -416,7 +416,7 @@ async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_
     bench.wire.push = lambda: story.append("push")  # type: ignore[method-assign]
 
     bench.add(1)
-    second = bench.add(2, laborious=True)
+    second = bench.add(2, slow_to_deliver=True)
     second.completed = lambda _reply, _timing: story.append("completed 2")  # type: ignore[method-assign]
     bench.add(3)
     await settle()
@@ -430,7 +430,7 @@ async def test_behind_much_work_the_line_is_woken_for_the_byte_before_the_last_o
     bench = Bench()
     bench.wire.bytewise = bench.wire.holds_back = True
 
-    bench.add(1, laborious=True)
+    bench.add(1, slow_to_deliver=True)
     bench.add(2)
     assert bench.wire.expected == toy.REPLY_BYTES  # nothing is done meanwhile
     await settle(reply_over_s + byte_s / 2)

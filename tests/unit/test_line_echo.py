@@ -2,7 +2,7 @@ import pytest
 
 from ldcnd.exchange import Exchange
 from tests.support import toy_family as toy
-from tests.support.line_bench import REQUEST_S, Bench, RecordingTurn, settle
+from tests.support.line_bench import REQUEST_S, Bench, RecordingTransaction, settle
 from tests.support.scripted_line import Say
 
 
@@ -14,7 +14,7 @@ async def test_our_own_bytes_are_taken_off_by_count(*, bytewise: bool):
     same = Exchange(1, twin, len(twin), toy.check, len, 0.001, repeatable=True)
     bench.replies({1: [Say(twin)]})
 
-    bench.users.waiting.append(RecordingTurn(same, bench.users.story))
+    bench.users.waiting.append(RecordingTransaction(same, bench.users.story))
     bench.line.kick()
     bench.add(2)
     await settle()

@@ -210,8 +210,8 @@ def test_who_was_chosen_ahead_goes_next(order):
     first, second = poller(1, NORMAL, 5.0), poller(2, NORMAL, 6.0)
     queue = queued(order, first, second)
 
-    assert queue.look_ahead(1.001) is first
-    assert queue.look_ahead(1.001) is None  # it is chosen already
+    assert queue.choose_ahead(1.001) is first
+    assert queue.choose_ahead(1.001) is None  # it is chosen already
     assert queue.next_due_s() == first.due_at_s
 
     assert nodes(queue, 1.001, 2) == [1, 2]
@@ -223,7 +223,7 @@ def test_nobody_is_chosen_ahead_who_is_not_due_yet(order):
     queue = PollQueue(CHOOSERS[order])
     queue.schedule(poller(1, NORMAL, 5.0), 1.0015)
 
-    assert queue.look_ahead(1.001) is None
+    assert queue.choose_ahead(1.001) is None
     assert nodes(queue, 1.0015, 1) == [1]
 
 
@@ -232,7 +232,7 @@ def test_who_will_be_due_by_then_can_be_chosen_ahead(order):
     queue = PollQueue(CHOOSERS[order])
     queue.schedule(poller(1, NORMAL, 5.0), 1.0005)
 
-    assert queue.look_ahead(1.001)
+    assert queue.choose_ahead(1.001)
     assert nodes(queue, 1.0004, 1) == [1]  # the line is free a little sooner than expected
 
 
@@ -240,7 +240,7 @@ def test_who_will_be_due_by_then_can_be_chosen_ahead(order):
 @pytest.mark.parametrize(("deadline_s", "taken"), [(4.9, [2, 1]), (5.1, [1, 2])])
 def test_only_an_earlier_deadline_overtakes_who_was_chosen_ahead(order, deadline_s, taken):
     queue = queued(order, poller(1, NORMAL, 5.0))
-    queue.look_ahead(1.001)
+    queue.choose_ahead(1.001)
     queue.schedule(poller(2, NORMAL, deadline_s), 1.0015)
 
     assert nodes(queue, 1.0015, 2) == taken
@@ -250,7 +250,7 @@ def test_only_an_earlier_deadline_overtakes_who_was_chosen_ahead(order, deadline
 def test_who_was_chosen_ahead_can_be_forgotten(order):
     first, second = poller(1, NORMAL, 5.0), poller(2, NORMAL, 6.0)
     queue = queued(order, first, second)
-    queue.look_ahead(1.001)
+    queue.choose_ahead(1.001)
 
     queue.unschedule(first)
 
@@ -262,7 +262,7 @@ def test_who_was_chosen_ahead_can_be_forgotten(order):
 def test_another_turn_replaces_the_one_that_was_chosen_ahead(order):
     first, second = poller(1, NORMAL, 5.0), poller(2, NORMAL, 6.0)
     queue = queued(order, first, second)
-    queue.look_ahead(1.001)
+    queue.choose_ahead(1.001)
 
     queue.schedule(first, 2.0)
 
@@ -291,7 +291,7 @@ def test_to_choose_ahead_changes_nothing_for_the_earliest_deadline(seed):
                 each.deadline_at_s = each.due_at_s + periods[each.node]
                 queue.schedule(each, each.due_at_s)
             if ahead:
-                queue.look_ahead(now_s + 0.001)
+                queue.choose_ahead(now_s + 0.001)
             now_s += 0.001
         orders_taken.append(taken)
     assert orders_taken[0] == orders_taken[1]

@@ -168,7 +168,7 @@ async def test_watchdog_starves_while_a_line_has_lost_its_deadline(manager: Mana
             await asyncio.sleep(0.0001)
         line._watchdog.cancel()
         line.wire.write = lambda _data: ""  # type: ignore[method-assign]
-        line._turn = None  # whatever comes is a stray: the line waits for ever
+        line._transaction = None  # whatever comes is a stray: the line waits for ever
         await asyncio.sleep(1)
         manager.heard()
 
@@ -176,13 +176,13 @@ async def test_watchdog_starves_while_a_line_has_lost_its_deadline(manager: Mana
     assert not any("WATCHDOG=1" in message for message in messages)
 
 
-async def test_status_says_which_bus_does_not_turn(manager: Manager):
+async def test_status_says_which_bus_has_missed_its_deadline(manager: Manager):
     async with service_of(manager) as (_, daemon, _client):
         await daemon.wait_up()
         bus = daemon.rig.buses[0].bus
-        bus.turning = lambda _now_s: False  # type: ignore[method-assign]
+        bus.on_time = lambda _now_s: False  # type: ignore[method-assign]
 
-        assert (await manager.listen(4))[-1].endswith("bus line0 does not turn")
+        assert (await manager.listen(4))[-1].endswith("bus line0 has missed its deadline")
 
 
 async def test_port_that_is_not_there_is_told_and_does_not_starve_the_watchdog(manager: Manager):

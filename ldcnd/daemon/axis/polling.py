@@ -44,7 +44,7 @@ class AxisPoller(Poller[AxisReading]):
         rates_hz: poll rate of each item.
     """
 
-    laborious = True
+    slow_to_deliver = True
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Triggers captures: a fault of a drive, a line that went down, a line that does not turn.
+"""Triggers captures: a fault of a drive, a line that went down, a line that acts too late.
 
 It checks a few times a second and never delays a packet. The capture is made a moment after its cause,
 so that it shows what came of it, and never sooner than `PAUSE_S` after the one before: a loose contact fills no disk.
@@ -72,5 +72,5 @@ def _causes(line: BusService, now_s: float) -> Iterator[str]:
             yield f"{axis.config.name} {fault.code}"
     if line.bus.statistics.losses:
         yield f"line down {line.bus.statistics.losses}"
-    if not line.bus.turning(now_s):
-        yield "line does not turn"
+    if not line.bus.on_time(now_s):
+        yield "line acts too late"

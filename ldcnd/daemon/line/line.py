@@ -231,7 +231,7 @@ class BusService:
                 if axis.config.name in heard:
                     self._poll(axis, now_s)
             if not heard:
-                pause_s = min((now_s - began_s + self.bus.fence_s) / LOOK_SHARE, LONGEST_LOOK_S)
+                pause_s = min((now_s - began_s + self.bus.quarantine_s) / LOOK_SHARE, LONGEST_LOOK_S)
 
     async def _probe_stop_lane(self, period_s: float) -> None:
         """Keep measuring how long a stop would wait."""

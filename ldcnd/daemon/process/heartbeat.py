@@ -124,7 +124,7 @@ class Heartbeat:
             return f"{name}: {trouble.text}"
         if now_s - since_s > silence_s:
             return f"{name}: no reply for more than {silence_s:g} s"
-        if not line.bus.turning(now_s):
+        if not line.bus.on_time(now_s):
             return f"{name}: the line does not keep to its plan"
         for axis in line.axes:
             for trouble in axis_troubles(axis.tracker):

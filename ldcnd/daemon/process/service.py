@@ -204,7 +204,7 @@ class Service:
         told = self._status()
         await self._assure(systemd.READY, systemd.status(told))
         while True:
-            messages = [systemd.WATCHDOG] if self._turning() else []
+            messages = [systemd.WATCHDOG] if self._lines_on_time() else []
             if (now := self._status()) != told:
                 messages.append(systemd.status(now))
                 told = now
@@ -218,18 +218,18 @@ class Service:
                 return
             await asyncio.sleep(TRY_PERIOD_S)
 
-    def _turning(self) -> bool:
+    def _lines_on_time(self) -> bool:
         now_s = asyncio.get_running_loop().time()
-        stuck = tuple(bus.bus.settings.name for bus in self._daemon.rig.buses if not bus.bus.turning(now_s))
+        stuck = tuple(bus.bus.settings.name for bus in self._daemon.rig.buses if not bus.bus.on_time(now_s))
         if stuck and stuck != self._stuck:
-            log.error("not turning", buses=stuck, watchdog_s=self._notifier.watchdog_s)
+            log.error("a line has missed its deadline", buses=stuck, watchdog_s=self._notifier.watchdog_s)
         self._stuck = stuck
         return not stuck
 
     def _status(self) -> str:
         if self._ending:
             return "stopping: axes come to rest"
-        stuck = [f"bus {name} does not turn" for name in self._stuck]
+        stuck = [f"bus {name} has missed its deadline" for name in self._stuck]
         return "; ".join(filter(None, [describe(self._daemon.rig), *stuck, self._remark]))
 
     # -- reloading ---------------------------------------------------------------------------------------------------

@@ -226,10 +226,10 @@ class RegisterBook:
 
     def assume(self, values: Mapping[str, int]) -> None:
         """The drive was taken over as it is: these values are assumed to be written, nothing else is known."""
-        self.doubt(self._registers)
+        self.invalidate(self._registers)
         self._set(values, Provenance.ASSUMED)
 
-    def doubt(self, names: Iterable[str]) -> None:
+    def invalidate(self, names: Iterable[str]) -> None:
         """Something is about to change these registers, or may have."""
         for name in names:
             if name in self._registers:

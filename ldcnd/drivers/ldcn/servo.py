@@ -371,7 +371,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
         if self.switched_off:
             mode = StopMode.OFF
-        self._book.doubt(("velocity",))
+        self._book.invalidate(("velocity",))
         off = mode is StopMode.OFF
         self._switching_off += off
         try:
@@ -470,7 +470,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             )
         await self.about_to_renumber()
         self.state.setting_back = before
-        self._book.doubt(("position",))  # the target that was loaded last means another place
+        self._book.invalidate(("position",))  # the target that was loaded last means another place
         with contextlib.suppress(OutcomeUnknown):
             await self._bus.execute(commands.reset_position(self._node))
         self.state.reading(await self._bus.execute(commands.read_status(self._node, STATE_ITEMS)))
@@ -549,7 +549,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         self._loaded = trajectory
         exchange = commands.load_trajectory(self._node, trajectory)
         values = trajectory_values(trajectory)
-        self._book.doubt(values)
+        self._book.invalidate(values)
         await self._bus.execute(exchange)
         self._book.wrote(values)
 
@@ -722,7 +722,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
     async def set_gains(self, gains: driver.Gains) -> None:
         exchange = commands.set_gain(self._node, Gains(**asdict(gains)))
         values = gain_values(gains)
-        self._book.doubt(values)
+        self._book.invalidate(values)
         await self._bus.execute(exchange)
         self._book.wrote(values)
         self._gains = gains
@@ -733,7 +733,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         known = self._book.value(LIMIT_PINS)
         pins = with_modes(INPUTS if known is None else LimitPins(known), limit1, limit2)
         exchange = commands.io_control(self._node, pins)
-        self._book.doubt((LIMIT_PINS,))
+        self._book.invalidate((LIMIT_PINS,))
         await self._bus.execute(exchange)
         self._book.wrote({LIMIT_PINS: pins})
 

@@ -12,8 +12,8 @@ from tests.support.bus_rig import SETTINGS, Rig, outcome, running
 from tests.support.toy_family import ToyPoller
 
 
-def turning(bus: Bus) -> bool:
-    return bus.turning(asyncio.get_running_loop().time())
+def on_time(bus: Bus) -> bool:
+    return bus.on_time(asyncio.get_running_loop().time())
 
 
 async def test_idle_line_turns():
@@ -22,7 +22,7 @@ async def test_idle_line_turns():
     async with running(rig):
         await asyncio.sleep(3600)
 
-        assert turning(rig.bus)
+        assert on_time(rig.bus)
 
 
 async def test_line_with_rare_polls_turns_all_the_time():
@@ -33,7 +33,7 @@ async def test_line_with_rare_polls_turns_all_the_time():
         for _ in range(600):
             await asyncio.sleep(0.5)
 
-            assert turning(rig.bus)
+            assert on_time(rig.bus)
 
 
 async def test_mute_drives_do_not_stop_a_bus():
@@ -44,7 +44,7 @@ async def test_mute_drives_do_not_stop_a_bus():
         for _ in range(1000):
             await asyncio.sleep(0.01)
 
-            assert turning(rig.bus)
+            assert on_time(rig.bus)
 
 
 async def test_long_wait_for_a_reply_is_part_of_the_plan():
@@ -54,7 +54,7 @@ async def test_long_wait_for_a_reply_is_part_of_the_plan():
         callers.create_task(outcome(rig.bus.execute(toy.exchange(1, response_s=30.0, repeatable=False))), name="slow")
         await asyncio.sleep(20)
 
-        assert turning(rig.bus)
+        assert on_time(rig.bus)
 
 
 async def test_line_that_waits_without_a_deadline_does_not_turn():
@@ -68,7 +68,7 @@ async def test_line_that_waits_without_a_deadline_does_not_turn():
         assert line.phase is Phase.REPLY
         line._watchdog.cancel()
 
-        assert not turning(rig.bus)
+        assert not on_time(rig.bus)
         call.cancel()
 
 
@@ -79,10 +79,10 @@ async def test_line_that_lets_a_poll_pass_does_not_turn():
         now_s = asyncio.get_running_loop().time()
         rig.bus._queue.schedule(ToyPoller(1, 1.0, now_s), now_s)  # and nobody told the line
 
-        assert turning(rig.bus)
+        assert on_time(rig.bus)
         await asyncio.sleep(LATE_S + 0.1)
 
-        assert not turning(rig.bus)
+        assert not on_time(rig.bus)
 
 
 async def test_line_that_rests_while_a_stop_waits_does_not_turn():
@@ -95,7 +95,7 @@ async def test_line_that_rests_while_a_stop_waits_does_not_turn():
         stop = callers.create_task(outcome(rig.bus.execute(toy.exchange(1), Lane.STOP)), name="stop")
         await asyncio.sleep(0)
 
-        assert not turning(rig.bus)
+        assert not on_time(rig.bus)
         stop.cancel()
 
 
@@ -109,7 +109,7 @@ async def test_port_that_never_opens_is_tried_again_and_again():
         for _ in range(1000):
             await asyncio.sleep(1)
 
-            assert turning(bus)
+            assert on_time(bus)
         owner.cancel()
 
 
@@ -122,9 +122,9 @@ async def test_opening_that_hangs_does_not_turn():
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name="bus")
         await asyncio.sleep(LONGEST_OPENING_S)
-        assert turning(bus)
+        assert on_time(bus)
 
         await asyncio.sleep(LONGEST_REOPEN_S + 0.1)
 
-        assert not turning(bus)
+        assert not on_time(bus)
         owner.cancel()

@@ -2,7 +2,7 @@ import pytest
 
 from ldcnd.bus.line import Phase
 from ldcnd.bus.queue import Lane
-from ldcnd.bus.resync import LONGEST_FENCE, Resync
+from ldcnd.bus.resync import LONGEST_QUARANTINE, Resync
 from tests.support import toy_family as toy
 from tests.support.line_bench import BYTE_S, FENCE_S, MARGIN_S, REPLY_S, REQUEST_S, Bench, settle
 from tests.support.scripted_line import Say
@@ -18,7 +18,7 @@ BAD_REPLIES = {
 
 
 @pytest.mark.parametrize("says", BAD_REPLIES.values(), ids=BAD_REPLIES.keys())
-async def test_a_reply_that_cannot_be_trusted_loses_the_turn_and_fences_the_line(says: list[Say]):
+async def test_a_reply_that_cannot_be_trusted_loses_the_turn_and_puts_the_line_in_quarantine(says: list[Say]):
     bench = Bench()
     bench.replies({1: says})
 
@@ -38,7 +38,7 @@ async def test_a_reply_that_cannot_be_trusted_loses_the_turn_and_fences_the_line
     assert bench.statistics.resynchronisations == 1
 
 
-async def test_the_fence_is_quiet_flush_settle_probe():
+async def test_the_quarantine_is_quiet_flush_settle_probe():
     bench = Bench()
     bench.replies({1: []})
 
@@ -91,7 +91,7 @@ async def test_a_doubled_reply_is_credited_to_nobody():
     assert bench.story == ["completed 1", "lost 2", "completed 3"]
 
 
-async def test_stray_bytes_on_an_idle_line_fence_it():
+async def test_stray_bytes_on_an_idle_line_quarantine_it():
     bench = Bench()
 
     bench.wire.say(b"\x55")
@@ -103,7 +103,7 @@ async def test_stray_bytes_on_an_idle_line_fence_it():
     assert bench.sent(1)[0] > FENCE_S
 
 
-async def test_bytes_in_the_fence_make_it_wait_for_silence():
+async def test_bytes_in_the_quarantine_make_it_wait_for_silence():
     bench = Bench()
 
     bench.wire.say(b"\x55")
@@ -124,10 +124,10 @@ async def test_a_line_that_is_never_silent_is_flushed_all_the_same():
         await settle(0.001)
 
     assert bench.wire.packets()[0] == toy.FLUSH
-    assert bench.wire.writes[0].at_s <= LONGEST_FENCE * toy.RESYNC.quiet_s + 0.001
+    assert bench.wire.writes[0].at_s <= LONGEST_QUARANTINE * toy.RESYNC.quiet_s + 0.001
 
 
-async def test_a_stop_shortens_the_fence_to_flush_and_settle():
+async def test_a_stop_shortens_the_quarantine_to_flush_and_settle():
     bench = Bench()
     bench.wire.say(b"\x55")
     await settle(0.001)

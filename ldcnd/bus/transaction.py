@@ -18,7 +18,7 @@ AT_ONCE = tuple(f"{lane}{AT_ONCE_REMARK}" for lane in LANES)
 """The same for packets that waited for the reply before them."""
 
 
-class Turn(ABC):
+class Transaction(ABC):
     """One exchange on its way over the wire; exactly one of the outcomes is reported for each time it is sent.
 
     Attributes:
@@ -27,10 +27,10 @@ class Turn(ABC):
         wanted_at_s: when it was queued or due, in loop time.
         then_baud: the rate to use from the end of this exchange on; None for the present one.
         at_baud: the rate of this exchange alone; None for the line's.
-        laborious: processing the reply takes long.
+        slow_to_deliver: processing the reply takes long.
     """
 
-    __slots__ = ("at_baud", "exchange", "laborious", "lane", "then_baud", "wanted_at_s")
+    __slots__ = ("at_baud", "exchange", "lane", "slow_to_deliver", "then_baud", "wanted_at_s")
     proves = False
     """Whether the line judges the content of the reply itself."""
 
@@ -40,7 +40,7 @@ class Turn(ABC):
         self.wanted_at_s = wanted_at_s
         self.then_baud: int | None = None
         self.at_baud: int | None = None
-        self.laborious = False
+        self.slow_to_deliver = False
 
     @abstractmethod
     def completed(self, reply: bytes, timing: Timing) -> None:
@@ -55,7 +55,7 @@ class Turn(ABC):
         """Note that the node did not execute the packet; return whether to send it again."""
 
 
-class PollTurn(Turn):
+class PollTransaction(Transaction):
     """A poll; it is never sent again, because the next poll comes soon enough."""
 
     __slots__ = ("order", "poller")
@@ -65,7 +65,7 @@ class PollTurn(Turn):
     ) -> None:
         self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
         self.then_baud = self.at_baud = None
-        self.laborious = poller.laborious
+        self.slow_to_deliver = poller.slow_to_deliver
         self.poller = poller
         self.order = order
 
@@ -91,7 +91,7 @@ class PollTurn(Turn):
         return False
 
 
-class Job(Turn):
+class Job(Transaction):
     """An exchange that a caller waits for; its future gets exactly one outcome, `timing` says when that was."""
 
     __slots__ = ("attempts", "attempts_left", "condition", "future", "timing")
