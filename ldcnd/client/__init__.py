@@ -1,1 +1,5 @@
-"""Typed access to a running daemon; contains the contract, not the machine."""
+"""The Python client: typed access to a running daemon.
+
+For programs, through `ldcnd.connect`; gateways, the console and the command line stand on it too. Start with `rig`,
+then `axis`; below them is `rig_client`, which asks and decodes.
+"""

@@ -1,1 +1,5 @@
-"""Keys, encodings and sessions: the road between the daemon and its clients."""
+"""Keys, encodings and sessions between the daemon and its clients.
+
+Serves both sides. Start with `session`, the contract; `zenoh_session` and `memory_session` fulfil it, `keys` and
+`codec` say what is on it.
+"""

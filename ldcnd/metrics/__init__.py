@@ -1,1 +1,4 @@
-"""Health of a rig as Prometheus metrics."""
+"""Health of a rig as Prometheus metrics.
+
+For those who monitor many rigs, through `ldcnd metrics`. Start with `exposition`.
+"""

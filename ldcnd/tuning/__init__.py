@@ -1,1 +1,4 @@
-"""Gains for an axis, computed from its traces; one package per family, pure functions without I/O."""
+"""Gains for an axis, computed from its traces; one package per family.
+
+For those who tune an axis. Start with `ldcn`: a model of the plant, and gains for it.
+"""

@@ -1,4 +1,4 @@
 """The family of LDCN and NMC drives as a whole: configuration, plan, examination; its protocol is in drivers/ldcn.
 
-Start at `family.py`.
+Serves the daemon and the tools through `FAMILIES`. Start with `family.py`.
 """

@@ -1,4 +1,4 @@
 """The family of SmartSteps as a whole: configuration, plan, tools; its protocol is in drivers/smartstep.
 
-Start at `family.py`.
+Serves the daemon and the tools through `FAMILIES`. Start with `family.py`.
 """
