@@ -12,7 +12,8 @@ from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import WrongState
 from ldcnd.model.commands import MoveVelocity, Power
-from ldcnd.model.rig_commands import Acquire, Rehearse
+from ldcnd.model.leases import Acquire
+from ldcnd.model.rig_commands import Rehearse
 from ldcnd.model.samples import AxisState, StateSample, TelemetryItem
 
 RUN_UP_S = 0.5

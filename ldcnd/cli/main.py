@@ -1,12 +1,12 @@
 """The entry point: finds the subcommand's module only when it is called, so that help and completion stay quick."""
 
-import importlib
 import os
 import sys
 from typing import NoReturn
 
 import click
 
+from ldcnd.cli.lazy_group import LazyGroup
 from ldcnd.cli.output import DONE, EXIT_CODES, exit_code
 from ldcnd.errors import LdcndError
 
@@ -20,8 +20,8 @@ COMMANDS = {
     "reset": ("ldcnd.cli.rig:reset", "Clear stop latches and faults of all axes."),
     "power": ("ldcnd.cli.rig:power", "Close or open the position loops of all axes."),
     "axis": ("ldcnd.cli.axis", "List, watch, move, stop and home axes of a running daemon."),
-    "group": ("ldcnd.cli.rig:group", "Move several axes together."),
-    "lease": ("ldcnd.cli.rig:lease", "See who controls which axis; hold control."),
+    "group": ("ldcnd.cli.group", "Move several axes together."),
+    "lease": ("ldcnd.cli.lease", "See who controls which axis; hold control."),
     "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
     "why": ("ldcnd.cli.why", "Tell why an axis cannot move, and what would clear that."),
     "fleet": ("ldcnd.cli.fleet", "Show every rig, axis, version and health that can be reached."),
@@ -29,7 +29,7 @@ COMMANDS = {
     "events": ("ldcnd.cli.events", "Show who moved what, when, with which result."),
     "drill": ("ldcnd.cli.drill", "Rehearse the loss of a client, a line or the daemon."),
     "bus": ("ldcnd.cli.bus", "Show the lines of a running daemon."),
-    "speed": ("ldcnd.cli.rig:speed", "Show or set the speed override of the rig."),
+    "speed": ("ldcnd.cli.speed", "Show or set the speed override of the rig."),
     "console": ("ldcnd.cli.console", "Show rigs in a browser."),
     "metrics": ("ldcnd.cli.metrics", "Serve the health of a running daemon to Prometheus."),
     "record": ("ldcnd.cli.record", "Record a rig to MCAP; recover and convert recordings."),
@@ -46,25 +46,10 @@ COMMANDS = {
 }
 
 
-class LazyGroup(click.Group):
-    """A group whose commands are imported when they are used."""
+class Program(LazyGroup):
+    """All commands; its help names them without importing them."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """Return the names in the order of the table."""
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        """Import the command's module and return its `command`."""
-        if cmd_name not in COMMANDS:
-            return None
-        module_name, _, name = COMMANDS[cmd_name][0].partition(":")
-        module = importlib.import_module(module_name)
-        command = getattr(module, name or "command")
-        if not isinstance(command, click.Command):
-            raise TypeError(f"{module.__name__}.command is not a command")
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
         """List the commands without importing them."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
@@ -78,7 +63,12 @@ Exit codes:
 {"".join(f"{code:4}  {meaning}{chr(10)}" for code, meaning in EXIT_CODES.items())}"""
 
 
-@click.group(cls=LazyGroup, help=HELP, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=Program,
+    homes={name: home for name, (home, _) in COMMANDS.items()},
+    help=HELP,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(package_name="ldcnd")
 def cli() -> None:
     """Find a command."""

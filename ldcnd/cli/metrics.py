@@ -7,6 +7,7 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.cli.typed import address_option
+from ldcnd.client.health import health_reports
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
@@ -37,7 +38,7 @@ async def _serve(client: RigClient, address: ListenAddress) -> None:
     ending = asyncio.Event()
     on_end(ending.set)
     try:
-        async with client.health(collector.take), metrics_server(registry, address.host, address.port) as port:
+        async with health_reports(client, collector.take), metrics_server(registry, address.host, address.port) as port:
             click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
             await ending.wait()
     except OSError as error:

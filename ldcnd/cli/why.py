@@ -9,7 +9,7 @@ from ldcnd.cli.output import typed
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.messaging.codec import remedy_of
-from ldcnd.model.commands import WhyReply
+from ldcnd.model.commands import Why, WhyReply
 
 
 @click.command()
@@ -20,7 +20,7 @@ def command(target: Target, axis: str) -> None:
 
     async def work(client: RigClient) -> WhyReply:
         await axis_of(client, axis)
-        return await client.why(axis)
+        return await client.ask(Why(), axis)
 
     reply = target.run(work)
     lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]

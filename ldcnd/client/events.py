@@ -10,6 +10,9 @@ from contextlib import asynccontextmanager
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import OutcomeUnknown, SessionError
+from ldcnd.messaging.codec import decode_received
+from ldcnd.messaging.keys import EVENT
+from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.events import CommandEvent, EventList, ReadEvents
 
 LOOK_PERIOD_S = 2.0
@@ -115,8 +118,16 @@ async def follow_events(client: RigClient, axis: str | None = None, *, history: 
     page = await client.ask(request)
     at = page if history else page.model_copy(update={"first_number": page.end_number})
     events = Events(client, axis, at)
-    async with client.command_events(events.take):
+
+    def take(sample: Sample) -> None:
+        if sample.kind is SampleKind.PUT:
+            events.take(decode_received(CommandEvent, sample.payload, sample.encoding))
+
+    declaration = await client.session.subscribe(client.keys.telemetry_pattern("*", EVENT), take)
+    try:
         yield events
+    finally:
+        await declaration.close()
 
 
 async def latest_events(client: RigClient, count: int, axis: str | None = None) -> list[CommandEvent]:

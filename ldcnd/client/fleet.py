@@ -3,6 +3,7 @@
 import asyncio
 
 from ldcnd.client import presence
+from ldcnd.client.health import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.messaging.session import Session
@@ -96,8 +97,8 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
             axes = await client.axes()
             states = await client.states()
             faults = await client.faults()
-            health = await client.last_health()
-            buses = tuple(sorted(await client.last_bus_health(), key=lambda bus: bus.bus))
+            health = await last_health(client)
+            buses = tuple(sorted(await last_bus_health(client), key=lambda bus: bus.bus))
     except LdcndError as error:
         return view.model_copy(update={"problems": (f"stopped answering: {error.message}",)})
     freshness = {axis.axis: axis for bus in buses for axis in bus.axes}

@@ -18,16 +18,14 @@ from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.commands import StopReply
 from ldcnd.model.events import CommandOutcome, ReadOutcome
+from ldcnd.model.leases import Acquire, HolderList, ListHolders
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.model.rig_commands import (
-    Acquire,
     AxisMove,
     AxisPath,
-    HolderList,
     IoReply,
     IoTimer,
     LinePath,
-    ListHolders,
     MoveTogether,
     PreviewTogether,
     PreviewTogetherReply,

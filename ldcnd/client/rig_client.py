@@ -8,24 +8,11 @@ from typing import TypeVar
 
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.messaging.keys import ALL_DAEMONS, EVENT, RIG_ITSELF, Keys
+from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Answer, Declaration, Sample, SampleKind, Session
-from ldcnd.model.commands import (
-    LONGEST_NAME,
-    AxisCommand,
-    Command,
-    Preview,
-    PreviewReply,
-    Stop,
-    StopReply,
-    Why,
-    WhyReply,
-)
-from ldcnd.model.events import CommandEvent
+from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
-from ldcnd.model.plan import RigBudget
+from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.model.samples import (
     FaultSample,
     LinkState,
@@ -37,7 +24,6 @@ from ldcnd.model.samples import (
     sample_model,
 )
 from ldcnd.model.samples import Sample as Measurement
-from ldcnd.model.traces import TraceChunk, TraceHeader
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -92,13 +78,23 @@ class Samples:
 
 
 class RigClient:
-    """Queries and commands one rig over an open session."""
+    """Queries and commands one rig over an open session.
+
+    Attributes:
+        rig: its name.
+        session: the session.
+        keys: the keys of the rig.
+    """
 
     def __init__(self, session: Session, rig: str) -> None:
         self.rig = rig
-        self._session = session
-        self._keys = Keys(rig)
+        self.session = session
+        self.keys = Keys(rig)
         self._instance: str | None = None
+
+    async def read(self, key: str, model: type[ModelT]) -> list[ModelT]:
+        """Return the values of the keys of the rig that match `key`."""
+        return [self._decoded(answer, model) for answer in await self.session.query(key)]
 
     async def daemon(self) -> DaemonInfo:
         """Return what the daemon says about itself.
@@ -106,78 +102,47 @@ class RigClient:
         Raises:
             SessionError: no daemon serves this rig.
         """
-        return self._one(await self._session.query(self._keys.daemon), DaemonInfo)
+        return self._one(await self.session.query(self.keys.daemon), DaemonInfo)
 
     async def axes(self) -> list[AxisInfo]:
         """Return all axes, in the order of their addresses."""
-        answers = await self._session.query(self._keys.axis_pattern)
-        axes = [self._decoded(answer, AxisInfo) for answer in answers]
-        return sorted(axes, key=lambda axis: (axis.bus, axis.address))
+        return sorted(await self.read(self.keys.axis_pattern, AxisInfo), key=lambda axis: (axis.bus, axis.address))
 
     async def buses(self) -> list[BusInfo]:
         """Return all lines."""
-        return [self._decoded(answer, BusInfo) for answer in await self._session.query(self._keys.bus_pattern)]
+        return await self.read(self.keys.bus_pattern, BusInfo)
 
     async def descriptions(self) -> dict[str, bytes]:
         """Return all that describes the rig, as JSON, by what follows `meta/` in its key; schemas are left out."""
         found: dict[str, bytes] = {}
-        for pattern in self._keys.description_patterns:
-            for answer in await self._session.query(pattern):
+        for pattern in self.keys.description_patterns:
+            for answer in await self.session.query(pattern):
                 if answer.is_error:
                     raise decode_error(answer.payload, answer.encoding)
-                if answer.key != self._keys.health:
+                if answer.key != self.keys.health:
                     found[answer.key.partition("/meta/")[2]] = answer.payload
         return found
-
-    async def line_plan(self) -> RigBudget | None:
-        """Return what the lines promise, or None when the daemon does not say."""
-        answers = await self._session.query(self._keys.budget)
-        return self._decoded(answers[0], RigBudget) if answers else None
-
-    async def command_list(self) -> CommandList | None:
-        """Return all commands and error codes, or None when the daemon does not say."""
-        answers = await self._session.query(self._keys.commands)
-        return self._decoded(answers[0], CommandList) if answers else None
 
     async def last(self, axis: str, item: str) -> Measurement | None:
         """Return the last value of an item, or None when there is none (yet)."""
         model = sample_model(item)
-        answers = await self._session.query(self._keys.telemetry_pattern(axis, item)) if model else []
+        answers = await self.session.query(self.keys.telemetry_pattern(axis, item)) if model else []
         return self._decoded(answers[0], model) if model and answers else None
 
     async def monitors(self, axis: str) -> dict[MonitorName, MonitorSample]:
         """Return the last value of every monitor that an axis publishes."""
-        answers = await self._session.query(self._keys.monitor(axis, "*"))
+        answers = await self.session.query(self.keys.monitor(axis, "*"))
         return {MonitorName(answer.key.rpartition("/")[2]): self._decoded(answer, MonitorSample) for answer in answers}
-
-    async def trace_header(self, axis: str) -> TraceHeader | None:
-        """Return how far an axis's last trace is, or None when there was none."""
-        answers = await self._session.query(self._keys.trace(axis))
-        return self._decoded(answers[0], TraceHeader) if answers else None
-
-    async def trace_chunk(self, axis: str, index: int) -> TraceChunk | None:
-        """Return samples of an axis's last trace, or None when it has no such chunk."""
-        answers = await self._session.query(self._keys.trace_chunk(axis, index))
-        return self._decoded(answers[0], TraceChunk) if answers else None
-
-    async def last_health(self) -> DaemonHealth | None:
-        """Return the daemon's last report about itself, or None when there is none yet."""
-        answers = await self._session.query(self._keys.health)
-        return self._decoded(answers[-1], DaemonHealth) if answers else None
-
-    async def last_bus_health(self) -> list[BusHealth]:
-        """Return the last report about each line and its axes."""
-        return [self._decoded(answer, BusHealth) for answer in await self._session.query(self._keys.bus_health("*"))]
 
     async def states(self) -> dict[str, StateSample]:
         """Return the last state of every axis that has one."""
-        answers = await self._session.query(self._keys.telemetry_pattern("*", TelemetryItem.STATE))
-        return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, StateSample) for answer in answers}
+        answers = await self.session.query(self.keys.telemetry_pattern("*", TelemetryItem.STATE))
+        return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, StateSample) for answer in answers}
 
     async def faults(self) -> dict[str, FaultSample]:
         """Return what is wrong with every axis that has published enough to tell."""
-        answers = await self._session.query(self._keys.telemetry_pattern("*", TelemetryItem.FAULT))
-        return {self._keys.parse_telemetry(answer.key).axis: self._decoded(answer, FaultSample) for answer in answers}
+        answers = await self.session.query(self.keys.telemetry_pattern("*", TelemetryItem.FAULT))
+        return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, FaultSample) for answer in answers}
 
     async def state(self, axis: str) -> StateSample | None:
         """Return the axis's last state, or None when there is none yet."""
@@ -215,19 +180,11 @@ class RigClient:
         """
         return await self._answer(axis, command, timeout_s)
 
-    async def why(self, axis: str, question: Why | None = None) -> WhyReply:
-        """Query why a motion of an axis would be refused now, and what would clear that."""
-        return await self.ask(question or Why(), axis)
-
-    async def preview(self, axis: str, question: Preview) -> PreviewReply:
-        """Preview a motion; no effect."""
-        return await self.ask(question, axis)
-
     async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
         payload, encoding = encode(command, Encoding.MSGPACK)
-        key = self._keys.command(axis, command.verb)
+        key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s
-        answers = await self._session.query(key, payload, encoding=encoding, timeout_s=longest_s)
+        answers = await self.session.query(key, payload, encoding=encoding, timeout_s=longest_s)
         if not answers:
             whose = "" if axis == RIG_ITSELF else f"axis {axis}: "
             raise await self._unanswered(f"{whose}{command.verb}")
@@ -237,8 +194,8 @@ class RigClient:
         """Stop one axis, or the whole rig; the events tell the first 64 characters of `client` as who it was."""
         request = Stop(client=client[:LONGEST_NAME] if client else None)
         payload, encoding = encode(request, Encoding.MSGPACK)
-        answers = await self._session.query(
-            self._keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True
+        answers = await self.session.query(
+            self.keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True
         )
         return self._one(answers, StopReply)
 
@@ -252,8 +209,8 @@ class RigClient:
         self, axis: str, item: str, take: Callable[[Sample], None], linger_s: float = 0.0
     ) -> AsyncIterator[None]:
         """Hand one item of an axis to `take`, encoded as it came, for the time of the context."""
-        key = self._keys.telemetry_pattern(axis, item)
-        declaration = await self._session.subscribe(key, take, KEPT_SAMPLES, linger_s=linger_s)
+        key = self.keys.telemetry_pattern(axis, item)
+        declaration = await self.session.subscribe(key, take, KEPT_SAMPLES, linger_s=linger_s)
         try:
             yield
         finally:
@@ -263,23 +220,9 @@ class RigClient:
     async def samples(self, axis: str = "*", item: str = "*") -> AsyncIterator[Samples]:
         """Subscribe to telemetry for the time of the context."""
         samples = Samples()
-        declaration = await self._session.subscribe(self._keys.telemetry_pattern(axis, item), samples.take)
+        declaration = await self.session.subscribe(self.keys.telemetry_pattern(axis, item), samples.take)
         try:
             yield samples
-        finally:
-            await declaration.close()
-
-    @asynccontextmanager
-    async def command_events(self, take: Callable[[CommandEvent], None]) -> AsyncIterator[None]:
-        """Hand every event to `take` for the time of the context; `follow_events` misses none."""
-
-        def decode(sample: Sample) -> None:
-            if sample.kind is SampleKind.PUT:
-                take(decode_received(CommandEvent, sample.payload, sample.encoding))
-
-        declaration = await self._session.subscribe(self._keys.telemetry_pattern("*", EVENT), decode)
-        try:
-            yield
         finally:
             await declaration.close()
 
@@ -296,8 +239,8 @@ class RigClient:
         """
         async with AsyncExitStack() as declared:
             declarations: list[Declaration] = []
-            for key in (self._keys.all_telemetry, f"{self._keys.health}/**"):
-                declaration = await self._session.subscribe(key, take, kept, linger_s=linger_s)
+            for key in (self.keys.all_telemetry, f"{self.keys.health}/**"):
+                declaration = await self.session.subscribe(key, take, kept, linger_s=linger_s)
                 declared.push_async_callback(declaration.close)
                 declarations.append(declaration)
             yield lambda: sum(declaration.load.lost for declaration in declarations)
@@ -305,34 +248,16 @@ class RigClient:
     async def last_published(self) -> list[Sample]:
         """Return the last value of every telemetry and health key, in msgpack; no samples of traces."""
         keys = (
-            self._keys.telemetry_pattern("*", "*"),
-            self._keys.telemetry_pattern("*", "monitor") + "/*",
-            f"{self._keys.health}/**",
+            self.keys.telemetry_pattern("*", "*"),
+            self.keys.telemetry_pattern("*", "monitor") + "/*",
+            f"{self.keys.health}/**",
         )
-        answers = [a for key in keys for a in await self._session.query(key, parameters={"enc": "msgpack"})]
+        answers = [a for key in keys for a in await self.session.query(key, parameters={"enc": "msgpack"})]
         return [
             Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns)
             for answer in answers
             if not answer.is_error
         ]
-
-    @asynccontextmanager
-    async def health(self, take: Callable[[DaemonHealth | BusHealth], None]) -> AsyncIterator[None]:
-        """Hand every health report to `take` for the time of the context."""
-
-        def decode(sample: Sample) -> None:
-            if sample.kind is SampleKind.DELETE:
-                return
-            if sample.key == self._keys.health:
-                take(decode_received(DaemonHealth, sample.payload, sample.encoding))
-            else:
-                take(decode_received(BusHealth, sample.payload, sample.encoding))
-
-        declaration = await self._session.subscribe(f"{self._keys.health}/**", decode)
-        try:
-            yield
-        finally:
-            await declaration.close()
 
     async def wait_for_end(self, axis: str, command_id: str) -> StateSample:
         """Wait until a command is not the axis's current one any more, and return the state after it.

@@ -41,6 +41,18 @@ class Trace:
         return panes(span, seconds, zip(titles, self.values, strict=True))
 
 
+async def trace_header(client: RigClient, axis: str) -> TraceHeader | None:
+    """Return how far an axis's last trace is, or None when there was none."""
+    headers = await client.read(client.keys.trace(axis), TraceHeader)
+    return headers[0] if headers else None
+
+
+async def trace_chunk(client: RigClient, axis: str, index: int) -> TraceChunk | None:
+    """Return samples of an axis's last trace, or None when it has no such chunk."""
+    chunks = await client.read(client.keys.trace_chunk(axis, index), TraceChunk)
+    return chunks[0] if chunks else None
+
+
 async def take_trace(client: RigClient, axis: str, request: TakeTrace, within_s: float) -> Trace:
     """Arm a trace, wait for its end, and return it; when cancelled meanwhile, end it.
 
@@ -83,7 +95,7 @@ async def armed_trace(client: RigClient, axis: str, request: TakeTrace) -> Async
 
 async def _end(client: RigClient, axis: str, trace_id: str) -> None:
     """End a trace, unless it has ended or given way to another one."""
-    header = await client.trace_header(axis)
+    header = await trace_header(client, axis)
     if header and header.trace_id == trace_id and header.phase in UNDER_WAY:
         await client.command(axis, AbortTrace(), ENDING_S)
 
@@ -141,7 +153,7 @@ async def fetch_trace(client: RigClient, axis: str, trace_id: str | None = None)
 
 
 async def _header(client: RigClient, axis: str, trace_id: str | None) -> TraceHeader:
-    header = await client.trace_header(axis)
+    header = await trace_header(client, axis)
     if header is None:
         raise WrongState(f"axis {axis}: there is no trace", axis=axis)
     if trace_id not in (None, header.trace_id):
@@ -150,7 +162,7 @@ async def _header(client: RigClient, axis: str, trace_id: str | None) -> TraceHe
 
 
 async def _chunk(client: RigClient, axis: str, trace_id: str, index: int) -> TraceChunk:
-    chunk = await client.trace_chunk(axis, index)
+    chunk = await trace_chunk(client, axis, index)
     if chunk is None or chunk.trace_id != trace_id:
         raise _replaced(axis, trace_id)
     return chunk

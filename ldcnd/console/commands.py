@@ -20,17 +20,8 @@ from ldcnd.messaging.codec import Encoding, decode, error_reply
 from ldcnd.model.catalogue import BY_VERB
 from ldcnd.model.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.rig_commands import (
-    Acquire,
-    AxisMove,
-    MoveTogether,
-    Release,
-    Renew,
-    SetIo,
-    SetIoTimer,
-    SetSpeedOverride,
-    WalkPath,
-)
+from ldcnd.model.leases import Acquire, Release, Renew
+from ldcnd.model.rig_commands import AxisMove, MoveTogether, SetIo, SetIoTimer, SetSpeedOverride, WalkPath
 
 STOP_TIME_S = 3.0
 LEASE_COMMANDS: frozenset[type[Command[Frozen]]] = frozenset({Acquire, Renew, Release})

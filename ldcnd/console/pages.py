@@ -32,7 +32,8 @@ from ldcnd.log import get_logger
 from ldcnd.messaging.codec import error_reply
 from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.rig_commands import Acquire, MoveTogether, MoveTogetherReply
+from ldcnd.model.leases import Acquire
+from ldcnd.model.rig_commands import MoveTogether, MoveTogetherReply
 from ldcnd.model.samples import Moving
 
 log = get_logger("console")

@@ -8,6 +8,8 @@ from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import RigReply
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.log import get_logger
+from ldcnd.model.meta import CommandList
+from ldcnd.model.plan import RigBudget
 
 log = get_logger("console")
 
@@ -115,8 +117,8 @@ class RigWatch:
                     "daemon": await client.daemon(),
                     "axes": tuple(await client.axes()),
                     "buses": tuple(await client.buses()),
-                    "plan": await client.line_plan(),
-                    "commands": await client.command_list(),
+                    "plan": next(iter(await client.read(client.keys.budget, RigBudget)), None),
+                    "commands": next(iter(await client.read(client.keys.commands, CommandList)), None),
                 }
         except TimeoutError:
             raise OutcomeUnknown(f"rig {client.rig} takes too long to describe itself") from None

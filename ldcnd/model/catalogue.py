@@ -8,9 +8,9 @@ from ldcnd.model.commands import About, AxisCommand, Capability, Command, Comman
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen, schema_name
 from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.model.leases import LeaseRequest
 from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.model.plan import RigBudget
-from ldcnd.model.rig_commands import LeaseRequest
 from ldcnd.model.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.model.traces import TraceChunk, TraceHeader
 

@@ -4,7 +4,7 @@ import asyncio
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError
-from ldcnd.model.rig_commands import ListHolders
+from ldcnd.model.leases import ListHolders
 from ldcnd.top.rig_view import RigView, described
 
 LOOK_S = 1.0

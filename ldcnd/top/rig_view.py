@@ -12,8 +12,8 @@ from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, LaneHealth
+from ldcnd.model.leases import HolderList
 from ldcnd.model.meta import AxisInfo, DaemonInfo
-from ldcnd.model.rig_commands import HolderList
 from ldcnd.model.samples import (
     AdcSample,
     FaultSample,

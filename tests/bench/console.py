@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 
+from ldcnd.client.health import health_reports
 from ldcnd.model.health import BusHealth
 from tests.bench.processes import LINE_CPU, SUBJECT_CPU, free_endpoint, process
 from tests.bench.report import Row
@@ -124,7 +125,7 @@ async def _measured(
     empty, full, hung = [], [], []
     async with client(endpoint) as rig:
         take = bench.reports.append
-        async with rig.health(lambda report: take(report) if isinstance(report, BusHealth) else None):
+        async with health_reports(rig, lambda report: take(report) if isinstance(report, BusHealth) else None):
             for _ in range(rounds):
                 empty.append(await bench.window())
                 full.append(await bench.window(*[page] * PAGES))

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from ldcnd.model.commands import SetPosition
-from ldcnd.model.rig_commands import ListHolders
+from ldcnd.model.leases import ListHolders
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from ldcnd.model.rig_commands import ListHolders
+from ldcnd.model.leases import ListHolders
 from tests.browser.house import Desk, open_browser
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

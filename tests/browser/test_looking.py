@@ -7,7 +7,7 @@ import re
 import pytest
 
 from ldcnd.cli.parameter_file import load_parameters
-from ldcnd.client.traces import fetch_trace
+from ldcnd.client.traces import fetch_trace, trace_header
 from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
@@ -57,7 +57,7 @@ async def test_a_trace_is_recorded_drawn_and_saved(house):
         await desk.button("Record").click()
         await expect(desk.panel("Captures").get_by_text("60 samples in")).to_be_visible()
 
-        header = await house.sim.rig.trace_header("x")
+        header = await trace_header(house.sim.rig, "x")
         assert (header.phase, header.samples) == (TracePhase.COMPLETE, 60)
         await desk.page.wait_for_function(DRAWN, arg=[1, "--curve-2"])  # the velocity has the second pane for itself
 

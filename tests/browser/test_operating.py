@@ -5,8 +5,8 @@ import re
 import pytest
 
 from ldcnd.model.commands import MoveVelocity, Power
+from ldcnd.model.leases import Acquire, ListHolders
 from ldcnd.model.parameters import ReadParameter
-from ldcnd.model.rig_commands import Acquire, ListHolders
 from ldcnd.model.samples import TelemetryItem
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

@@ -10,7 +10,7 @@ import pytest
 
 from ldcnd.epics.gateway import WHO
 from ldcnd.model.commands import Power
-from ldcnd.model.rig_commands import ListHolders
+from ldcnd.model.leases import ListHolders
 from ldcnd.model.samples import Moving
 from tests.edges.epics_clients import CLIENTS
 from tests.support.process import ROOT, client, daemon, free_port, process

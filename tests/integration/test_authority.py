@@ -20,9 +20,9 @@ from ldcnd.errors import (
     StaleSequence,
     UnknownAxis,
 )
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb, Why
 from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
-from ldcnd.model.rig_commands import SHORTEST_LEASE_S, Acquire, ListHolders
+from ldcnd.model.leases import SHORTEST_LEASE_S, Acquire, ListHolders
 from ldcnd.model.samples import AxisState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
@@ -273,7 +273,7 @@ async def test_why_lists_everything_that_is_in_the_way():
         await rig.until("x", lambda state: state.link == "up")
         await rig.client.stop("x")
 
-        reply = await rig.client.why("x")
+        reply = await rig.client.ask(Why(), "x")
 
         assert not reply.can_move
         assert [cause.code for cause in reply.causes] == ["lease_required", "stop_latched", "wrong_state"]
@@ -289,7 +289,7 @@ async def test_nothing_is_in_the_way_of_an_axis_that_is_ready():
         await powered(rig)
         await asyncio.sleep(0.2)
 
-        assert (await rig.client.why("x")).can_move
+        assert (await rig.client.ask(Why(), "x")).can_move
 
 
 async def test_an_error_under_a_lease_is_raised_as_itself():

@@ -13,7 +13,7 @@ from bluesky.utils import FailedStatus, RunEngineInterrupted
 from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
 from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, UnknownAxis, WrongState
 from ldcnd.model.events import ReadEvents
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import AxisState, Moving
 from tests.support.bluesky_engine import Laboratory, laboratory
 

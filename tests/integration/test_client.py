@@ -24,7 +24,7 @@ from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedReque
 from ldcnd.model.catalogue import COMMANDS
 from ldcnd.model.commands import About, Halt
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
 from tests.support.process import ROOT, daemon
 from tests.support.rig import RunningRig, running_rig

@@ -9,7 +9,7 @@ from ldcnd.client.lease import control
 from ldcnd.config.rig import load_config
 from ldcnd.errors import LeaseExpired
 from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import AxisState
 from tests.support.rig import SIMULATED, running_rig
 

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.model.rig_commands import Acquire, ListHolders
+from ldcnd.model.leases import Acquire, ListHolders
 from ldcnd.model.samples import AxisState, Moving
 from tests.support.console_rig import open_page, running_console
 

@@ -18,7 +18,7 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.model.events import ReadEvents
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import LinkState, Moving
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, shows

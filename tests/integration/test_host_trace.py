@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, wait_for_trace
+from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, trace_header, wait_for_trace
 from ldcnd.config.rig import load_config
 from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
 from ldcnd.model.commands import MoveAbsolute, Power
@@ -82,7 +82,7 @@ async def test_other_axes_keep_their_rates_while_one_is_traced_as_fast_as_possib
         reply = await arm_trace(rig.client, "x", TakeTrace(channels=("position",), samples=10_000))
 
         gaps = {axis: await gaps_s(rig, axis) for axis in ("y", "z")}
-        header = await rig.client.trace_header("x")
+        header = await trace_header(rig.client, "x")
 
     assert (header.trace_id, header.phase) == (reply.trace_id, TracePhase.RECORDING)
     for axis, period_s in (("y", 0.05), ("z", 0.1)):
@@ -113,7 +113,7 @@ async def test_trace_tells_when_a_trigger_counts():
         await arm_trace(rig.client, "x", request)
         async with asyncio.timeout(10):
             while TracePhase.WAITING not in phases:
-                phases.append((await rig.client.trace_header("x")).phase)
+                phases.append((await trace_header(rig.client, "x")).phase)
                 await asyncio.sleep(0.02)
         filled_s = asyncio.get_running_loop().time() - armed_at
 
@@ -128,7 +128,7 @@ async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_t
 
         with pytest.raises(DriveFault, match="the trigger did not come within 2 s"):
             await take_trace(rig.client, "x", request, within_s=60)
-        header = await rig.client.trace_header("x")
+        header = await trace_header(rig.client, "x")
         before = rig.daemon.rig.buses[0].bus.statistics.exchanges
         await asyncio.sleep(1)
         polled = rig.daemon.rig.buses[0].bus.statistics.exchanges - before
@@ -146,7 +146,7 @@ async def test_second_trace_is_refused_until_the_first_is_aborted():
         with pytest.raises(BusyTracing, match=first.trace_id):
             await arm_trace(rig.client, "x", request)
         aborted = await rig.client.command("x", AbortTrace())
-        header = await rig.client.trace_header("x")
+        header = await trace_header(rig.client, "x")
         again = await arm_trace(rig.client, "x", request)
         await rig.client.command("x", AbortTrace())
         with pytest.raises(WrongState, match="no trace is under way"):
@@ -171,7 +171,7 @@ async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
 
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(wait(), 3)
-        header = await rig.client.trace_header("x")
+        header = await trace_header(rig.client, "x")
 
     assert header.phase is (TracePhase.WAITING if replaced else TracePhase.ABORTED)
 
@@ -192,7 +192,7 @@ async def test_impossible_request_is_refused_with_the_reason(request_, reason):
 
         with pytest.raises(ValueOutOfRange, match=reason):
             await arm_trace(rig.client, "x", request_)
-        header = await rig.client.trace_header("x")
+        header = await trace_header(rig.client, "x")
 
     assert header is None
 
@@ -255,7 +255,7 @@ async def test_a_stop_on_the_traced_line_waits_for_the_poll_on_the_wire_only():
             await rig.client.stop("y")
             waits_s.append(loop.time() - began_s)
             await asyncio.sleep(0.0137)
-        header = await rig.client.trace_header("x")
+        header = await trace_header(rig.client, "x")
 
     assert header.phase is TracePhase.RECORDING
     assert max(waits_s) <= alone_s + longest_s + 0.001

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from ldcnd.config.rig import RigConfig
 from ldcnd.errors import LeaseHeld, StopLatched, ValueOutOfRange, WrongState
 from ldcnd.model.commands import MoveVelocity, Power, Stop
-from ldcnd.model.rig_commands import Acquire, IoReply, SetIo, SetIoTimer, Snapshot
+from ldcnd.model.leases import Acquire
+from ldcnd.model.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot
 from ldcnd.model.samples import IoSample, LinkState, TelemetryItem
 from ldcnd.planning.plan import plan_bus
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

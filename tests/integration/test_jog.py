@@ -8,7 +8,7 @@ import pytest
 from ldcnd.errors import LeaseExpired, LeaseHeld, PositionLimit, StopLatched, VelocityLimit
 from ldcnd.model.commands import Halt, Jog, MoveAbsolute, Stop
 from ldcnd.model.events import ReadEvents
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import AxisState, LinkState
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, dialect_rig
 

@@ -14,7 +14,8 @@ from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, StopLatched
 from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.rig_commands import Acquire, LeaseReply, Rehearsal, Rehearse
+from ldcnd.model.leases import Acquire, LeaseReply
+from ldcnd.model.rig_commands import Rehearsal, Rehearse
 from ldcnd.model.samples import AxisState, Moving
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive

@@ -8,6 +8,7 @@ from asyncio.subprocess import PIPE
 import pytest
 from prometheus_client import CollectorRegistry
 
+from ldcnd.client.health import health_reports
 from ldcnd.metrics.exposition import HealthCollector
 from tests.support.process import LDCND, ROOT, daemon
 from tests.support.rig import running_rig
@@ -19,7 +20,7 @@ async def test_a_daemon_s_reports_become_metrics():
         collector = HealthCollector("sim", asyncio.get_running_loop().time)
         registry.register(collector)
 
-        async with rig.client.health(collector.take):
+        async with health_reports(rig.client, collector.take):
             await asyncio.sleep(3.5)
 
         assert registry.get_sample_value("ldcnd_daemon_up", {"rig": "sim"}) == 1

@@ -11,7 +11,8 @@ import pytest
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import NotSupported, PositionLimit, ValueOutOfRange
 from ldcnd.model.commands import Halt, Power, Stop
-from ldcnd.model.rig_commands import Acquire, AxisPath, PathReply, Release, WalkPath
+from ldcnd.model.leases import Acquire, Release
+from ldcnd.model.rig_commands import AxisPath, PathReply, WalkPath
 from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

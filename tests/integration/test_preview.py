@@ -18,7 +18,7 @@ async def test_a_plan_is_what_the_move_then_is():
         await rig.until("x", lambda state: state.link == "up")
         await rig.client.command("x", Power(on=True))
 
-        plan = await rig.client.preview("x", Preview(position=12.3456, velocity=7.0))
+        plan = await rig.client.ask(Preview(position=12.3456, velocity=7.0), "x")
         before = len(sent(rig))
         move = await rig.client.command("x", MoveAbsolute(position=12.3456, velocity=7.0))
 
@@ -41,7 +41,7 @@ async def test_a_plan_sends_nothing():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
 
-        plan = await rig.client.preview("x", Preview(distance=1.0))
+        plan = await rig.client.ask(Preview(distance=1.0), "x")
 
         assert not set(plan.packets) & set(sent(rig))
         assert plan.obstacles == ("axis x is disabled",)
@@ -51,8 +51,8 @@ async def test_a_plan_that_cannot_be_names_the_nearest_that_can():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")
 
-        far = await rig.client.preview("x", Preview(position=500.0))
-        fast = await rig.client.preview("x", Preview(velocity=-60.0))
+        far = await rig.client.ask(Preview(position=500.0), "x")
+        fast = await rig.client.ask(Preview(velocity=-60.0), "x")
 
         assert (far.refusal.code, far.refusal.nearest) == ("position_limit", 100)
         assert (fast.refusal.code, fast.refusal.nearest) == ("velocity_limit", -50)
@@ -64,4 +64,4 @@ async def test_a_plan_says_which_motion_is_meant():
 
         for vague in (Preview(), Preview(position=1.0, distance=1.0)):
             with pytest.raises(MalformedRequest):
-                await rig.client.preview("x", vague)
+                await rig.client.ask(vague, "x")

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.client.traces import arm_trace, fetch_trace, take_trace, wait_for_trace
+from ldcnd.client.traces import arm_trace, fetch_trace, take_trace, trace_header, wait_for_trace
 from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, StringChecksum, TraceWordLayout
 from ldcnd.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange, WrongState
 from ldcnd.messaging.codec import decode
@@ -200,10 +200,10 @@ async def test_second_unit_keeps_its_rate_while_a_trace_uploads():
         quiet = await gaps_s(rig, 20)
         reply = await arm_trace(rig.client, "feed", TakeTrace(channels=("speed_feedback", "inp")))
         await asyncio.sleep(1.0)
-        uploading = await rig.client.trace_header("feed")
+        uploading = await trace_header(rig.client, "feed")
 
         busy = await gaps_s(rig, 5)
-        still = await rig.client.trace_header("feed")
+        still = await trace_header(rig.client, "feed")
         end = await wait_for_trace(rig.client, "feed", reply.trace_id, 120)
 
     # a position is due every 2 s; one piece may be on the wire when it is its turn
@@ -237,7 +237,7 @@ async def test_stop_on_another_bus_is_not_delayed_by_an_upload():
         await asyncio.sleep(0.6)
 
         busy = await stop_times_s(rig, 100)
-        header = await rig.client.trace_header("feed")
+        header = await trace_header(rig.client, "feed")
 
     assert header.phase is TracePhase.UPLOADING
     assert max(busy) <= bound_s
@@ -256,7 +256,7 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
             await arm_trace(client, "feed", trace_request())
         aborted = await client.command("feed", AbortTrace(), 10)
         after = await client.command("feed", write)
-        header = await client.trace_header("feed")
+        header = await trace_header(client, "feed")
 
     assert (reply.written, after.written) == (True, True)
     assert (aborted.trace_id, header.phase, header.chunks) == ("test-1", TracePhase.ABORTED, 0)

@@ -7,7 +7,8 @@ import pytest
 from ldcnd.errors import LeaseHeld, WrongState
 from ldcnd.model.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, Preview, SetPwm, Track
 from ldcnd.model.events import ReadEvents
-from ldcnd.model.rig_commands import Acquire, SetSpeedOverride
+from ldcnd.model.leases import Acquire
+from ldcnd.model.rig_commands import SetSpeedOverride
 from ldcnd.model.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 

@@ -7,6 +7,7 @@ from asyncio.subprocess import PIPE
 import pytest
 
 from ldcnd.client.trace_file import load_trace
+from ldcnd.client.traces import trace_header
 from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon
@@ -28,12 +29,12 @@ async def test_ctrl_c_and_sigterm_end_the_trace_that_waits(number):
         words = ("trace", "take", "x", "-e", endpoint, "-c", "position", "--trigger", "position:rising:5")
         taking = await asyncio.create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE)
         async with asyncio.timeout(30):
-            while (header := await rig.trace_header("x")) is None or header.phase is not TracePhase.WAITING:
+            while (header := await trace_header(rig, "x")) is None or header.phase is not TracePhase.WAITING:
                 await asyncio.sleep(0.1)
             early = await ldcnd("trace", "last", "x", "-e", endpoint)
             taking.send_signal(number)
             await taking.communicate()
-        header = await rig.trace_header("x")
+        header = await trace_header(rig, "x")
 
     assert taking.returncode == 130
     assert early[0] == 1
@@ -54,7 +55,7 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
                 ldcnd("trace", "take", "x", "-e", endpoint, *channels, *trigger, "--out", str(file))
             )
             async with asyncio.timeout(30):
-                while (header := await rig.trace_header("x")) is None or header.phase is TracePhase.FILLING:
+                while (header := await trace_header(rig, "x")) is None or header.phase is TracePhase.FILLING:
                     await asyncio.sleep(0.1)
             await rig.command("x", MoveAbsolute(position=10.0))
         refused = await ldcnd("trace", "take", "x", "-e", endpoint, "-c", "torque")

@@ -19,7 +19,7 @@ from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, MoveRelative, MoveVelocity, Power, Reset
-from ldcnd.model.rig_commands import Acquire, Release, Renew
+from ldcnd.model.leases import Acquire, Release, Renew
 from ldcnd.model.samples import LinkState
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan

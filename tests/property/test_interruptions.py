@@ -47,7 +47,8 @@ from ldcnd.model.commands import (
     Why,
 )
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.rig_commands import Acquire, AxisMove, ListHolders, MoveTogether, Release, Renew
+from ldcnd.model.leases import Acquire, ListHolders, Release, Renew
+from ldcnd.model.rig_commands import AxisMove, MoveTogether
 from ldcnd.model.samples import StateSample
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.chain import Chain

@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
+from ldcnd.client.traces import trace_header
 from ldcnd.model.traces import TracePhase
 from tests.support.pages import Block, blocks_of
 from tests.support.process import END_TIME_S, START_TIME_S, answering, client, free_port
@@ -158,7 +159,7 @@ class PageReader:
     def _is_armed(self, axis: str) -> Callable[[Process], Awaitable[bool]]:
         async def armed(_process: Process) -> bool:
             async with client(self._endpoint) as rig:
-                header = await rig.trace_header(axis)
+                header = await trace_header(rig, axis)
             return header is not None and header.phase is TracePhase.WAITING
 
         return armed

@@ -35,17 +35,8 @@ from ldcnd.messaging.session import Query
 from ldcnd.model.catalogue import RENAMED
 from ldcnd.model.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
 from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
-from ldcnd.model.rig_commands import (
-    Acquire,
-    AxisMove,
-    LeaseReply,
-    ListHolders,
-    MoveTogether,
-    Rehearsal,
-    Rehearse,
-    Release,
-    Renew,
-)
+from ldcnd.model.leases import Acquire, LeaseReply, ListHolders, Release, Renew
+from ldcnd.model.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse
 from ldcnd.model.samples import AxisState
 from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, raising
 

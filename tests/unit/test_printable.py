@@ -11,7 +11,7 @@ from ldcnd.errors import LdcndError, MalformedRequest, UnknownAxis
 from ldcnd.messaging.codec import Encoding, decode, decode_received, encode
 from ldcnd.model.commands import Halt
 from ldcnd.model.events import CommandEvent, CommandStatus
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.printable import is_printable, printable
 
 ATTACKS = (

@@ -47,15 +47,11 @@ from ldcnd.model.commands import (
 )
 from ldcnd.model.events import CommandOutcome, CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.leases import Acquire, Holder, HolderList, LeaseReply, ListHolders, Release, Renew
 from ldcnd.model.rig_commands import (
-    Acquire,
     AxisShare,
     GroupMoves,
-    Holder,
-    HolderList,
-    LeaseReply,
     LinePath,
-    ListHolders,
     MoveTogether,
     MoveTogetherReply,
     PathReply,
@@ -63,8 +59,6 @@ from ldcnd.model.rig_commands import (
     PreviewTogetherReply,
     ReadWireLog,
     Rehearse,
-    Release,
-    Renew,
     SetIo,
     SetIoTimer,
     SetSpeedOverride,

@@ -18,7 +18,8 @@ from ldcnd.drivers.driver import StopMode
 from ldcnd.errors import ErrorCode, LdcndError, LeaseHeld
 from ldcnd.log import LogLimit, get_logger
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.rig_commands import SHORTEST_LEASE_S, Acquire, Rehearsal, RehearsalReply, Rehearse
+from ldcnd.model.leases import SHORTEST_LEASE_S, Acquire
+from ldcnd.model.rig_commands import Rehearsal, RehearsalReply, Rehearse
 from ldcnd.model.samples import Moving
 
 log = get_logger("loss")

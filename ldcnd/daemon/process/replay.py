@@ -22,7 +22,7 @@ from ldcnd.messaging.codec import Encoding, as_json
 from ldcnd.messaging.keys import RIG_ITSELF, Keys
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
 from ldcnd.messaging.session import Sample
-from ldcnd.model.rig_commands import Acquire
+from ldcnd.model.leases import Acquire
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.transport.port_url import SOCKET
 from ldcnd.wirelog.capture import Capture, CaptureHeader
