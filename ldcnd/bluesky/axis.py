@@ -20,6 +20,7 @@ from ldcnd.errors import (
     OutcomeUnknown,
     RequestRefused,
     SessionError,
+    StopLatched,
     WrongState,
 )
 from ldcnd.model.meta import AxisInfo
@@ -357,9 +358,9 @@ class Axis(ReadableAxis):
         async def moving() -> None:
             try:
                 await work()
-            except (CommandAborted, DriveFault) as error:
+            except (CommandAborted, DriveFault, RequestRefused) as error:
                 with suppress(LdcndError):  # why it ended matters more than what its standstill took
-                    await self._rest()
+                    await self._rest(is_news=isinstance(error, StopLatched))
                 if not (self._stopped and isinstance(error, CommandAborted)):
                     raise
             finally:
@@ -393,10 +394,13 @@ class Axis(ReadableAxis):
             await (await self._axis.halt()).done()
         await self._rest()
 
-    async def _rest(self) -> None:
-        """Wait until the axis stands."""
+    async def _rest(self, *, is_news: bool = False) -> None:
+        """Wait until the axis stands, as far as the daemon knows it; after a stop that is news, in a later state."""
+        known = self._axis.state.sample
         async with _within(SILENT_S, f"axis {self._info.axis}: it did not come to rest within {SILENT_S:g} s"):
-            while self._axis.state.moving is not Moving.NO:
+            while is_news and self._axis.state.sample is known:
+                await self._axis.news(None)
+            while self._axis.state.moving is not Moving.NO and self._axis.state.link is not LinkState.DOWN:
                 await self._axis.news(None)
 
     async def _check(self, target: float, velocity: float | None) -> None:

@@ -1,5 +1,6 @@
 """Plans of a real RunEngine on a whole daemon: what they record, and how they end when something goes wrong."""
 
+import asyncio
 import threading
 from contextlib import suppress
 
@@ -11,7 +12,7 @@ from bluesky.preprocessors import monitor_during_wrapper
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
 from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
-from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, UnknownAxis, WrongState
+from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, StopLatched, UnknownAxis, WrongState
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import AxisState, Moving
@@ -225,6 +226,23 @@ def test_a_stop_from_elsewhere_ends_the_run_as_failed(lab: Laboratory):
 
     assert latched
     assert lab.documents.exit_status == "fail"
+
+
+@pytest.mark.parametrize("later_s", [0.0, 0.001, 0.002, 0.0025])
+def test_a_move_that_a_stop_overtakes_ends_with_the_axis_at_rest(lab: Laboratory, later_s: float):
+    async def move_and_stop():
+        status = x.set(-20 if lab.truth("x") > 0 else 20)
+        await asyncio.sleep(later_s)
+        await lab.running.client.stop("x")
+        return status
+
+    with lab.powered("x") as (x,):
+        error = lab.loop.run(move_and_stop()).exception(20)
+        state = lab.loop.run(lab.running.client.state("x"))
+        x.reset().wait(20)
+
+    assert isinstance(error, StopLatched | CommandAborted)
+    assert (state.stop_latched, state.moving) == (True, Moving.NO)
 
 
 def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
