@@ -16,7 +16,7 @@ for name; do
     "$python" -m venv "$place"
     uv pip install --quiet --python "$place/bin/python" -c constraints.txt -e '.[test]'
     echo "$name: $("$place/bin/python" --version)"
-    "$place/bin/python" -m pytest -q -m "not soak and not edges and not guest and not real_time" ${PYTEST_ARGS:--n 2}
+    "$place/bin/python" -m pytest -q -m "not soak and not system and not edges and not guest and not real_time" ${PYTEST_ARGS:--n 2}
     tried=$((tried + 1))
 done
 [ "$tried" -gt 0 ]
