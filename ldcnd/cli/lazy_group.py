@@ -8,10 +8,10 @@ import click
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command when it is used.
+    """A group with commands that are imported when they are used.
 
     Args:
-        homes: the module of each command, and behind a colon its name there, which is `command` otherwise.
+        homes: the module of such a command, and behind a colon its name there, which is `command` otherwise.
         given: as `click.Group` takes it.
     """
 
@@ -19,14 +19,14 @@ class LazyGroup(click.Group):
         super().__init__(*given, **named)
         self._homes = homes
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """Return the names in the order of the table."""
-        return list(self._homes)
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands."""
+        return sorted([*super().list_commands(ctx), *self._homes])
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        """Import the command's module and return the command."""
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command, whose module may be imported for that."""
         if cmd_name not in self._homes:
-            return None
+            return super().get_command(ctx, cmd_name)
         module, _, name = self._homes[cmd_name].partition(":")
         command = getattr(import_module(module), name or "command")
         if not isinstance(command, click.Command):
