@@ -64,6 +64,12 @@ def show_lines(*lines: str, err: bool = False) -> None:
     print("\n".join(map(printable, lines)), file=sys.stderr if err else sys.stdout, flush=True)
 
 
+def show_passing(text: str) -> None:
+    """Show one line on a terminal that the next one replaces; nothing where there is no terminal."""
+    if sys.stderr.isatty():
+        print(f"\r{printable(text)}\x1b[K", end="", file=sys.stderr, flush=True)
+
+
 def exit_code(error: BaseException) -> int:
     """Say how a command has ended; return its exit code. An unexpected error is raised again."""
     match error:

@@ -11,7 +11,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.output import FAILED, show_lines
+from ldcnd.cli.output import FAILED, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, values_of
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient, Samples
@@ -147,13 +147,12 @@ async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> Sta
             return await client.wait_for_end(info.axis, reply.command_id)
         finally:
             showing.cancel()
-            if sys.stderr.isatty():
-                with suppress(OSError):
-                    print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            with suppress(OSError):
+                show_passing("")
 
 
 async def _show(info: AxisInfo, positions: Samples) -> None:
     if sys.stderr.isatty():
         async for _, sample in positions:
             if isinstance(sample, PositionSample):
-                print(f"\r{info.axis}: {number(sample.value, info)}\x1b[K", end="", file=sys.stderr, flush=True)
+                show_passing(f"{info.axis}: {number(sample.value, info)}")

@@ -9,6 +9,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
+from ldcnd.cli.output import show_passing
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
@@ -19,6 +20,7 @@ from ldcnd.model.traces import (
     AbortTrace,
     TakeTrace,
     TraceChannel,
+    TraceHeader,
     TraceReply,
     TraceTrigger,
     TriggerKind,
@@ -119,7 +121,8 @@ def take(
         async with armed_trace(client, axis, request) as reply:
             print(_granted(reply), file=sys.stderr)
             within_s = timeout + 2 * reply.interval_s * reply.samples + UPLOAD_S
-            await wait_for_trace(client, axis, reply.trace_id, within_s)
+            await wait_for_trace(client, axis, reply.trace_id, within_s, _show_phase)
+            show_passing("")
             return await fetch_trace(client, axis, reply.trace_id)
 
     end_as_interrupted()
@@ -171,6 +174,11 @@ def plot(file: Path, output: Path) -> None:
 def _granted(reply: TraceReply) -> str:
     pace = f"every {reply.interval_s * 1e3:g} ms" if reply.interval_s else "as fast as the line allows"
     return f"trace {reply.trace_id}: {reply.samples} samples by the {reply.source}, {pace}"
+
+
+def _show_phase(header: TraceHeader) -> None:
+    share = "" if header.uploaded is None else f" {header.uploaded:.0%}"
+    show_passing(f"{header.axis}: {header.phase}{share}")
 
 
 def _deliver(target: Target, trace: Trace, out: Path | None) -> None:

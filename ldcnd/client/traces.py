@@ -1,7 +1,7 @@
 """Taking a trace and fetching it whole."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
@@ -100,8 +100,10 @@ async def _end(client: RigClient, axis: str, trace_id: str) -> None:
         await client.command(axis, AbortTrace(), ENDING_S)
 
 
-async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: float) -> TraceHeader:
-    """Wait for the end of a trace, good or bad.
+async def wait_for_trace(
+    client: RigClient, axis: str, trace_id: str, within_s: float, told: Callable[[TraceHeader], None] = lambda _: None
+) -> TraceHeader:
+    """Wait for the end of a trace, good or bad; `told` is called with how far it is.
 
     Raises:
         OutcomeUnknown: it did not end in time, or gave way to another one.
@@ -112,6 +114,7 @@ async def wait_for_trace(client: RigClient, axis: str, trace_id: str, within_s: 
                 header = await _header(client, axis, trace_id)
                 if header.phase not in UNDER_WAY:
                     return header
+                told(header)
                 await asyncio.sleep(LOOK_S)
     except TimeoutError:
         raise OutcomeUnknown(

@@ -17,8 +17,8 @@ from ldcnd.model.traces import (
 
 SIGNAL_LEVEL = 0.5
 """Between the two values of a signal."""
-Progress = Callable[[TracePhase], None]
-"""Called with each new phase of a trace; does not wait."""
+Progress = Callable[[TracePhase, float | None], None]
+"""Called with each new phase of a trace, and while its memory is read with the share that has been; does not wait."""
 
 
 class TraceTimedOut(DriveFault):

@@ -149,6 +149,8 @@ class TraceHeader(Sample):
     """Who took the samples."""
     phase: TracePhase
     """How far it is."""
+    uploaded: float | None = Field(default=None, ge=0, le=1)
+    """Share of the drive's trace memory that has been read, 0 to 1, while it is uploading; null otherwise."""
     problem: str | None = None
     """Why it was not completed, or why its values are uncertain."""
     channels: tuple[TraceChannel, ...]

@@ -9,6 +9,7 @@ from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
 from ldcnd.errors import LeaseHeld
 from ldcnd.model.parameters import Memory, ReadAllParameters, ReadParameter, WriteParameter
 
+axe = pytest.importorskip("axe_playwright_python.async_playwright", reason="needs axe-playwright-python")
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
@@ -19,6 +20,7 @@ pytestmark = [
     pytest.mark.timeout(240),
 ]
 
+BROKEN_RULES = "async () => (await window.axe.run()).violations.map(({ id }) => id)"
 UPLOAD_MS = 120_000
 """Maximum time of a trace of 500 samples on a line that is polled at two thirds of what it carries, milliseconds."""
 FAULTS_OF_A_DRIVE = """async ({ reset }) => {
@@ -140,6 +142,12 @@ async def test_a_drive_is_tuned_by_its_parameters_and_its_recorder(house):
 
         await desk.page.get_by_label("Duration").fill("1")
         await desk.button("Record").click()
+
+        upload = desk.panel("Record").get_by_role("progressbar", name="Upload of the trace")
+        await expect(upload).to_be_visible(timeout=UPLOAD_MS)
+        await expect(desk.panel("Record")).to_contain_text(re.compile(r"uploading: \d+ samples of .*[1-9]\d? %"))
+        await desk.page.evaluate(axe.Axe().axe_script)
+        assert await desk.page.evaluate(BROKEN_RULES) == []
 
         row = desk.panel("Runs").get_by_role("row", name=re.compile("^1 "))
         await expect(row).to_contain_text("Pn102 47", timeout=UPLOAD_MS)

@@ -213,6 +213,8 @@ async def test_second_unit_keeps_its_rate_while_a_trace_uploads():
         TracePhase.UPLOADING,
         TracePhase.COMPLETE,
     )
+    assert 0 <= uploading.uploaded < still.uploaded < 1
+    assert end.uploaded is None
     assert max(busy) <= max(quiet) + piece_s
     assert sum(busy) <= 5 * 2.0 + max(quiet) - 2.0 + piece_s
 

@@ -170,7 +170,7 @@ async def right_or_marked(layout, order, checksum, count_unit, longest, gear, pu
     async with smartstep_line([unit], profile=SmartStepProfile(trace_chunk_bytes=1000)) as line:
         armed = await line.axis("u1").tracer.arm(TakeTrace(channels=channels, interval_s=0.004))
         try:
-            result = await armed.record(lambda _phase: None)
+            result = await armed.record(lambda _phase, _uploaded: None)
         except BadReply:
             return
         except ReplyTimeout:  # strings of another length than expected: only where the drive counts words

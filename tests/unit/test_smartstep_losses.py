@@ -28,7 +28,7 @@ def loses(step: int, losses: tuple[str, ...]):
 
 async def trace(axis, _unit):
     armed = await axis.tracer.arm(TakeTrace(channels=("speed_feedback",)))
-    recorded = await armed.record(lambda _phase: None)
+    recorded = await armed.record(lambda _phase, _uploaded: None)
     return list(recorded.raw[0])
 
 
@@ -49,7 +49,7 @@ async def triggered(axis, unit):
     armed = await axis.tracer.arm(request)
     unit.drive.set_run(asyncio.get_running_loop().time(), on=True)
     unit.drive.set_pulse_rate(8000.0, asyncio.get_running_loop().time())
-    recorded = await armed.record(lambda _phase: None)
+    recorded = await armed.record(lambda _phase, _uploaded: None)
     first = unit.drive.read(Register.TRGADR)
     return list(recorded.raw[0][-first:] + recorded.raw[0][:-first]) if first else list(recorded.raw[0])
 

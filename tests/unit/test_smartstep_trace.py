@@ -124,7 +124,7 @@ TRIGGERED = SmartStepProfile(trigger_map=BENCH_TRIGGER_MAP)
 NEVER = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=4000.0)
 
 
-def ignore(_phase):
+def ignore(_phase, _uploaded):
     pass
 
 

@@ -33,7 +33,7 @@ class FakeTrace(ArmedTrace):
     async def record(self, progress):
         if self.stubborn:
             await _heedless(self.outcome)
-        progress(TracePhase.UPLOADING)
+        progress(TracePhase.UPLOADING, 0.25)
         return await self.outcome
 
 

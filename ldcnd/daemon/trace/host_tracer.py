@@ -307,10 +307,10 @@ class ArmedCapture(ArmedTrace):
             async with self._limit(self._wait_s, "the trigger did not come"):
                 await capture.filled.wait()
                 if self.granted.phase is TracePhase.FILLING and not capture.triggered.is_set():
-                    progress(TracePhase.WAITING)
+                    progress(TracePhase.WAITING, None)
                 await capture.triggered.wait()
             if capture.trigger_index is not None:
-                progress(TracePhase.RECORDING)
+                progress(TracePhase.RECORDING, None)
             async with self._limit(self._limit_s, "the line did not bring the samples"):
                 await capture.done.wait()
         finally:

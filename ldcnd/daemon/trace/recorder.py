@@ -181,8 +181,8 @@ class TraceRecorder:
     async def _outcome(self, trace: _Trace) -> Recorded | LdcndError:
         trace.started.set()
 
-        def progress(phase: TracePhase) -> None:
-            self._publish(trace, trace.header.model_copy(update={"phase": phase}))
+        def progress(phase: TracePhase, uploaded: float | None) -> None:
+            self._publish(trace, trace.header.model_copy(update={"phase": phase, "uploaded": uploaded}))
 
         try:
             return await trace.armed.record(progress)
@@ -195,7 +195,7 @@ class TraceRecorder:
     def _over(self, trace: _Trace, phase: TracePhase, error: LdcndError | None) -> None:
         problem = error.message if error else None
         log.info("trace over", axis=self._axis, trace_id=trace.header.trace_id, phase=phase.value, reason=problem)
-        self._publish(trace, trace.header.model_copy(update={"phase": phase, "problem": problem}))
+        self._publish(trace, trace.header.model_copy(update={"phase": phase, "uploaded": None, "problem": problem}))
 
     async def _complete(self, trace: _Trace, recorded: Recorded) -> None:
         """Publish the samples, then the header that says that they are there."""
@@ -225,6 +225,7 @@ class TraceRecorder:
             "t_error_ns": t_error_ns,
             "quality": quality,
             "phase": TracePhase.COMPLETE,
+            "uploaded": None,
             "problem": "; ".join(recorded.problems) or None,
             "samples": len(recorded.offsets_ns),
             "trigger_index": recorded.trigger_index,

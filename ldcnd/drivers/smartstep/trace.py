@@ -16,6 +16,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 from typing_extensions import override
@@ -363,9 +364,9 @@ class ArmedSmartStep(ArmedTrace):
                 late_s = await self._start_by_host(progress)
             ended_at_s = await self._wait_until_done()
             self._require_complete(ended_at_s)
-            progress(TracePhase.UPLOADING)
+            progress(TracePhase.UPLOADING, 0.0)
             await require_settings(words, setup.settings, Lane.BACKGROUND)
-            memory = await self._memory()
+            memory = await self._memory(partial(progress, TracePhase.UPLOADING))
         except BaseException:
             await leave(words)
             await put_back(words, setup.originals)
@@ -403,7 +404,7 @@ class ArmedSmartStep(ArmedTrace):
             ) from None
         await require_idle(words)
         await self.start()
-        progress(TracePhase.RECORDING)
+        progress(TracePhase.RECORDING, None)
         return self._execution.replied_s + self._setup.interval_s - before_s
 
     # -- recording ---------------------------------------------------------------------------------------------------
@@ -491,14 +492,19 @@ class ArmedSmartStep(ArmedTrace):
 
     # -- the result --------------------------------------------------------------------------------------------------
 
-    async def _memory(self) -> TraceMemory:
+    async def _memory(self, read: Callable[[float], None]) -> TraceMemory:
         words, setup = self._words, self._setup
         address: int | None = None
         if setup.trigger:
             address = await words.ask(reference(words.unit, Register.TRGADR), Lane.BACKGROUND)
         first = 0 if address is None else ring_start(address, self.granted.pre_trigger)
         upload = TraceUpload(self._bus, words, self._profile)
-        rings = [await upload.fetch(memory + 1) for memory in range(setup.assignment.used)]
+        used = setup.assignment.used
+
+        def read_of(memory: int, share: float) -> None:
+            read((memory + share) / used)
+
+        rings = [await upload.fetch(memory + 1, partial(read_of, memory)) for memory in range(used)]
         return TraceMemory(tuple(rings), first, address, upload.string_checksum, setup.source)
 
     def _first_s(self, ended_at_s: float) -> tuple[float, float]:

@@ -9,6 +9,7 @@ Source: manual 2.2, data string reference command; 4, settings 9.
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from dataclasses import replace
 
 from ldcnd.bus.bus import Bus
@@ -23,6 +24,8 @@ from ldcnd.exchange import Exchange
 ROUNDS = 4
 """Maximum readings of a piece until two agree, and maximum time-outs of one reading."""
 
+TOLD_EACH = 0.01
+"""Least growth of the share that has been read before it is told again."""
 IDLE_LOOK_S = 0.005
 LONGEST_REST_S = 5.0
 """Maximum pause between two pieces on a line that is never idle, seconds; in it others send some 700 characters."""
@@ -44,17 +47,26 @@ class TraceUpload:
             return self._pin.pinned
         return self._profile.string_checksum
 
-    async def fetch(self, trace: int) -> tuple[int, ...]:
+    async def fetch(self, trace: int, read: Callable[[float], None] = lambda _: None) -> tuple[int, ...]:
         """Return the words of trace memory 1 or 2, in the order of the memory.
+
+        Args:
+            trace: 1 or 2.
+            read: called with the share of the memory that has been read, whenever that has grown by a percent.
 
         Raises:
             BadReply: the drive's strings are not as the profile says, or no two readings agree.
             DriveFault: the drive declined.
             BusError: the line failed.
         """
-        data = b""
-        for chunk in chunk_plan(trace, self._profile.trace_chunk_bytes):
+        data, told = b"", 0.0
+        chunks = chunk_plan(trace, self._profile.trace_chunk_bytes)
+        whole = sum(chunk.byte_count for chunk in chunks)
+        for chunk in chunks:
             data += await self._fetch(chunk)
+            if len(data) / whole >= told + TOLD_EACH:
+                told = len(data) / whole
+                read(told)
         return split_words(data, self._profile.trace_byte_order)
 
     async def _fetch(self, chunk: Chunk) -> bytes:

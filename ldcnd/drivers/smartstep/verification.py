@@ -128,7 +128,7 @@ async def _trace(tracer: SmartStepTracer, channels: tuple[str, ...]) -> StringCh
         DriveFault: no reading agrees with the monitors.
     """
     armed = await tracer.arm(TakeTrace(channels=channels, interval_s=INTERVAL_S))
-    recorded = await armed.record(lambda _phase: None)
+    recorded = await armed.record(lambda *_: None)
     if tracer.possible is None:
         raise DriveFault(f"no known layout of trace words agrees with the monitors: {'; '.join(recorded.problems)}")
     return StringChecksum(recorded.drive.string_checksum) if recorded.drive else StringChecksum.AUTO

@@ -4,6 +4,7 @@ import { html, useId, useMemo, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
 import { Action, Choice, Field, Panel, Reason, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
+import { TraceProgress } from "../parts/trace_progress.js";
 import { clock, dateAndClock, duration, words } from "../parts/format.js";
 import { axisPath } from "../session/api.js";
 import { capture, captures, discard, fetchLast, keep } from "../session/captures.js";
@@ -85,7 +86,7 @@ function TraceForm({ axis }) {
         obstacle=${under ? "A trace is under way." : null}>Fetch the last one<//>
     </p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
-    <p role="status">${axis.trace && `${words(axis.trace.phase)}: ${axis.trace.samples} samples of ${axis.trace.channels.map((each) => words(each.name)).join(", ")}${axis.trace.problem ? `; ${axis.trace.problem}` : ""}`}</p>
+    <${TraceProgress} trace=${axis.trace} />
   <//>`;
 }
 

@@ -5,6 +5,7 @@ import { ChartView } from "../parts/chart_view.js";
 import { Action, Choice, Field, Panel, Reason, Table, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
 import { decimalsOf, duration, number, percent } from "../parts/format.js";
+import { TraceProgress } from "../parts/trace_progress.js";
 import { look } from "../session/channels.js";
 import { useRigs } from "../session/rigs.js";
 import { obstacle } from "../session/obstacles.js";
@@ -63,6 +64,7 @@ function TestMove({ axis }) {
       act=${() => runTest(axis, { kind, distance: way * distance, settleS: settleS ?? 0 })}
       >Move ${number(way * (distance ?? 0), 3)} ${axis.info.unit} and record<//></p>
     ${hindered && html`<${Reason} id=${reason} text=${hindered} />`}
+    <${TraceProgress} trace=${axis.trace} />
   <//>`;
 }
 

@@ -3,6 +3,7 @@
 import { html, useEffect, useState } from "../html.js";
 import { Action, Field, Panel, RefusalText, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { TraceProgress } from "../parts/trace_progress.js";
 import { arm } from "../session/captures.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -62,6 +63,7 @@ function Record({ axis, gains, onRun }) {
   return html`<${Panel} title="Record" note="The pulses that move this drive come from elsewhere: let the machine move, then record.">
     <div class="fields"><${Field} label="Duration" unit="s" value=${seconds} onChange=${setSeconds} min="1" max="60" /></div>
     <p class="row"><${Action} kind="main" act=${record} onDone=${onRun} obstacle=${obstacle(axis, "trace")}>Record<//></p>
+    <${TraceProgress} trace=${axis.trace} />
   <//>`;
 }
 

@@ -9,7 +9,7 @@ import { changed } from "./rigs.js";
 const MOST_KEPT = 12;
 /** A drive's recorder is set up word by word. */
 const ARMING_MS = 35_000;
-/** Beyond its own time-out a trace may be uploaded from a slow drive. */
+/** Beyond its own time-out; while the daemon tells of progress, the time begins anew. */
 const UPLOAD_S = 120;
 /** Samples from before the trigger are gathered first. */
 const ARMED_S = 30;
@@ -107,16 +107,22 @@ async function finished(axis, traceId, patienceS) {
 /** Wait until the header of a trace is in a phase that is wanted. */
 function reached(axis, traceId, wanted, patienceS) {
   return new Promise((resolve, reject) => {
+    let last = null;
+    let timer = null;
     const look = () => {
       const header = axis.trace;
-      if (header?.trace_id === traceId && wanted(header.phase)) end(resolve, header);
+      if (header?.trace_id !== traceId || header === last) return;
+      last = header;
+      clearTimeout(timer);
+      timer = setTimeout(() => end(reject, late), patienceS * 1e3);
+      if (wanted(header.phase)) end(resolve, header);
     };
     const leave = feed.listen(() => look());
     const late = new Refusal(
       { message: "The trace did not get on in time.", remedy: "Abort it, and look at the line" },
       0,
     );
-    const timer = setTimeout(() => end(reject, late), patienceS * 1e3);
+    timer = setTimeout(() => end(reject, late), patienceS * 1e3);
     function end(settle, outcome) {
       leave();
       clearTimeout(timer);
