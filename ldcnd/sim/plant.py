@@ -34,6 +34,7 @@ class MotorPlant:
         delay_s: from a change of the output to the torque: the amplifier and the motor's inductance, as a dead time.
         backlash_counts: lost motion between motor and encoder, which sits on the load.
         motor_reversed: the motor's leads are swapped: a positive output turns it in reverse.
+        encoder_disconnected: the counter stands still while the shaft turns, and the drive does not notice.
     """
 
     counts_per_rev: int = 2000
@@ -56,6 +57,7 @@ class MotorPlant:
     delay_s: float = 0.0
     backlash_counts: float = 0.0
     motor_reversed: bool = False
+    encoder_disconnected: bool = False
 
 
 class Shaft:

@@ -2,21 +2,20 @@
 
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.tuning.ldcn.design import Proposal, figures_of, propose, stiff_gains, within_authority
-from ldcnd.tuning.ldcn.identify import Identified, Record, identify
+from ldcnd.tuning.ldcn.design import Proposal, duration_s, propose, stiff_gains, within_authority
+from ldcnd.tuning.ldcn.excitation import Bounds, Excitation, Record, Shown, Trial, Trials
+from ldcnd.tuning.ldcn.identify import Identified, identify
 from ldcnd.tuning.ldcn.plant import ENDLESS_COUNTS, Plant
 from ldcnd.tuning.ldcn.response import Figures, Move, Response, Start, simulate
+from ldcnd.tuning.ldcn.verdict import measured, worst
 
 REFERENCE = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
 """The gains of the examples in config/."""
-FULL_LEVEL = 64
-"""Largest output of an excitation, PWM steps."""
-TEST_S = 1.2
 SAMPLE_S = 0.0026
 """What a line at 115200 baud brings of one drive."""
 
@@ -60,66 +59,37 @@ def drawn_plants(seed: int, count: int) -> Iterator[DrawnPlant]:
         yield DrawnPlant(number, motor, 2 * lines)  # half a revolution
 
 
-@dataclass(frozen=True, slots=True)
-class Excited:
-    """What excitations have shown.
+class SimulatedAxis:
+    """Carries out trials on a machine.
 
     Attributes:
-        records: there and back with the level that moved it; empty where the drive gave up.
-        farthest_counts: from where it stood.
+        farthest_counts: the farthest place of its shaft from where it stood at first.
     """
 
-    records: tuple[Record, ...]
-    farthest_counts: float
+    def __init__(self, profile: Profile, plant: DrawnPlant) -> None:
+        self.farthest_counts = 0.0
+        self._profile = profile
+        self._motor = plant.motor
+        self._at = 0.0
+        self._dice = random.Random(plant.number)
 
+    def run(self, trials: Trials) -> tuple[Record, ...]:
+        """Carry out all trials of a kind; return what they lead to."""
+        try:
+            trial = next(trials)
+            while True:
+                trial = trials.send(self._shown(trial))
+        except StopIteration as end:
+            records: tuple[Record, ...] = end.value
+            return records
 
-def excite(profile: Profile, plant: DrawnPlant, seed: int) -> Excited:
-    """Move a machine there and back by a fourth of its distance, with more output each time until it follows.
-
-    The command is a step, EL is a third more than that, and OL grows from one PWM step: a motor that runs away does so
-    with little more than its friction needs.
-    """
-    dice = random.Random(seed)
-    reach = plant.distance_counts // 4
-    farthest, level = 0.0, 1.0
-    while level <= FULL_LEVEL:
-        kp = max(round(256 * level / reach), 1)
-        gains = replace(REFERENCE, kp=kp, kd=8 * kp, ki=0, il=0, ol=max(round(level), 1), el=reach * 4 // 3)
-        records: list[Record] = []
-        start, slack = Start(), 0.0
-        for distance in (reach, -reach):
-            move = Move(distance, 100.0 * reach, 100_000.0 * reach)
-            run = simulate(profile, plant.motor, gains, move, 0.6, Start(start.position_counts, slack))
-            offset = 0 if distance > 0 else reach
-            farthest = max(farthest, *(abs(run.positions + offset)))
-            if run.tripped:
-                return Excited((), farthest)
-            if abs(run.positions[-1] - start.position_counts) < 0.6 * reach:
-                break
-            records.append(sampled(run, gains, move, Start(start.position_counts, slack), dice))
-            start, slack = Start(int(run.positions[-1]) - distance), 1.0 if distance > 0 else 0.0
-        if len(records) == 2:
-            return Excited(tuple(records), farthest)
-        level *= 1.5
-    return Excited((), farthest)
-
-
-def refined(profile: Profile, plant: DrawnPlant, gains: Gains, seed: int) -> tuple[tuple[Record, ...], float]:
-    """Return traces of short steps with stiff gains, without integral, and the farthest place in them."""
-    dice = random.Random(seed)
-    reach = plant.distance_counts // 8
-    stiff = replace(gains, ki=0, il=0, ol=FULL_LEVEL, el=2 * reach)
-    records: list[Record] = []
-    start, slack, farthest = Start(), 0.0, 0.0
-    for distance in (reach, -reach):
-        move = Move(distance, 100.0 * reach, 100_000.0 * reach)
-        run = simulate(profile, plant.motor, stiff, move, 0.3, Start(start.position_counts, slack))
-        farthest = max(farthest, *(abs(run.positions + (reach if distance < 0 else 0))))
-        if run.tripped:
-            break
-        records.append(sampled(run, stiff, move, Start(start.position_counts, slack), dice))
-        start, slack = Start(int(run.positions[-1]) - distance), 1.0 if distance > 0 else 0.0
-    return tuple(records), farthest
+    def _shown(self, trial: Trial) -> Shown:
+        run = simulate(self._profile, self._motor, trial.gains, trial.move, trial.lasts_s, trial.start)
+        lowest, highest, last = run.shaft_counts
+        self.farthest_counts = max(self.farthest_counts, -self._at - lowest, self._at + highest)
+        self._at += last
+        record = sampled(run, trial.gains, trial.move, trial.start, self._dice)
+        return Shown(record, run.tripped, int(run.positions[-1]))
 
 
 def sampled(run: Response, gains: Gains, move: Move, start: Start, dice: random.Random) -> Record:
@@ -145,19 +115,16 @@ class Tuned:
         true: what it is.
         known: what its traces say.
         proposal: what was proposed for that.
-        measured: the figures of the test move with it, on the machine.
-        reference: those of the same move with the gains of the examples.
-        tripped: the drive gave up in the test move with the proposal, and `reference_tripped` with the others.
-        farthest_counts: from where the machine stood, in all excitations.
+        measured: the worst figures of the test moves with it, on the machine; None where the drive gave up.
+        reference: those of the same moves with the gains of the examples.
+        farthest_counts: from where the machine stood, in all trials but those with the gains of the examples.
     """
 
     true: Plant
     known: Identified
     proposal: Proposal
-    measured: Figures
-    reference: Figures
-    tripped: bool
-    reference_tripped: bool
+    measured: Figures | None
+    reference: Figures | None
     farthest_counts: float
 
     @property
@@ -166,24 +133,27 @@ class Tuned:
         return abs(self.known.plant.acceleration / self.true.acceleration - 1)
 
 
+def excited(profile: Profile, plant: DrawnPlant) -> tuple[Excitation, SimulatedAxis, tuple[Record, ...]]:
+    """Give pulses to a machine and move it softly."""
+    excitation, axis = Excitation(profile, Bounds(plant.distance_counts)), SimulatedAxis(profile, plant)
+    axis.run(excitation.pulses())
+    return excitation, axis, axis.run(excitation.soft())
+
+
 def tuned(profile: Profile, plant: DrawnPlant, bandwidth_hz: float | None = None) -> Tuned:
     """Excite a machine softly, then stiffly, identify it, propose gains, and move with them."""
-    soft = excite(profile, plant, seed=plant.number)
-    first = identify(profile, soft.records)
-    stiff, farthest = refined(profile, plant, stiff_gains(profile, first), seed=plant.number)
-    known = identify(profile, (*soft.records, *stiff), first.plant)
-    distance = plant.distance_counts // 2
-    move = within_authority(known.plant, Move(distance, 40.0 * distance, 800.0 * distance))
+    excitation, axis, soft = excited(profile, plant)
+    first = identify(profile, soft)
+    stiff = axis.run(excitation.stiff(stiff_gains(profile, first)))
+    known = identify(profile, (*soft, *stiff), first.plant)
+    move = within_authority(known.plant, excitation.wanted())
     proposal = propose(profile, known, move, bandwidth_hz)
-    run = simulate(profile, plant.motor, proposal.gains, move, TEST_S)
-    usual = simulate(profile, plant.motor, REFERENCE, move, TEST_S)
-    return Tuned(
-        Plant.of(plant.motor),
-        known,
-        proposal,
-        figures_of(run, move),
-        figures_of(usual, move),
-        run.tripped,
-        usual.tripped,
-        max(soft.farthest_counts, farthest, float(max(abs(run.positions)))),
-    )
+
+    def tried(gains: Gains, on: SimulatedAxis) -> Figures | None:
+        records = on.run(excitation.test(gains, move, duration_s(move)))
+        moves = [measured(profile, known.plant, record) for record in records]
+        return worst(moves) if len(moves) == 2 else None
+
+    outcome = tried(proposal.gains, axis)
+    farthest = axis.farthest_counts
+    return Tuned(Plant.of(plant.motor), known, proposal, outcome, tried(REFERENCE, axis), farthest)

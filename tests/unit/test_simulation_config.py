@@ -131,14 +131,17 @@ def test_index_pulses_can_be_nearer_than_a_revolution(tmp_path):
     assert on_index == [0, 1, 2, 3, 500, 501, 502, 503, 1000, 1001, 1002, 1003]
 
 
-def test_a_machine_may_have_a_load_a_dead_time_backlash_and_swapped_leads(tmp_path):
-    plant = "{ load_nm = -0.02, delay_s = 0.001, backlash_counts = 8, motor_reversed = true }"
+def test_a_machine_may_have_a_load_a_dead_time_backlash_and_wrong_wires(tmp_path):
+    plant = (
+        "{ load_nm = -0.02, delay_s = 0.001, backlash_counts = 8, motor_reversed = true, encoder_disconnected = true }"
+    )
     config = load(tmp_path, f'[[module]]\nmodel = "ls182ap"\nplant = {plant}')
 
     machine = build_chain(config.spec()).modules[0].shaft.plant
 
     assert (machine.load_nm, machine.delay_s, machine.backlash_counts) == (-0.02, 0.001, 8)
     assert machine.motor_reversed
+    assert machine.encoder_disconnected
 
 
 def test_a_line_of_a_rig_takes_the_same_modules():

@@ -1,11 +1,12 @@
 """Plants found in traces, gains designed for them, and what the model promises of a move."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
 
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.errors import DriveFault, ValueOutOfRange
 from ldcnd.sim.plant import MotorPlant
 from ldcnd.tuning.ldcn.design import (
     GAIN_MARGIN_DB,
@@ -17,10 +18,12 @@ from ldcnd.tuning.ldcn.design import (
     stiff_gains,
     within_authority,
 )
-from ldcnd.tuning.ldcn.identify import Identified, Record, identify
+from ldcnd.tuning.ldcn.excitation import PULSE_COUNTS, Bounds, Excitation, Record, Shown
+from ldcnd.tuning.ldcn.identify import Identified, identify
 from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.response import Move, Start, figures, simulate
-from tests.support.simulated_plants import REFERENCE, drawn_plants, excite, tuned
+from ldcnd.tuning.ldcn.response import Figures, Move, Start, figures, simulate
+from ldcnd.tuning.ldcn.verdict import objection
+from tests.support.simulated_plants import REFERENCE, SimulatedAxis, drawn_plants, tuned
 
 SMALL_MOTOR = Plant.of(MotorPlant())
 MOVE = Move(500, 20_000.0, 400_000.0)
@@ -155,14 +158,51 @@ def test_a_trace_without_motion_tells_nothing():
         identify(PIC_SERVO_V4, [still])
 
 
-def test_a_reversed_motor_gives_no_trace_and_stays_within_the_distance():
-    for plant in drawn_plants(SEED, 4):
-        reversed_motor = replace(plant, motor=replace(plant.motor, motor_reversed=True, load_nm=0.0))
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [({"motor_reversed": True}, "against an output"), ({"encoder_disconnected": True}, "the encoder counted nothing")],
+    ids=["reversed motor", "disconnected encoder"],
+)
+def test_wrong_wires_are_found_by_pulses_within_the_distance(wrong, said):
+    (plant,) = drawn_plants(SEED, 1)
+    axis = SimulatedAxis(PIC_SERVO_V4, replace(plant, motor=replace(plant.motor, **wrong)))
 
-        found = excite(PIC_SERVO_V4, reversed_motor, seed=1)
+    with pytest.raises(DriveFault, match=said):
+        axis.run(Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts)).pulses())
 
-        assert found.records == ()
-        assert 0 < found.farthest_counts <= plant.distance_counts, plant
+    assert 0 < axis.farthest_counts <= plant.distance_counts
+
+
+def test_pulses_end_in_the_drive_itself():
+    (plant,) = drawn_plants(SEED, 1)
+    blind = replace(plant.motor, encoder_disconnected=True)
+    pulses = Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts)).pulses()
+    nothing = Shown(Record(REFERENCE, MOVE, Start(), (0.0,), (0,)), tripped=False, rest_counts=0)
+
+    trial = next(pulses)
+    with suppress(DriveFault):
+        while True:
+            run = simulate(PIC_SERVO_V4, blind, trial.gains, trial.move, 0.1)
+            assert 0 < sum(abs(run.pwm)) <= PULSE_COUNTS * trial.gains.ol
+            assert not run.pwm[-1]
+            trial = pulses.send(nothing)
+
+
+def test_a_distance_that_is_too_short_is_refused():
+    with pytest.raises(ValueOutOfRange, match="within 100 counts"):
+        Excitation(PIC_SERVO_V4, Bounds(100))
+
+
+def test_gains_are_not_better_when_they_settle_later_overshoot_or_trip():
+    good = Figures(overshoot=0.05, settling_s=0.05, settled=True, following_error_counts=50.0, error_counts=0.0)
+
+    assert objection(good, good) is None
+    assert objection(replace(good, settling_s=0.054), good) is None
+    assert objection(good, replace(good, settled=False)) is None
+    assert "with the old gains in 50 ms" in objection(replace(good, settling_s=0.056), good)
+    assert "overshot by 16%" in objection(replace(good, overshoot=0.16), None)
+    assert "did not settle" in objection(replace(good, settled=False), None)
+    assert "opened its loop" in objection(None, good)
 
 
 @pytest.mark.timeout(300)  # a second or two of processor time, on a machine that may be busy
@@ -174,7 +214,7 @@ def test_of_a_drawn_machine_traces_tell_the_inertia_and_gains_suit_it(number):
     outcome = tuned(PIC_SERVO_V4, plant, bandwidth_hz=23.0)  # to search all would cost seconds
 
     assert outcome.acceleration_error < 0.1
+    assert outcome.measured is not None
     assert outcome.measured.settled
-    assert not outcome.tripped
     assert outcome.measured.overshoot < 0.15
     assert outcome.farthest_counts <= plant.distance_counts

@@ -95,6 +95,8 @@ class PlantConfig(Frozen):
     """Lost motion between the motor and the encoder, which sits on the load; 0."""
     motor_reversed: bool | None = None
     """Whether the motor's leads are swapped: a positive output turns it in reverse. Then no position loop holds."""
+    encoder_disconnected: bool | None = None
+    """Whether the counter stands still while the shaft turns, and the drive does not notice."""
 
 
 class Quirks(Frozen):

@@ -134,6 +134,8 @@ class ServoLoop:
         self._overloaded = 0  # cycles for which the motor current has been limited
         self._arrived = False  # at the analog target
         shaft.limit_current(quirks.peak_current_a if profile.pic_ae_diagnostics else 0.0)
+        if shaft.plant.encoder_disconnected:
+            stage.conditions.add(Condition.ENCODER_STUCK)
         self._zero = math.floor(shaft.position_counts)
         self._ticked_position = 0
         self._previous_error = 0

@@ -232,14 +232,14 @@ def _better(
             return best
     except ValueOutOfRange:
         return best
-    duration_s = _duration_s(move)
-    predicted = simulate(profile, plant, gains, move, duration_s)
+    lasts_s = duration_s(move)
+    predicted = simulate(profile, plant, gains, move, lasts_s)
     outcome = figures_of(predicted, move)
     limit = 3 * outcome.following_error_counts + LEAST_ERROR_LIMIT
     gains = replace(gains, el=min(math.ceil(limit), profile.most_error_limit))
     worst = 0.0
     for edge in (plant, *edges):
-        run = predicted if edge is plant else simulate(profile, edge, gains, move, duration_s)
+        run = predicted if edge is plant else simulate(profile, edge, gains, move, lasts_s)
         shown = figures_of(run, move)
         worst = max(worst, shown.settling_s)
         good = shown.settled and not run.tripped and shown.overshoot <= MOST_OVERSHOOT
@@ -265,7 +265,8 @@ def _edges(known: Identified) -> tuple[Plant, ...]:
     )
 
 
-def _duration_s(move: Move) -> float:
+def duration_s(move: Move) -> float:
+    """Return the time for a move and its settling, seconds."""
     way, rate = abs(move.distance_counts), move.acceleration_counts_per_s2
     peak = min(move.speed_counts_per_s, math.sqrt(way * rate))
     return way / peak + peak / rate + PREDICTED_S

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.errors import ValueOutOfRange
+from ldcnd.tuning.ldcn.excitation import Record
 from ldcnd.tuning.ldcn.plant import LEAST_DAMPING_PER_S, Plant
-from ldcnd.tuning.ldcn.response import Floats, Move, Start, simulate
+from ldcnd.tuning.ldcn.response import Floats, Move, simulate
 
 CONFIDENCE_SIGMAS = 1.96
 """Half the width of an interval of 95 %, in standard deviations."""
@@ -37,25 +37,6 @@ STARTS = ((1.0, 1.0, 1.0), (0.6, 1.0, 0.5), (1.6, 1.0, 1.0), (1.0, 4.0, 0.3))
 MOST_CORRELATION = 0.95
 PER_SAMPLE_COUNTS = 0.3
 """Standard deviation of a position that is a whole number of counts."""
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """The trace of one move that began at standstill.
-
-    Attributes:
-        gains: the registers in force.
-        move: the commanded move.
-        start: how the axis stood.
-        times_s: of the samples, rising; when the move began is not known better than by the trace itself.
-        positions: counts from the command position before the move.
-    """
-
-    gains: Gains
-    move: Move
-    start: Start
-    times_s: tuple[float, ...]
-    positions: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +78,11 @@ def identify(profile: Profile, records: Sequence[Record], near: Plant | None = N
     if near is None:
         plant, begun = _regression(profile, records)
     else:
-        plant, begun = near, [_begin(profile, near, record) for record in records]
+        plant, begun = near, [begin_s(profile, near, record) for record in records]
     return _Fit(profile, records).solve(plant, begun)
 
 
-def _begin(profile: Profile, plant: Plant, record: Record) -> float:
+def begin_s(profile: Profile, plant: Plant, record: Record) -> float:
     """Return when a move must have begun for this plant to follow it so."""
     span_s = record.times_s[-1] - record.times_s[0]
     run = simulate(profile, plant, record.gains, record.move, span_s, record.start)

@@ -57,6 +57,7 @@ class Response:
         positions: encoder positions.
         pwm: outputs, -255 to 255.
         tripped: the following error exceeded EL, and the drive gave up.
+        shaft_counts: the lowest, the highest and the last place of the shaft, also where the encoder does not show it.
     """
 
     times_s: Floats
@@ -64,6 +65,7 @@ class Response:
     positions: Floats
     pwm: Floats
     tripped: bool = False
+    shaft_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def simulate(
@@ -97,18 +99,26 @@ def simulate(
     loop.trajectory.go_to(origin + move.distance_counts, speed, acceleration)
     cycles = round(duration_s / profile.servo_cycle_s)
     positions, commanded, pwm = [0] * cycles, [0] * cycles, [0] * cycles
+    unseen = list[float]()
     for cycle in range(cycles):
         loop.run(1)
         positions[cycle] = loop.position - origin
         commanded[cycle] = loop.trajectory.position // FRACTION - origin
         pwm[cycle] = loop.pwm
+        if motor.encoder_disconnected:
+            unseen.append(shaft.position_counts)
     return Response(
         np.asarray(np.arange(1, cycles + 1) * profile.servo_cycle_s, dtype=np.float64),
         np.array(commanded, dtype=np.float64),
         np.array(positions, dtype=np.float64),
         np.array(pwm, dtype=np.float64),
         tripped=loop.faulted,
+        shaft_counts=_range(unseen or positions),
     )
+
+
+def _range(places: Sequence[float]) -> tuple[float, float, float]:
+    return (min(places), max(places), places[-1]) if places else (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

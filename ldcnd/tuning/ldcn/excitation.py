@@ -1,0 +1,322 @@
+"""The moves from which an axis is identified and judged, one trial after the other; bounded in what they may do.
+
+A trial begins and ends at standstill with the loop open, so each one starts where the axis is. This module says what
+to try next from what was shown; who tries it is a session with a rig, or a simulated machine.
+
+* Pulses find out whether the encoder counts the motor's way, and at which output the axis gives way. They have a
+  derivative gain only: the drive adds output for as long as the command position moves and takes it away by itself,
+  whatever the host does. So a motor whose encoder is disconnected turns for some milliseconds, and brakes.
+* Soft moves have so little output that a runaway is slow, and an error limit just beyond their distance.
+* Stiff moves are short. Only they show the dead time.
+* Test moves go there and back with gains that are to be judged.
+"""
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drivers.ldcn.registers import Gains
+from ldcnd.errors import DriveFault, ValueOutOfRange
+from ldcnd.tuning.ldcn.plant import FULL_PWM
+from ldcnd.tuning.ldcn.response import Move, Start
+
+LEAST_WITHIN_COUNTS = 200
+"""Within less than this, moves are too short to tell of an axis, counts."""
+PULSE_COUNTS = 10
+"""Distance of the command of a pulse, counts, one a servo tick at most: its output lasts so many ticks at most."""
+MOST_PULSE_LEVEL = 100
+MOST_IMPULSE = 1000.0
+"""Most that a pulse may be: PWM steps times servo ticks."""
+SEEN_COUNTS = 3
+"""An axis that has moved so far has moved: one count is noise."""
+PULSE_MARGIN_COUNTS = 20
+PULSE_MARGIN_SHARE = 0.05
+"""An axis may run away in a pulse by these counts, or this share of the distance, before the drive opens its loop."""
+PULSE_S = 0.25
+LEVEL_STEP = 1.25
+MOST_SOFT_LEVEL = 64
+"""Largest output of a soft or a stiff move, PWM steps."""
+FIRST_SOFT_SHARE = 1 / 3
+"""Soft moves begin at this share of the output at which the axis gave way to a pulse."""
+SOFT_STEP = 1.5
+SOFT_SHARE = 0.6
+"""A soft move has arrived with this share of its distance: friction holds it there."""
+SOFT_S = 0.6
+SOFT_DERIVATIVE_TICKS = 8
+STIFF_S = 0.3
+
+
+class Purpose(StrEnum):
+    """What a trial is for."""
+
+    PULSE = "pulse"
+    SOFT = "soft"
+    STIFF = "stiff"
+    TEST = "test"
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What an axis may be asked to do.
+
+    Attributes:
+        within_counts: it stays so near to where it stood at the beginning.
+        velocity_counts_per_s: the highest command velocity.
+        acceleration_counts_per_s2: the highest command acceleration.
+    """
+
+    within_counts: int
+    velocity_counts_per_s: float = math.inf
+    acceleration_counts_per_s2: float = math.inf
+
+    def move(self, distance_counts: int, velocity_counts_per_s: float, acceleration_counts_per_s2: float) -> Move:
+        """Return a move no faster than this axis may go."""
+        return Move(
+            distance_counts,
+            min(velocity_counts_per_s, self.velocity_counts_per_s),
+            min(acceleration_counts_per_s2, self.acceleration_counts_per_s2),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One move to be made.
+
+    Attributes:
+        purpose: what it is for.
+        gains: to be loaded before the loop is closed.
+        move: from where the axis stands then.
+        start: how the axis stands before.
+        lasts_s: from its begin until the loop is opened.
+    """
+
+    purpose: Purpose
+    gains: Gains
+    move: Move
+    start: Start
+    lasts_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """The trace of one move that began at standstill.
+
+    Attributes:
+        gains: the registers in force.
+        move: the commanded move.
+        start: how the axis stood.
+        times_s: of the samples, rising; when the move began is not known better than by the trace itself.
+        positions: counts from the command position before the move.
+    """
+
+    gains: Gains
+    move: Move
+    start: Start
+    times_s: tuple[float, ...]
+    positions: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What became of a trial.
+
+    Attributes:
+        record: the trace, with the move as the drive had it.
+        tripped: the drive gave up.
+        rest_counts: where the axis came to rest, from where it stood before.
+    """
+
+    record: Record
+    tripped: bool
+    rest_counts: int
+
+
+Trials = Generator[Trial, Shown, tuple[Record, ...]]
+
+
+class Excitation:
+    """The trials of one axis, in the order of the methods; keeps account of where it stands.
+
+    Args:
+        profile: the dialect.
+        bounds: what the axis may be asked to do.
+
+    Attributes:
+        level: output at which the axis gave way to pulses, PWM steps.
+        farthest_counts: from where it stood at the beginning, as seen in the traces.
+
+    Raises:
+        ValueOutOfRange: within these bounds nothing can be found out.
+    """
+
+    def __init__(self, profile: Profile, bounds: Bounds) -> None:
+        if bounds.within_counts < LEAST_WITHIN_COUNTS:
+            raise ValueOutOfRange(
+                f"moves within {bounds.within_counts} counts tell too little of an axis",
+                value=bounds.within_counts,
+                limit=LEAST_WITHIN_COUNTS,
+                remedy=f"allow at least {LEAST_WITHIN_COUNTS} counts",
+            )
+        self.level = 1
+        self.farthest_counts = 0
+        self._profile = profile
+        self._bounds = bounds
+        self._offset_counts = 0
+        self._slack = 0.0
+
+    @property
+    def most_impulse(self) -> float:
+        """The largest pulse, PWM steps times ticks.
+
+        Without any friction a motor is carried by a pulse as far as full output would carry it in the same share of the
+        time. It is taken to be no faster at full output than its drive can count.
+        """
+        profile = self._profile
+        full_counts = profile.encoder_counts_per_s * profile.servo_cycle_s / FULL_PWM
+        return min(self._bounds.within_counts / full_counts, MOST_IMPULSE)
+
+    def pulses(self) -> Trials:
+        """Find the output at which the axis gives way, and whether its encoder then counts the motor's way.
+
+        Raises:
+            DriveFault: it counts the other way, or not at all.
+        """
+        most = min(int(self.most_impulse / PULSE_COUNTS), MOST_PULSE_LEVEL)
+        margin = max(PULSE_MARGIN_COUNTS, int(PULSE_MARGIN_SHARE * self._bounds.within_counts))
+        limit = min(PULSE_COUNTS + margin, self._profile.most_error_limit)
+        cycle_s = self._profile.servo_cycle_s
+        self.level = 1
+        silent = [1, -1]
+        while silent and self.level <= most:
+            for direction in tuple(silent):  # a load may make one of them easier
+                gains = Gains(kp=0, kd=256 * self.level, ki=0, il=0, ol=self.level, cl=0, el=limit, sr=1)
+                move = self._bounds.move(direction * PULSE_COUNTS, 1 / cycle_s, 1 / cycle_s**2)
+                shown = yield self._trial(Purpose.PULSE, gains, move, PULSE_S)
+                gone = self._account(shown) * direction
+                if gone <= -SEEN_COUNTS:
+                    raise DriveFault(
+                        f"the axis moved by {gone:+d} counts against an output of {self.level} of {FULL_PWM} PWM steps",
+                        value=gone,
+                        remedy="swap the motor's leads or the encoder's tracks; or a load pulled it away: hold that by"
+                        " other means",
+                    )
+                if gone >= SEEN_COUNTS:
+                    silent.remove(direction)
+            if silent:
+                self.level = max(self.level + 1, math.ceil(self.level * LEVEL_STEP))
+        if not silent:
+            return ()
+        raise DriveFault(
+            f"the encoder counted nothing at {most} of {FULL_PWM} PWM steps, {PULSE_COUNTS} servo ticks long",
+            value=most,
+            remedy="check the encoder, the motor's leads, its supply and the brake; more output would take a motor"
+            " without an encoder farther than this tuning may go, so allow more distance if all of that is right",
+        )
+
+    def soft(self) -> Trials:
+        """Move there and back by a fourth of the distance, with more output each time until the axis follows.
+
+        Raises:
+            DriveFault: it does not, or the drive gave up.
+        """
+        reach = min(self._bounds.within_counts // 4, self._profile.most_error_limit * 3 // 4)
+        level = max(self.level * FIRST_SOFT_SHARE, 1.0)
+        while level <= MOST_SOFT_LEVEL:
+            kp = max(round(256 * level / reach), 1)
+            gains = Gains(
+                kp=kp,
+                kd=SOFT_DERIVATIVE_TICKS * kp,
+                ki=0,
+                il=0,
+                ol=max(round(level), 1),
+                cl=0,
+                el=reach * 4 // 3,
+                sr=1,
+            )
+            records: list[Record] = []
+            for distance in self._there_and_back(reach):
+                move = self._bounds.move(distance, 100.0 * reach, 100_000.0 * reach)
+                shown = yield self._trial(Purpose.SOFT, gains, move, SOFT_S)
+                self._account(shown)
+                if shown.tripped:
+                    raise _gave_up("a soft move")
+                if abs(shown.rest_counts) < SOFT_SHARE * reach:
+                    break
+                records.append(shown.record)
+            if len(records) == 2:  # noqa: PLR2004 - there and back
+                return tuple(records)
+            level *= SOFT_STEP
+        raise DriveFault(
+            f"the axis does not follow with {MOST_SOFT_LEVEL} of {FULL_PWM} PWM steps",
+            value=MOST_SOFT_LEVEL,
+            remedy="look for a brake, a jam or a missing supply",
+        )
+
+    def stiff(self, gains: Gains) -> Trials:
+        """Move there and back by an eighth of the distance with stiff gains, without their integral.
+
+        Raises:
+            DriveFault: the drive gave up.
+        """
+        reach = min(self._bounds.within_counts // 8, self._profile.most_error_limit // 2)
+        gains = replace(gains, ki=0, il=0, ol=MOST_SOFT_LEVEL, el=2 * reach)
+        records = []
+        for distance in self._there_and_back(reach):
+            move = self._bounds.move(distance, 100.0 * reach, 100_000.0 * reach)
+            shown = yield self._trial(Purpose.STIFF, gains, move, STIFF_S)
+            self._account(shown)
+            if shown.tripped:
+                raise _gave_up("a stiff move")
+            records.append(shown.record)
+        return tuple(records)
+
+    def wanted(self) -> Move:
+        """Return the test move: half of the distance, as fast as the axis may go and a model still has to allow."""
+        distance = self._bounds.within_counts // 2
+        return self._bounds.move(distance, 40.0 * distance, 800.0 * distance)
+
+    def test(self, gains: Gains, move: Move, lasts_s: float) -> Trials:
+        """Make the test move there and back; ends early where the drive gives up.
+
+        Args:
+            gains: to be judged; their error limit is lowered to half of the distance.
+            move: there.
+            lasts_s: time for one way, with settling.
+        """
+        gains = replace(gains, cl=0, el=min(gains.el, max(self._bounds.within_counts // 2, 1)))
+        records = []
+        for distance in self._there_and_back(abs(move.distance_counts)):
+            there = replace(move, distance_counts=distance)
+            shown = yield self._trial(Purpose.TEST, gains, there, lasts_s)
+            self._account(shown)
+            if shown.tripped:
+                break
+            records.append(shown.record)
+        return tuple(records)
+
+    def _there_and_back(self, distance: int) -> tuple[int, int]:
+        """Return a distance and its opposite, first towards where the axis stood at the beginning."""
+        first = -distance if self._offset_counts > 0 else distance
+        return first, -first
+
+    def _trial(self, purpose: Purpose, gains: Gains, move: Move, lasts_s: float) -> Trial:
+        return Trial(purpose, gains, move, Start(0, self._slack), lasts_s)
+
+    def _account(self, shown: Shown) -> int:
+        """Note where the axis has been and is now; return how far it was from where it stood, signed."""
+        positions = (*shown.record.positions, shown.rest_counts)
+        gone = max(positions, key=abs)
+        self.farthest_counts = max(self.farthest_counts, *(abs(self._offset_counts + each) for each in positions))
+        self._offset_counts += shown.rest_counts
+        if abs(shown.rest_counts) >= SEEN_COUNTS:
+            self._slack = 1.0 if shown.rest_counts > 0 else 0.0
+        return gone
+
+
+def _gave_up(what: str) -> DriveFault:
+    return DriveFault(
+        f"the drive opened its loop in {what}: the axis did not follow",
+        remedy="look for an obstacle, a load that pulls, or a loose encoder; then reset and tune again",
+    )
