@@ -1,6 +1,28 @@
 """What tuning has found out, proposed and measured: one document, for people and programs."""
 
+import math
+from collections.abc import Sequence
+
 from ldcnd.model.frozen import Frozen
+from ldcnd.tuning.ldcn.response import Figures
+from ldcnd.tuning.ldcn.verdict import Measured, worst
+from ldcnd.tuning.plan import Plan
+from ldcnd.tuning.session import Findings, Verified, registers_of
+
+
+class TuningPlan(Frozen):
+    """What `ldcnd tune --dry-run` says it would do."""
+
+    axis: str
+    """The axis."""
+    unit: str
+    """Its unit."""
+    within: float
+    """It stays so near to where it stands, in axis units."""
+    within_counts: int
+    """Likewise, in counts."""
+    lines: tuple[str, ...]
+    """The same and the rest for people."""
 
 
 class Estimate(Frozen):
@@ -73,3 +95,69 @@ class TuningReport(Frozen):
     """Why the proposal is not better; null where it is at least as good, or was not tried."""
     applied: bool = False
     """The proposed gains are in the drive; otherwise the old ones are."""
+
+
+def plan_reported(planned: Plan) -> TuningPlan:
+    """Return a plan as a document."""
+    counts = planned.bounds.within_counts
+    return TuningPlan(
+        axis=planned.info.axis,
+        unit=planned.info.unit,
+        within=planned.units(counts),
+        within_counts=counts,
+        lines=planned.lines,
+    )
+
+
+def reported(found: Findings, verified: Verified | None = None) -> TuningReport:
+    """Return everything that was found out, as one document."""
+    planned, plant, spread = found.plan, found.known.plant, found.known.interval
+    info = planned.info
+    units = {
+        "acceleration": "counts/s^2 per PWM step",
+        "damping_per_s": "1/s",
+        "friction_pwm": "PWM steps",
+        "load_pwm": "PWM steps",
+        "delay_s": "s",
+        "backlash_counts": "counts",
+    }
+    margins = found.proposal.margins
+    return TuningReport(
+        axis=info.axis,
+        unit=info.unit,
+        within=planned.units(planned.bounds.within_counts),
+        farthest=planned.units(max(found.farthest_counts, verified.farthest_counts if verified else 0)),
+        plant={
+            name: Estimate(value=getattr(plant, name), interval=getattr(spread, name), unit=unit)
+            for name, unit in units.items()
+        },
+        left_counts=found.known.left_counts,
+        distance=planned.units(abs(found.move.distance_counts)),
+        old_gains=found.old,
+        gains=registers_of(found.proposal.gains, found.old),
+        margins=LoopMargins(
+            bandwidth_hz=margins.crossover_hz,
+            phase_deg=margins.phase_deg,
+            gain_db=margins.gain_db if math.isfinite(margins.gain_db) else None,
+        ),
+        predicted=_shown(planned, found.proposal.figures),
+        before=_shown_worst(planned, found.before),
+        after=_shown_worst(planned, verified.after) if verified else None,
+        objection=verified.objection if verified else None,
+        applied=verified is not None and verified.objection is None,
+    )
+
+
+def _shown_worst(planned: Plan, moves: Sequence[Measured]) -> MoveFigures | None:
+    figures = worst(moves)
+    return _shown(planned, figures) if figures else None
+
+
+def _shown(planned: Plan, figures: Figures) -> MoveFigures:
+    return MoveFigures(
+        settling_s=figures.settling_s,
+        settled=figures.settled,
+        overshoot=figures.overshoot,
+        following_error=planned.units(figures.following_error_counts),
+        error=planned.units(figures.error_counts),
+    )

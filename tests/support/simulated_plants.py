@@ -151,8 +151,7 @@ def tuned(profile: Profile, plant: DrawnPlant, bandwidth_hz: float | None = None
 
     def tried(gains: Gains, on: SimulatedAxis) -> Figures | None:
         records = on.run(excitation.test(gains, move, duration_s(move)))
-        moves = [measured(profile, known.plant, record) for record in records]
-        return worst(moves) if len(moves) == 2 else None
+        return worst([measured(profile, known.plant, record) for record in records])
 
     outcome = tried(proposal.gains, axis)
     farthest = axis.farthest_counts

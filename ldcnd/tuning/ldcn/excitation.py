@@ -142,8 +142,10 @@ class Excitation:
     Args:
         profile: the dialect.
         bounds: what the axis may be asked to do.
+        offset_counts: where it stands, from where it stood at the beginning.
 
     Attributes:
+        offset_counts: where it stands now, likewise.
         level: output at which the axis gave way to pulses, PWM steps.
         farthest_counts: from where it stood at the beginning, as seen in the traces.
 
@@ -151,7 +153,7 @@ class Excitation:
         ValueOutOfRange: within these bounds nothing can be found out.
     """
 
-    def __init__(self, profile: Profile, bounds: Bounds) -> None:
+    def __init__(self, profile: Profile, bounds: Bounds, offset_counts: int = 0) -> None:
         if bounds.within_counts < LEAST_WITHIN_COUNTS:
             raise ValueOutOfRange(
                 f"moves within {bounds.within_counts} counts tell too little of an axis",
@@ -160,10 +162,10 @@ class Excitation:
                 remedy=f"allow at least {LEAST_WITHIN_COUNTS} counts",
             )
         self.level = 1
-        self.farthest_counts = 0
+        self.offset_counts = offset_counts
+        self.farthest_counts = abs(offset_counts)
         self._profile = profile
         self._bounds = bounds
-        self._offset_counts = 0
         self._slack = 0.0
 
     @property
@@ -298,18 +300,26 @@ class Excitation:
 
     def _there_and_back(self, distance: int) -> tuple[int, int]:
         """Return a distance and its opposite, first towards where the axis stood at the beginning."""
-        first = -distance if self._offset_counts > 0 else distance
+        first = -distance if self.offset_counts > 0 else distance
         return first, -first
 
     def _trial(self, purpose: Purpose, gains: Gains, move: Move, lasts_s: float) -> Trial:
+        if abs(self.offset_counts + move.distance_counts) > self._bounds.within_counts:
+            raise DriveFault(
+                f"the axis stands {self.offset_counts:+d} counts from where it stood: the next move could leave the"
+                f" {self._bounds.within_counts} counts that it may go",
+                value=self.offset_counts,
+                limit=self._bounds.within_counts,
+                remedy="secure the load, which carries it away between moves",
+            )
         return Trial(purpose, gains, move, Start(0, self._slack), lasts_s)
 
     def _account(self, shown: Shown) -> int:
         """Note where the axis has been and is now; return how far it was from where it stood, signed."""
         positions = (*shown.record.positions, shown.rest_counts)
         gone = max(positions, key=abs)
-        self.farthest_counts = max(self.farthest_counts, *(abs(self._offset_counts + each) for each in positions))
-        self._offset_counts += shown.rest_counts
+        self.farthest_counts = max(self.farthest_counts, *(abs(self.offset_counts + each) for each in positions))
+        self.offset_counts += shown.rest_counts
         if abs(shown.rest_counts) >= SEEN_COUNTS:
             self._slack = 1.0 if shown.rest_counts > 0 else 0.0
         return gone

@@ -15,6 +15,7 @@ from ldcnd.tuning.ldcn.response import Figures, Floats, figures, simulate
 MOST_MEASURED_OVERSHOOT = 0.15
 SAME_S = 0.005
 """Settling times within two samples of a trace of each other are equal, seconds."""
+BOTH_WAYS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +49,10 @@ def measured(profile: Profile, plant: Plant, record: Record) -> Measured:
     return Measured(times, commanded, positions, predicted, figures(times, positions, commanded, window))
 
 
-def worst(moves: Sequence[Measured]) -> Figures:
-    """Return the worst of each figure of several moves."""
+def worst(moves: Sequence[Measured]) -> Figures | None:
+    """Return the worst of each figure of a move there and of one back; None where there are not both."""
+    if len(moves) < BOTH_WAYS:
+        return None
     each = [move.figures for move in moves]
     return Figures(
         overshoot=max(one.overshoot for one in each),

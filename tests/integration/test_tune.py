@@ -1,0 +1,246 @@
+"""Tuning through the whole daemon: what is identified, applied and verified, and what comes back afterwards."""
+
+import asyncio
+from contextlib import asynccontextmanager
+from dataclasses import replace
+
+import pytest
+
+from ldcnd.client.lease import control
+from ldcnd.client.rig import Rig
+from ldcnd.config.axis import ApproachConfig
+from ldcnd.config.rig import load_config
+from ldcnd.drivers.ldcn.profiles import LS_182AP
+from ldcnd.errors import (
+    DriveFault,
+    NotReferenced,
+    NotSupported,
+    PositionLimit,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.model.commands import MoveAbsolute, Power, SetGains
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.plant import MotorPlant
+from ldcnd.tuning.kept_gains import file_of, kept_for, put_back
+from ldcnd.tuning.ldcn.plant import Plant
+from ldcnd.tuning.plan import plan
+from ldcnd.tuning.report import plan_reported, reported
+from ldcnd.tuning.session import measure, verify
+from tests.support.rig import SIMULATED, running_rig
+
+CONFIGURED = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000, "sr": 1, "deadband": 0}
+WITHIN_COUNTS = 2000
+WRONG_WITHIN = 0.5
+STIFF = MotorPlant(inertia_kg_m2=2e-4, friction_nm=0.02, delay_s=0.0008)
+"""Comes to rest soon, so that its traces are short."""
+
+
+@pytest.fixture(autouse=True)
+def state_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+
+@asynccontextmanager
+async def tuned_rig(machine=STIFF, **changes):
+    """Run a rig with one axis, x, on this machine, which is up; with its shaft."""
+    config = load_config(SIMULATED)
+    (bus,) = config.bus
+    axis = bus.axis[0].model_copy(update=changes)
+    one = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (axis,), "group": ()}),)})
+    chain = build_chain(ChainSpec(modules=(ModuleSpec("ls182ap", machine),)))
+    async with running_rig(one, {"line0": chain}) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        yield rig, chain.modules[0].shaft
+
+
+async def registers(rig):
+    (info,) = await rig.client.axes()
+    return {each.name: each.value for each in info.registers if each.name in CONFIGURED}
+
+
+async def is_off_with_its_old_gains(rig):
+    state = await rig.client.state("x")
+    return not state.enabled and await registers(rig) == CONFIGURED and not file_of("sim", "x").exists()
+
+
+@asynccontextmanager
+async def measuring(rig, until):
+    """Measure in a task of its own; begins when a line that contains `until` has been said."""
+    said = asyncio.Event()
+
+    def tell(line):
+        if until in line:
+            said.set()
+
+    planned = await plan(rig.client, "x", None)
+    task = asyncio.create_task(measure(rig.client, planned, 20.0, tell), name="measure")
+    await said.wait()
+    await rig.until("x", lambda state: state.enabled)
+    assert kept_for("sim", "x").gains == CONFIGURED
+    yield task
+
+
+@pytest.mark.timeout(300)  # some seconds of processor time, on a machine that may be busy
+async def test_an_axis_is_identified_tuned_and_verified_and_worse_gains_are_not_kept():
+    said = []
+    async with tuned_rig() as (rig, shaft):
+        planned = await plan(rig.client, "x", None)
+        found = await measure(rig.client, planned, 20.0, said.append)
+        assert await is_off_with_its_old_gains(rig)
+
+        weak = replace(found.proposal, gains=replace(found.proposal.gains, kp=10, kd=100, ki=1, il=0))
+        refused = reported(found, await verify(rig.client, replace(found, proposal=weak), said.append))
+        assert await is_off_with_its_old_gains(rig)
+
+        report = reported(found, await verify(rig.client, found, said.append))
+        state = await rig.client.state("x")
+        loaded = await registers(rig)
+        place = shaft.position_counts
+
+    true = Plant.of(STIFF)
+    assert found.known.plant.acceleration == pytest.approx(true.acceleration, rel=0.1)
+    assert found.known.plant.friction_pwm == pytest.approx(true.friction_pwm, rel=0.2)
+    assert found.known.plant.delay_s == pytest.approx(true.delay_s, abs=LS_182AP.servo_cycle_s)
+    assert not refused.applied
+    assert refused.objection
+    assert report.applied
+    assert report.objection is None
+    assert not state.enabled
+    assert loaded == report.gains != CONFIGURED
+    assert not file_of("sim", "x").exists()
+    assert report.margins.phase_deg > 30
+    assert report.after.settled
+    assert report.after.settling_s <= report.before.settling_s + 0.005
+    assert report.after.overshoot < 0.15
+    assert report.after.following_error == pytest.approx(report.predicted.following_error, rel=0.2)
+    assert report.farthest <= report.within == WITHIN_COUNTS / 1000
+    assert abs(place) <= WITHIN_COUNTS
+    assert said[0] == "pulses: does the encoder count the motor's way?"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [({"motor_reversed": True}, "against an output"), ({"encoder_disconnected": True}, "the encoder counted nothing")],
+    ids=["reversed motor", "disconnected encoder"],
+)
+async def test_wrong_wires_end_it_within_the_stated_distance_and_the_gains_come_back(wrong, said):
+    places = [0.0]
+
+    async def watch(shaft):
+        while True:
+            places.append(shaft.position_counts)
+            await asyncio.sleep(0.002)
+
+    async with tuned_rig(replace(MotorPlant(), **wrong)) as (rig, shaft):
+        planned = await plan(rig.client, "x", WRONG_WITHIN)
+        watching = asyncio.create_task(watch(shaft), name="watch")
+        with pytest.raises(DriveFault, match=f"axis x: .*{said}") as refused:
+            await measure(rig.client, planned, 20.0, lambda _: None)
+        watching.cancel()
+        assert await is_off_with_its_old_gains(rig)
+
+    assert refused.value.axis == "x"
+    assert refused.value.remedy
+    assert 1 < max(map(abs, places)) <= 1000 * WRONG_WITHIN
+
+
+async def test_a_tuning_that_is_cancelled_puts_the_gains_back():
+    async with tuned_rig() as (rig, _), measuring(rig, "pulses") as task:
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+        assert await is_off_with_its_old_gains(rig)
+
+
+async def test_a_stop_by_anyone_ends_a_tuning_and_the_gains_are_put_back():
+    async with tuned_rig() as (rig, _), measuring(rig, "pulses") as task:
+        await rig.client.stop()
+        with pytest.raises(StopLatched):
+            await task
+
+        assert await is_off_with_its_old_gains(rig)
+        assert (await rig.client.state("x")).stop_latched
+        with pytest.raises(StopLatched):
+            await plan(rig.client, "x", None)
+
+
+async def test_gains_wait_on_the_disk_while_another_client_has_control():
+    async with tuned_rig() as (rig, _), measuring(rig, "pulses") as task:
+        async with control(rig.client, "ann", "x", force=True):
+            with pytest.raises(WrongState, match="could not be put back") as refused:
+                await task
+            with pytest.raises(WrongState, match="earlier tuning"):
+                await plan(rig.client, "x", None)
+        assert await registers(rig) != CONFIGURED
+
+        await put_back(Rig(rig.client, await rig.client.daemon()), kept_for("sim", "x"))
+
+        assert await is_off_with_its_old_gains(rig)
+    assert "ldcnd tune x --put-back" in str(refused.value.remedy)
+
+
+async def test_nothing_is_sent_by_a_plan_and_it_states_the_distance():
+    async with tuned_rig(counts_per_unit=500.0) as (rig, _):
+        planned = await plan(rig.client, "x", 1.5)
+
+        assert (await registers(rig))["kp"] == 0
+    document = plan_reported(planned)
+    assert (document.within, document.within_counts, document.unit) == (1.5, 750, "mm")
+    assert "it will stay within 1.5 mm (750 counts)" in document.lines[0]
+
+
+async def test_a_closed_loop_is_not_tuned():
+    async with tuned_rig() as (rig, _):
+        await rig.client.command("x", Power(on=True))
+
+        with pytest.raises(WrongState, match="begins with the loop open") as refused:
+            await plan(rig.client, "x", None)
+
+    assert "ldcnd axis power x off" in refused.value.remedy
+
+
+async def test_a_distance_must_fit_into_the_travel_and_be_long_enough():
+    async with tuned_rig() as (rig, _):
+        with pytest.raises(ValueOutOfRange, match="within 100 counts"):
+            await plan(rig.client, "x", 0.1)
+        await rig.client.command("x", Power(on=True))
+        reply = await rig.client.command("x", MoveAbsolute(position=99.0))
+        await rig.client.wait_for_end("x", reply.command_id)
+        await rig.client.command("x", Power(on=False))
+
+        with pytest.raises(PositionLimit, match="2 mm either way"):
+            await plan(rig.client, "x", None)
+        assert (await plan(rig.client, "x", 0.5)).bounds.within_counts == 500
+
+
+async def test_an_axis_that_has_limits_and_no_reference_is_not_tuned():
+    async with tuned_rig(reference="required") as (rig, _):
+        with pytest.raises(NotReferenced, match="does not know where it is"):
+            await plan(rig.client, "x", None)
+
+
+async def test_an_axis_that_comes_from_one_side_is_not_tuned():
+    async with tuned_rig(approach=ApproachConfig(direction="positive", distance=0.5)) as (rig, _):
+        with pytest.raises(WrongState, match="approach"):
+            await plan(rig.client, "x", None)
+
+
+async def test_an_axis_without_gains_is_told_to_get_some():
+    async with tuned_rig(gains=None) as (rig, _):
+        planned = await plan(rig.client, "x", None)
+        with pytest.raises(WrongState, match="no gains yet"):
+            await measure(rig.client, planned, None, lambda _: None)
+        await rig.client.command("x", SetGains(kp=350, el=4000))
+
+        assert not file_of("sim", "x").exists()
+
+
+async def test_a_smartstep_says_what_it_has_instead():
+    async with running_rig(load_config(SIMULATED.with_name("mixed.toml"))) as rig:
+        with pytest.raises(NotSupported, match="tunes itself") as refused:
+            await plan(rig.client, "feed", None)
+
+    assert "Pn110" in refused.value.remedy
