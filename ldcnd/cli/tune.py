@@ -19,11 +19,11 @@ from ldcnd.errors import ConfigError, WrongState
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ldcnd.tuning.ldcn.plan import Plan
+    from ldcnd.tuning.ldcn.report import MoveFigures, TuningReport
     from ldcnd.tuning.ldcn.response import Floats
+    from ldcnd.tuning.ldcn.session import Findings, Verified
     from ldcnd.tuning.ldcn.verdict import Measured
-    from ldcnd.tuning.plan import Plan
-    from ldcnd.tuning.report import MoveFigures, TuningReport
-    from ldcnd.tuning.session import Findings, Verified
 
 ROWS = 2
 """Of the picture: positions above, following errors below."""
@@ -72,9 +72,9 @@ def command(
         show_lines(target.run(lambda client: _put_back(client, axis)))
         return
     _require_numpy()
-    from ldcnd.tuning import plan as plans  # noqa: PLC0415 - needs an optional package
-    from ldcnd.tuning import report as reports  # noqa: PLC0415 - likewise
-    from ldcnd.tuning import session  # noqa: PLC0415 - likewise
+    from ldcnd.tuning.ldcn import plan as plans  # noqa: PLC0415 - needs an optional package
+    from ldcnd.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
+    from ldcnd.tuning.ldcn import session  # noqa: PLC0415 - likewise
 
     figure = stacked_rows(ROWS)[0] if plot else None  # missing matplotlib is said before anything moves
 
@@ -121,7 +121,7 @@ def _tell(line: str) -> None:
 
 
 async def _put_back(client: RigClient, axis: str) -> str:
-    from ldcnd.tuning.kept_gains import file_of, kept_for, put_back  # noqa: PLC0415 - nothing else needs it
+    from ldcnd.tuning.ldcn.kept_gains import file_of, kept_for, put_back  # noqa: PLC0415 - nothing else needs it
 
     await axis_of(client, axis)
     rig = Rig(client, await client.daemon())

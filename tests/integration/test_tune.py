@@ -23,11 +23,11 @@ from ldcnd.errors import (
 from ldcnd.model.commands import MoveAbsolute, Power, SetGains
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.tuning.kept_gains import file_of, kept_for, put_back
+from ldcnd.tuning.ldcn.kept_gains import file_of, kept_for, put_back
+from ldcnd.tuning.ldcn.plan import plan
 from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.plan import plan
-from ldcnd.tuning.report import plan_reported, reported
-from ldcnd.tuning.session import measure, verify
+from ldcnd.tuning.ldcn.report import plan_reported, reported
+from ldcnd.tuning.ldcn.session import measure, verify
 from tests.support.rig import SIMULATED, running_rig
 
 CONFIGURED = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000, "sr": 1, "deadband": 0}

@@ -8,7 +8,7 @@ from asyncio.subprocess import DEVNULL, PIPE
 import pytest
 
 from ldcnd.model.rig_commands import ListHolders
-from ldcnd.tuning.kept_gains import LEASE_S
+from ldcnd.tuning.ldcn.kept_gains import LEASE_S
 from tests.support.process import LDCND, ROOT, client, daemon
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(300)]
@@ -94,7 +94,7 @@ async def test_gains_of_a_tuning_that_was_killed_are_put_back_by_hand(state_file
         await ended(running)
         left, kept = await registers(rig), json.loads(state_file.read_text())
         async with asyncio.timeout(LEASE_S + BEGIN_S):
-            while (await rig.ask(ListHolders())).holders:
+            while any(each.client for each in (await rig.ask(ListHolders())).holders):
                 await asyncio.sleep(0.1)
         refused = await ended(await tune("-e", endpoint, "--yes"))
         put_back = await ended(await tune("-e", endpoint, "--put-back"))

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 
 from ldcnd.model.frozen import Frozen
+from ldcnd.tuning.ldcn.plan import Plan
 from ldcnd.tuning.ldcn.response import Figures
+from ldcnd.tuning.ldcn.session import Findings, Verified, registers_of
 from ldcnd.tuning.ldcn.verdict import Measured, worst
-from ldcnd.tuning.plan import Plan
-from ldcnd.tuning.session import Findings, Verified, registers_of
 
 
 class TuningPlan(Frozen):

@@ -10,8 +10,8 @@ from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
 from ldcnd.errors import NotReferenced, NotSupported, PositionLimit, Remedy, StopLatched, WrongState, step
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import AxisState
-from ldcnd.tuning.kept_gains import at_rest, kept_for
 from ldcnd.tuning.ldcn.excitation import Bounds, Excitation
+from ldcnd.tuning.ldcn.kept_gains import at_rest, kept_for
 
 WITHIN_COUNTS = 2000
 """Distance where none is wanted, counts."""

@@ -26,13 +26,13 @@ from ldcnd.errors import (
 )
 from ldcnd.model.samples import AxisState
 from ldcnd.model.traces import TakeTrace
-from ldcnd.tuning.kept_gains import LEASE_S, KeptGains, at_rest, forget, gains_in, keep, kept_for, load, put_back
 from ldcnd.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
 from ldcnd.tuning.ldcn.excitation import Excitation, Record, Shown, Trial, Trials
 from ldcnd.tuning.ldcn.identify import Identified, identify
+from ldcnd.tuning.ldcn.kept_gains import LEASE_S, KeptGains, at_rest, forget, gains_in, keep, kept_for, load, put_back
+from ldcnd.tuning.ldcn.plan import Plan, check_off
 from ldcnd.tuning.ldcn.response import Move, simulate
 from ldcnd.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, Measured, measured, objection, worst
-from ldcnd.tuning.plan import Plan, check_off
 
 CLIENT = "ldcnd tune"
 PUT_BACK_S = 15.0
