@@ -121,6 +121,11 @@ class ApproachConfig(Frozen):
     distance: float = Field(gt=0)
     """How far before the goal it begins, in axis units: more than the play."""
 
+    @property
+    def signed(self) -> float:
+        """The last motion, in axis units."""
+        return self.distance if self.direction == "positive" else -self.distance
+
 
 class LossPolicy(StrEnum):
     """Reaction of an axis to the loss of a client, the line or the daemon."""

@@ -1,6 +1,6 @@
 """An axis as a motor record: its fields, and what puts to them do.
 
-Fields follow the motor record of the EPICS collaboration. What the gateway cannot do has no field: retries, backlash.
+Fields follow the motor record of the EPICS collaboration. What the gateway cannot do has no field, such as retries.
 """
 
 import asyncio
@@ -134,6 +134,7 @@ class MotorRecord:
             "SREV": integer(1),
             "UREV": number(step, unit, precision=9),
             "RDBD": here(0.0),
+            "BDST": here(info.approach or 0.0),
             "OUT": string(f"{info.bus} {info.address}"),
             "DESC": string(f"{info.axis}, {info.model}"),
             "RTYP": string("motor"),

@@ -204,6 +204,8 @@ class AxisInfo(Frozen):
     """Software limits in axis units."""
     limit_stop: Literal["high", "low"] | None = None
     """Level of the limit switch inputs at which the drive stops a motion towards the switch; null when it does not."""
+    approach: float | None = None
+    """Signed distance over which moves come to their goal, in axis units; null without an approach from one side."""
     group: str | None = None
     """Its group: axes that `move_together` starts in the same servo cycle; null when it is in none."""
     capabilities: tuple[Verb, ...]

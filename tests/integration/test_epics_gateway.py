@@ -53,6 +53,7 @@ FIELDS = [
     "SREV",
     "UREV",
     "RDBD",
+    "BDST",
     "OUT",
     "DESC",
     "RTYP",
@@ -220,6 +221,26 @@ async def test_a_target_beyond_the_limit_is_refused_and_moves_nothing():
         assert (await running.client.state("x")).moving is Moving.NO
         await put(made, "T:x", 0.5)
         assert made.variables["T:x.LVIO"].value == 0
+
+
+@pytest.mark.parametrize(("direction", "distance"), [("positive", 0.5), ("negative", -0.5)])
+async def test_backlash_is_the_approach_of_the_daemon_and_one_put(direction: str, distance: float):
+    async with dialect_rig(LS_182AP, approach={"direction": direction, "distance": 0.5}) as drive:
+        rig = Rig(drive.rig.client, await drive.rig.client.daemon())
+        async with gateway(rig, prefix="T:", moves=("x",)) as made:
+            await shows(made, "T:x:control", "epics gateway")
+            await put(made, "T:x.CNEN", "Enable")
+            seen, target = [], -2.0 * distance  # from the wrong side
+            async with rig.samples("x", "position") as positions:
+                moving = asyncio.create_task(put(made, "T:x", target))
+                while not moving.done():
+                    seen.append((await anext(positions))[1].value)
+            await moving
+
+            assert made.variables["T:x.BDST"].value == distance
+            assert made.variables["T:x.BDST"].check_access("host", "user") == AccessRights.READ
+            assert made.variables["T:x.RBV"].value == pytest.approx(target, abs=0.02)
+            assert max(seen, key=abs) == pytest.approx(target - distance, abs=0.1)
 
 
 async def test_a_stop_halts_without_the_latch_and_the_put_is_complete():

@@ -328,7 +328,7 @@ class AxisMotion:
         way = goal.position - here if forward else here - goal.position
         if way >= approach.distance or (way >= 0 and self.approached and here_counts is not None):
             return None
-        begin = goal.position - (approach.distance if forward else -approach.distance)
+        begin = goal.position - approach.signed
         return self.plan_to(begin, velocity, acceleration)
 
     def on_line(self, plan: MotionPlan) -> LineAxis:

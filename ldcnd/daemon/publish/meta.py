@@ -217,6 +217,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         modulo=config.modulo,
         limits=config.limits,
         limit_stop=LEVELS[driver.spec.limit_stop],
+        approach=config.approach.signed if config.approach else None,
         group=group,
         capabilities=tuple(sorted(driver.capabilities, key=list(Verb).index)),
         items=tuple(item.value for item in TelemetryItem if _publishes(driver, item)),
