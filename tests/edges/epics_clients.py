@@ -140,10 +140,12 @@ def caproto_tools(record: str) -> None:
     tools = Path(sys.executable).parent
 
     def run(tool: str, *arguments: str) -> str:
-        return subprocess.run([tools / tool, *arguments], check=True, capture_output=True, text=True, timeout=30).stdout
+        return subprocess.run(
+            [tools / tool, *arguments], check=True, capture_output=True, text=True, timeout=120
+        ).stdout
 
     assert "motor" in run("caproto-get", "--no-repeater", f"{record}.RTYP")
-    run("caproto-put", "--no-repeater", "--notify", "--timeout", "20", record, "1.5")
+    run("caproto-put", "--no-repeater", "--notify", "--timeout", "60", record, "1.5")
     assert "1.5" in run("caproto-get", "--no-repeater", f"{record}.VAL")
 
 

@@ -136,7 +136,7 @@ async def test_a_killed_daemon_fails_the_run_and_the_drive_ends_its_move(tmp_pat
 
         def at_each(_, document):
             nonlocal began_s
-            if document["seq_num"] == 10:
+            if document["seq_num"] == MIDDLE:
                 began_s = time.monotonic()
                 kill()
 
@@ -145,7 +145,7 @@ async def test_a_killed_daemon_fails_the_run_and_the_drive_ends_its_move(tmp_pat
             with rig.control("x", client="scan") as x:
                 x.power(on=True).wait(20)
                 with pytest.raises(FailedStatus):
-                    engine(bp.scan([], x, 0, 199, POINTS))
+                    engine(bp.scan([], x, 0, 99.5, POINTS))
         return documents, time.monotonic() - began_s
 
     async with simulated_terminal(link, "ls182ap", "ls182ap", "picservo-v4", "picservo-v4"):
@@ -168,10 +168,10 @@ async def test_a_killed_daemon_fails_the_run_and_the_drive_ends_its_move(tmp_pat
                 _, position = await anext(positions)
 
     assert documents.exit_status == "fail"
-    assert 10 <= len(documents.data("x")) <= 12
+    assert MIDDLE <= len(documents.data("x")) <= MIDDLE + 2
     assert took_s < 40
     assert isinstance(position, PositionSample)
-    assert 8_000 < position.counts < 13_000  # where the last move led, not beyond
+    assert 49_000 < position.counts < 51_500  # where the last move led, not beyond
 
 
 @contextlib.asynccontextmanager
@@ -181,17 +181,39 @@ async def client_of(running, endpoint):
         yield rig
 
 
+CHECKED = """
+import bluesky
+from tests.support.bluesky_engine import Documents
+
+class Engine(bluesky.RunEngine):
+    def __init__(self):
+        super().__init__()
+        self.documents = Documents()
+        self.subscribe(self.documents.take)
+        self.subscribe(lambda name, document: print("checked", name))
+
+bluesky.RunEngine = Engine
+"""
+"""Makes each engine of a program check its documents against event-model's schemas."""
+
+
 @pytest.mark.real_time
-async def test_the_page_on_bluesky_runs():
+async def test_the_page_on_bluesky_runs_and_its_documents_are_valid():
     (program,) = re.findall(r"(?ms)^```python\n(.*?)^```", (ROOT / "docs" / "how-to" / "use-bluesky.md").read_text())
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
         typed = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", program, stdout=-1, env={**os.environ, "LDCND_CONNECT": endpoint}
+            *(sys.executable, "-c", CHECKED + program),
+            stdout=-1,
+            env={**os.environ, "LDCND_CONNECT": endpoint},
+            cwd=ROOT,
         )
         printed, _ = await typed.communicate()
 
     text = printed.decode()
     assert typed.returncode == 0, text
     assert text.count("\nstop") == 4, text
+    assert text.count("checked ") == text.count("\nstart") + text.count("\ndescriptor") + text.count("\nevent") + 4, (
+        text
+    )
     assert "x_trace_position" in text
     assert "event_page" in text

@@ -15,7 +15,7 @@ from ldcnd.model.samples import Moving
 from tests.edges.epics_clients import CLIENTS
 from tests.support.process import ROOT, client, daemon, free_port, process
 
-pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(300)]
 
 
 @asynccontextmanager

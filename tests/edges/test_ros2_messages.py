@@ -1,7 +1,12 @@
-"""Bytes and type hashes of messages against two other CDR libraries, and tokens as a plain Zenoh client sees them."""
+"""Bytes and type hashes of messages against two other CDR libraries, and tokens as other programs see them."""
 
 import asyncio
+import os
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -10,7 +15,7 @@ from pycdr2.types import float64, int32, sequence, uint8, uint32
 from rosbags.typesys import Stores, get_typestore
 
 from ldcnd.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
-from tests.support.process import LDCND, ROOT, daemon, free_port
+from tests.support.process import ROOT, daemon, free_port, process
 from tests.support.ros2_messages import DIAGNOSTICS, JOINTS
 from tests.support.router import router
 
@@ -107,26 +112,80 @@ def test_pycdr2_writes_the_same_diagnostics(message: DiagnosticArray):
     assert Diagnostics(header(message.t), [of(each) for each in message.statuses]).serialize() == message.payload
 
 
-@pytest.mark.real_time
-@pytest.mark.timeout(120)
-async def test_a_plain_zenoh_client_sees_node_publishers_and_joint_states():
+@asynccontextmanager
+async def bridged() -> AsyncIterator[str]:
+    """Run a daemon, the router of a graph and the bridge between them, in domain 3; yields the router's endpoint."""
     graph = f"tcp/127.0.0.1:{free_port()}"
-    async with router(graph), daemon(ROOT / "config" / "simulated.toml") as endpoint:
-        bridge = await asyncio.create_subprocess_exec(
-            *LDCND, "ros2", "x", "y", "-e", endpoint, "--router", graph, "--domain", "3", stdout=-1
-        )
+    async with (
+        router(graph),
+        daemon(ROOT / "config" / "simulated.toml") as endpoint,
+        process("ros2", "x", "y", "-e", endpoint, "--router", graph, "--domain", "3") as bridge,
+    ):
         assert bridge.stdout
         assert b"domain 3" in await bridge.stdout.readline()
-        tokens, samples = await asyncio.to_thread(look, graph)
+        yield graph
         bridge.terminate()
-        code = await bridge.wait()
+        assert await bridge.wait() == 0
+
+
+@pytest.mark.real_time
+@pytest.mark.timeout(300)
+async def test_a_plain_zenoh_client_sees_node_publishers_and_joint_states():
+    async with bridged() as graph:
+        tokens, samples = await asyncio.to_thread(look, graph)
 
     kinds = sorted(token.split("/")[5] for token in tokens)
     assert kinds == ["MP", "MP", "NN"]
-    assert code == 0
     read = STORE.deserialize_cdr(samples[0][0], "sensor_msgs/msg/JointState")
     assert read.name[0] in {"x", "y"}
     assert samples[0][1][:16] == b"\x0fsequence_number"
+
+
+SUBSCRIBER = """
+import queue
+import sys
+
+from zenoh_ros2_sdk import ROS2Subscriber
+from zenoh_ros2_sdk.session import ZenohSession
+
+port, type_hash = int(sys.argv[1]), sys.argv[2]
+session = ZenohSession.get_instance("127.0.0.1", port)
+session.register_message_type("int32 sec\\nuint32 nanosec", "builtin_interfaces/msg/Time")
+session.register_message_type("builtin_interfaces/Time stamp\\nstring frame_id", "std_msgs/msg/Header")
+fields = "std_msgs/Header header\\nstring[] name\\nfloat64[] position\\nfloat64[] velocity\\nfloat64[] effort"
+taken = queue.Queue()
+kind = "sensor_msgs/msg/JointState"
+ROS2Subscriber("/joint_states", kind, taken.put, fields, domain_id=3, router_port=port, type_hash=type_hash)
+seen = set()
+while seen != {"x", "y"}:
+    message = taken.get(timeout=60)
+    assert len(message.name) == len(message.position) == 1, message
+    assert abs(message.position[0]) < 1e-4, message
+    seen.add(message.name[0])
+session.close()
+"""
+
+
+@pytest.mark.real_time
+@pytest.mark.timeout(300)
+async def test_another_implementation_of_the_protocol_lists_the_topics_and_reads_them(tmp_path):
+    async def said(*command: str) -> str:
+        run = await asyncio.create_subprocess_exec(*command, stdout=-1, env={**os.environ, "HOME": str(tmp_path)})
+        printed, _ = await run.communicate()
+        assert run.returncode == 0
+        return printed.decode()
+
+    async with bridged() as graph:
+        tool = (str(Path(sys.executable).parent / "zenoh-ros2"), "--no-daemon", "--timeout", "20", "--domain-id", "3")
+        tool = (*tool, "--router", graph.removeprefix("tcp/"), "topic")
+        listed = await said(*tool, "list", "-t", "-v")
+        info = await said(*tool, "info", "-v", "/joint_states")
+        await said(sys.executable, "-c", SUBSCRIBER, graph.rpartition(":")[2], JOINT_STATE.type_hash)
+
+    assert "/joint_states [sensor_msgs/msg/JointState] 1 publisher" in listed
+    assert "/diagnostics [diagnostic_msgs/msg/DiagnosticArray] 1 publisher" in listed
+    assert "Node name: ldcnd_sim" in info
+    assert JOINT_STATE.type_hash in info
 
 
 def look(endpoint: str):

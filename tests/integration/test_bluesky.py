@@ -11,6 +11,7 @@ from bluesky import protocols
 from bluesky.preprocessors import monitor_during_wrapper
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
+import ldcnd.bluesky.axis
 from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
 from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, StopLatched, UnknownAxis, WrongState
 from ldcnd.model.events import ReadEvents
@@ -104,7 +105,9 @@ def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
     assert (lab.truth("x"), lab.truth("y")) == pytest.approx(began, abs=IN_POSITION)
 
 
-def test_a_fly_scan_yields_positions_with_the_times_of_the_drive(lab: Laboratory):
+def test_a_fly_scan_yields_pages_of_positions_with_the_times_of_the_drive(lab: Laboratory, monkeypatch):
+    monkeypatch.setattr(ldcnd.bluesky.axis, "PAGE_SAMPLES", 10)
+
     def flight():
         yield from bps.prepare(x, Fly(0, 5, velocity=5), wait=True)
         yield from bp.fly([x])
@@ -118,6 +121,7 @@ def test_a_fly_scan_yields_positions_with_the_times_of_the_drive(lab: Laboratory
     times = [at for page in pages for at in page["timestamps"]["x"]]
     assert descriptor["name"] == "x_fly"
     assert len(positions) >= 15  # 1 s at 20 Hz
+    assert {len(page["time"]) for page in pages[:-1]} == {10}
     assert (positions[0], positions[-1]) == pytest.approx((0, 5), abs=0.5)
     assert positions[-1] == pytest.approx(5, abs=IN_POSITION)
     assert times == sorted(set(times))

@@ -12,6 +12,7 @@ from event_model import DocumentNames, schema_validators
 from ldcnd.bluesky import Axis, Devices
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
+from ldcnd.config.rig import RigConfig
 from ldcnd.model.samples import LinkState
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
@@ -90,10 +91,11 @@ class Laboratory:
 
 
 @contextmanager
-def laboratory() -> Iterator[Laboratory]:
-    """Run a daemon and a RunEngine until the context ends."""
+def laboratory(config: RigConfig | None = None) -> Iterator[Laboratory]:
+    """Run a daemon and a RunEngine until the context ends, on two axes of the simulated rig if not on another one."""
     loop = JumpingLoop()
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, MODELS))))
+    chains = {} if config else {"line0": chain}
 
     def tick() -> None:
         loop.call_later(TICK_S, tick)
@@ -104,7 +106,7 @@ def laboratory() -> Iterator[Laboratory]:
     engine.subscribe(documents.take)  # type: ignore[no-untyped-call]
     there = LoopThread(loop)
     try:
-        with there.inside(running_rig(two_axes(), {"line0": chain})) as running:
+        with there.inside(running_rig(config or two_axes(), chains)) as running:
 
             async def rig() -> Rig:
                 for name in running.daemon.rig.axes:

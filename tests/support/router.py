@@ -6,6 +6,8 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from tests.support.process import START_TIME_S
+
 PROGRAM = """
 import json, sys, zenoh
 off = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
@@ -25,7 +27,7 @@ async def router(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process]:
     )
     try:
         assert process.stdout
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(START_TIME_S):
             assert await process.stdout.readline() == b"ready\n"
         yield process
     finally:
