@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.config.edit import set_for_axis
+from ldcnd.config.edit import edited_for_axis, set_for_axis
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
 from tests.support.process import ROOT
@@ -72,4 +72,57 @@ def test_a_file_that_is_laid_out_otherwise_is_left_alone(config):
         set_for_axis(config, "feed", LAYOUT)
 
     assert config.read_text() == text
+    assert list(config.parent.iterdir()) == [config]
+
+
+MOVED = """# the axis of the slide
+[[bus.axis]] # first
+model = "ls-182ap"
+name = "slide"
+address = 1
+unit = "mm"
+counts_per_unit = 1000 # 500 lines, 2 mm a turn
+velocity = 10
+acceleration = 100
+limits = { position_min = -50, velocity = 20 } # soft
+gains = { kp = 350, el = 4000 }
+
+# the next one
+[[bus.axis]]
+name = "lift"
+address = 2
+model = "ls-182ap"
+velocity = 10
+acceleration = 100
+[bus.axis.limits]
+velocity = 30
+
+"""
+LINES = 'rig = "r"\n[[bus]]\nname = "b"\nport = "sim:b"\nbaud = 115200\n'
+SIM = '[[sim]]\nname = "b"\nmodule = [{ model = "ls-182ap" }, { model = "ls-182ap" }]\n'
+
+
+def test_keys_and_inline_tables_of_the_axis_itself_are_replaced_and_remarks_kept(tmp_path):
+    config = tmp_path / "rig.toml"
+    config.write_text(LINES + MOVED + SIM)
+
+    set_for_axis(
+        config, "slide", {"": {"direction": '"reverse"', "counts_per_unit": "900.5"}, "limits": {"velocity": "15"}}
+    )
+    set_for_axis(config, "lift", {"": {"velocity": "5.0"}, "limits": {"velocity": "6.5"}})
+
+    expected = MOVED.replace("= 1000 #", "= 900.5 #").replace("velocity = 20 }", "velocity = 15 }")
+    expected = expected.replace(
+        "gains = { kp = 350, el = 4000 }\n", 'gains = { kp = 350, el = 4000 }\ndirection = "reverse"\n'
+    )
+    head, name, tail = expected.partition('name = "lift"')
+    tail = tail.replace("velocity = 10", "velocity = 5.0").replace("velocity = 30", "velocity = 6.5")
+    assert config.read_text() == LINES + head + name + tail + SIM
+
+
+def test_an_edit_can_be_seen_before_it_is_made(config):
+    edited = edited_for_axis(config, "feed", {"smartstep.trace": {"word_layout": '"lsb-io-shift"'}})
+
+    assert "lsb-io-shift" in edited
+    assert config.read_text() == MIXED
     assert list(config.parent.iterdir()) == [config]
