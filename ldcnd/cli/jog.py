@@ -2,16 +2,13 @@
 
 import asyncio
 import sys
-import termios
-import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.keyboard import keys, repetitions
 from ldcnd.cli.output import show_lines
 from ldcnd.cli.quantities import rounded
 from ldcnd.cli.sending import NAME, halted, halting
@@ -25,10 +22,6 @@ from ldcnd.model.meta import AxisInfo
 
 LEASE_S = 1.0
 """The daemon applies `loss.client` so soon when this program disappears."""
-FIRST_REPEAT_S = 0.8
-"""A keyboard begins to repeat a key that is held within this time."""
-NEXT_REPEAT_S = 0.25
-"""Longest time between its repetitions; after a longer silence the key counts as released."""
 HOLD_S = 0.4
 """Longest time between two repetitions of the key that reach the daemon; then it ends the jog."""
 RENEW_EACH_S = 0.1
@@ -88,7 +81,7 @@ async def _for_a_time(info: AxisInfo, held: Control, command: Jog, for_s: float)
 async def _while_pressed(client: RigClient, info: AxisInfo, held: Control, command: Jog) -> None:
     """Run the axis whenever the space bar is held, until another key is pressed."""
     first = command.model_copy(update={"hold_s": LONGEST_HOLD_S})
-    with _keys() as pressed:
+    with keys() as pressed:
         show_lines("hold the space bar to run, any other key ends", err=True)
         while await pressed.get() == " ":
             jog = Jogging(partial(held.command, info.axis), first)
@@ -104,31 +97,8 @@ async def _while_pressed(client: RigClient, info: AxisInfo, held: Control, comma
 async def _renewed_until_released(pressed: "asyncio.Queue[str]", jog: Jogging) -> None:
     """Keep a jog alive with the repetitions of the key; return when it is not repeated any more."""
     loop = asyncio.get_running_loop()
-    within_s, due_s = FIRST_REPEAT_S, loop.time()
-    while True:
-        try:
-            async with asyncio.timeout(within_s):
-                key = await pressed.get()
-        except TimeoutError:
-            return
-        if key != " ":
-            return
-        within_s = NEXT_REPEAT_S
+    due_s = loop.time()
+    async for _ in repetitions(pressed, " "):
         if loop.time() >= due_s:
             due_s = loop.time() + RENEW_EACH_S
             await jog.renew(hold_s=HOLD_S)
-
-
-@contextmanager
-def _keys() -> "Iterator[asyncio.Queue[str]]":
-    """Yield the keys that are pressed, one by one, as they come."""
-    pressed: asyncio.Queue[str] = asyncio.Queue()
-    loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal)
-    loop.add_reader(terminal, lambda: pressed.put_nowait(sys.stdin.read(1)))
-    try:
-        yield pressed
-    finally:
-        loop.remove_reader(terminal)
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)

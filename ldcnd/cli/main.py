@@ -15,6 +15,7 @@ COMMANDS = {
     "check-config": ("ldcnd.cli.check_config", "Validate a configuration without opening anything."),
     "plan": ("ldcnd.cli.plan", "Show what the lines of a configuration promise, before any hardware is there."),
     "scan": ("ldcnd.cli.scan", "Find out which drives are on a port, at which rate and in which state."),
+    "commission": ("ldcnd.cli.commission", "Go through the checklist of an axis: from its first motion to a report."),
     "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
     "stop": ("ldcnd.cli.rig:stop", "Stop every axis of a rig, or one, and latch."),
     "reset": ("ldcnd.cli.rig:reset", "Clear stop latches and faults of all axes."),

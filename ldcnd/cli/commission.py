@@ -1,0 +1,193 @@
+"""`ldcnd commission`: the checklist that takes an axis from its first motion to a configuration and a report."""
+
+import getpass
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from ldcnd import durable
+from ldcnd.cli.connection import Target
+from ldcnd.cli.ending import end_as_interrupted
+from ldcnd.cli.output import FAILED, show_lines
+from ldcnd.cli.terminal_person import TerminalPerson
+from ldcnd.cli.typed import Finite
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.commissioning.checklist import STEPS, Checklist, axis_of
+from ldcnd.commissioning.person import Left, Person
+from ldcnd.commissioning.record import StepRecord, StepState
+from ldcnd.commissioning.report import html_of
+from ldcnd.config.rig import load_config
+from ldcnd.errors import ConfigError
+from ldcnd.version import version
+
+RUN, SKIP, LATER = ("y", "yes"), ("s", "skip"), ("n", "no")
+
+
+@click.command()
+@click.argument("axis")
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    help="The rig's configuration (TOML); the record is kept beside it.",
+)
+@click.option("--step", "name", type=click.Choice(list(STEPS)), help="Run this step only, done or not.")
+@click.option("--list", "only_list", is_flag=True, help="Show the checklist; run nothing.")
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write a report of everything that is known at the end (HTML).",
+)
+@click.option(
+    "--for", "for_s", type=Finite(0, 3600, min_open=True), help="Longest motion of a step, seconds, instead of a key."
+)
+@click.option("--by", default=getpass.getuser, show_default="the login", help="Who answers, for the record.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines: the record of each step.")
+@click.option(
+    "--connect", "-e", multiple=True, envvar="LDCND_CONNECT", help="Zenoh endpoint of the daemon, or HOST:PORT."
+)
+@click.option("--login", type=click.Path(path_type=Path), help="Zenoh configuration file, as `ldcnd pki` makes it.")
+def command(
+    axis: str,
+    config: Path,
+    name: str | None,
+    report: Path | None,
+    for_s: float | None,
+    by: str,
+    connect: tuple[str, ...],
+    login: Path | None,
+    *,
+    only_list: bool,
+    as_json: bool,
+) -> None:
+    """Go through the checklist of AXIS, step by step; leave it at any question, and go on another time.
+
+    Each step says what will move, how far and what catches it, and asks. It moves only while the space bar is held, or
+    with --for for a time, and is halted at Ctrl-C and when the terminal goes. Proposed values are shown as a change of
+    the configuration and written when you say so.
+    """
+    rig = load_config(config)
+    axis_of(rig, axis)
+    target = Target(connect, (), login, rig.rig, as_json=as_json)
+    person = TerminalPerson(for_s)
+
+    async def work(client: RigClient) -> bool:
+        checklist = Checklist(Rig(client, await client.daemon()), config, axis, person, by=by)
+        session = _Session(target, person, checklist, config)
+        try:
+            if only_list:
+                return await session.show_list()
+            await session.put_back_gains()
+            return await session.go_through(name)
+        except Left as left:
+            person.tell(f"{left}; the same command goes on from here")
+            return False
+        finally:
+            if report:
+                _write_report(report, checklist, config)
+
+    end_as_interrupted()
+    if not target.run(work):
+        sys.exit(FAILED)
+
+
+class _Session:
+    """One call of the command."""
+
+    def __init__(self, target: Target, person: Person, checklist: Checklist, config: Path) -> None:
+        self._target = target
+        self._person = person
+        self._checklist = checklist
+        self._config = config
+
+    async def show_list(self) -> bool:
+        """Show every step with what is known of it."""
+        await self._refresh()
+        for name in STEPS:
+            self._show(self._checklist.record.of(name))
+        return True
+
+    async def put_back_gains(self) -> None:
+        """Put gains back that an earlier call has left in the drive, once the person agrees."""
+        if self._checklist.record.gains_to_put_back is not None:
+            self._person.tell(
+                "an earlier call was killed in the middle of a step: the drive has low gains of that step"
+            )
+            if not await self._person.confirm("put the former gains back now? The loop is opened for it"):
+                raise Left("the gains are still low")
+            await self._checklist.put_back_gains()
+
+    async def go_through(self, name: str | None) -> bool:
+        """Go through one step, or through all open ones; tell whether none has failed."""
+        await self._refresh()
+        if name:
+            return await self._one(name) is not False
+        name = self._checklist.next_open()
+        while name:
+            goes_on = await self._one(name)
+            if goes_on is not None:
+                return goes_on
+            name = self._checklist.next_open(after=name)
+        self._person.tell("the end of the checklist; --list shows it, --report writes it")
+        return True
+
+    async def _refresh(self) -> None:
+        self._person.tell(*await self._checklist.refresh())
+
+    async def _one(self, name: str) -> bool | None:
+        """Explain a step, run it if the person agrees; None when the next one may follow, else whether all is well."""
+        step = STEPS[name]
+        self._person.tell("", f"{step.title} ({name})", f"  {step.about}")
+        self._person.tell(*(f"  * {line}" for line in await self._checklist.preview(name)))
+        answer = ""
+        while answer not in RUN + SKIP + LATER:
+            answer = (await self._person.ask("run it: [y]es, [s]kip it for a reason, [n]ot now")).lower()
+        if answer in LATER:
+            return None
+        if answer in SKIP:
+            while not (reason := await self._person.ask("for which reason")):
+                pass
+            self._show(await self._checklist.skip(name, reason))
+            return None
+        kept = await self._checklist.run(name)
+        self._show(kept)
+        if kept.result.state is StepState.FAILED:
+            return False
+        return await self._offer(name)
+
+    async def _offer(self, name: str) -> bool | None:
+        """Show what a step proposes as a change of the configuration, and write it if the person agrees."""
+        change = self._checklist.change(name)
+        if change is None:
+            return None
+        self._person.tell(*change.lines)
+        if not await self._person.confirm(f"write this into {self._config}"):
+            return None
+        self._checklist.write(change)
+        if change.restarts:
+            self._person.tell(f"{self._config} is changed: restart the daemon, then give the same command again")
+        else:
+            self._person.tell(
+                f"{self._config} is changed: SIGHUP lets the daemon read it; then give the same command again"
+            )
+        return True
+
+    def _show(self, kept: StepRecord) -> None:
+        result = kept.result
+        proposes = "; proposes " + ", ".join(f"{each.name} = {each.literal}" for each in result.proposals)
+        text = kept.reopened or result.text or STEPS[kept.step].title
+        state = result.state.value.replace("_", " ")
+        self._target.show(kept, f"{kept.step:8} {state:12} {text}{proposes if result.proposals else ''}")
+
+
+def _write_report(path: Path, checklist: Checklist, config: Path) -> None:
+    at = datetime.now(UTC).isoformat(timespec="seconds")
+    text = html_of(checklist.record, STEPS, config.read_text(encoding="utf-8"), version(), at)
+    try:
+        durable.replace(path, text)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    show_lines(f"{path}: written", err=True)

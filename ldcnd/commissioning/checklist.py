@@ -1,0 +1,283 @@
+"""The checklist of one axis: which steps there are, which are open, and what happens around the run of one."""
+
+import difflib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pydantic import JsonValue
+
+from ldcnd.client.rig import Rig
+from ldcnd.commissioning import record as records
+from ldcnd.commissioning.homing import HomeRepeatability
+from ldcnd.commissioning.limit_switches import LimitSwitches
+from ldcnd.commissioning.lowered_gains import put_back
+from ldcnd.commissioning.motor import MotorDirection
+from ldcnd.commissioning.person import Person, said
+from ldcnd.commissioning.questions import Gains, Load
+from ldcnd.commissioning.record import Proposal, Record, Result, StepRecord, StepState
+from ldcnd.commissioning.scale import Scale
+from ldcnd.commissioning.speed import HighestSpeed
+from ldcnd.commissioning.step import Site, Step, seen
+from ldcnd.commissioning.travel import Travel
+from ldcnd.config.axis import AxisConfig, MovedAxisConfig
+from ldcnd.config.edit import draft_of, edited_for_axis
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.errors import ConfigError, LdcndError, UnknownAxis, WrongState
+from ldcnd.model.meta import AxisInfo
+
+STEPS: dict[str, Step] = {
+    each.name: each
+    for each in (
+        Load(),
+        MotorDirection(),
+        Scale(),
+        LimitSwitches(),
+        HomeRepeatability(),
+        Travel(),
+        HighestSpeed(),
+        Gains(),
+    )
+}
+"""All of them, in the order in which they build on each other."""
+CLIENT = "ldcnd commission"
+LEASE_S = 1.0
+"""So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
+SETTLED = (StepState.DONE, StepState.SKIPPED, StepState.NOT_POSSIBLE)
+SAME_IN_FILE = ("model", "address", "unit", "counts_per_unit", "direction", "modulo", "limits")
+"""Settings in which the running daemon and the file must agree, or lengths and limits would mean something else."""
+RELOADED = MovedAxisConfig.reloadable
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a step proposes, as a change of the file.
+
+    Attributes:
+        text: the file as it would be.
+        lines: the difference, as `diff -u` shows it.
+        restarts: whether the daemon must be restarted for it; otherwise SIGHUP has it read the file again.
+    """
+
+    text: str
+    lines: tuple[str, ...]
+    restarts: bool
+
+
+class Checklist:
+    """The steps of one axis and what is known of them; made by `open_checklist`.
+
+    Attributes:
+        record: what is known, as it is on the disk.
+        path: of the record.
+    """
+
+    def __init__(
+        self, rig: Rig, config: Path, axis: str, person: Person, *, by: str, now: Callable[[], datetime] | None = None
+    ) -> None:
+        self.path = records.file_of(config, rig.name, axis)
+        self.record = records.read(self.path, rig.name, axis)
+        self._rig = rig
+        self._config = config
+        self._axis = axis
+        self._person = person
+        self._by = by
+        self._now = now or (lambda: datetime.now(UTC))
+
+    def next_open(self, after: str | None = None) -> str | None:
+        """Return the first step that is neither done nor settled otherwise; None when there is none.
+
+        Args:
+            after: only those behind this one.
+        """
+        names = list(STEPS)
+        behind = names[names.index(after) + 1 :] if after else names
+        return next((name for name in behind if self.record.of(name).result.state not in SETTLED), None)
+
+    async def refresh(self) -> list[str]:
+        """Compare the record with the drive and the configuration as they are now.
+
+        Returns:
+            In words what has been reopened, and why.
+        """
+        site = await self._site()
+        messages = []
+        record = self.record
+        for name, step in STEPS.items():
+            kept = record.of(name)
+            differs = records.changes(kept, _basis(step, site)) if kept.result.state is not StepState.OPEN else []
+            if differs:
+                why = f"{step.title} is open again: {'; '.join(differs)}"
+                messages.append(why)
+                opened = Result(state=StepState.OPEN, text="", proposals=())
+                record = record.with_step(StepRecord(step=name, result=opened, reopened=why))
+            elif kept.result.state is StepState.OPEN and (obstacle := step.obstacle(site)):
+                impossible = Result(state=StepState.NOT_POSSIBLE, text=obstacle)
+                record = record.with_step(self._kept(step, site, impossible))
+            elif kept.result.state is StepState.NOT_POSSIBLE and not step.obstacle(site):
+                record = record.with_step(StepRecord(step=name))
+        if record != self.record:
+            self._keep(record)
+        return messages
+
+    async def put_back_gains(self) -> None:
+        """Put gains back that a step, or an earlier run that was killed, has left low; nothing without such.
+
+        Raises:
+            LdcndError: as the daemon refused it; they are still to be put back.
+            TimeoutError: it takes too long; likewise.
+        """
+        if self.record.gains_to_put_back is not None:
+            await put_back(self._rig, self._axis, self.record.gains_to_put_back, self._keep_gains)
+
+    async def preview(self, name: str) -> tuple[str, ...]:
+        """Return in words what a step would do now; nothing is sent to the drive.
+
+        Raises:
+            WrongState: the daemon runs with another configuration than the file.
+            LdcndError: it would be refused.
+        """
+        site = await self._site()
+        _require_same(site)
+        step = STEPS[name]
+        if obstacle := step.obstacle(site):
+            return (obstacle,)
+        return await step.preview(site)
+
+    async def run(self, name: str) -> StepRecord:
+        """Run a step that was confirmed, and keep its result; a failure is kept, too, before it is raised.
+
+        Raises:
+            LdcndError: it has failed.
+            Left: the person has left in its middle; it stays as it was.
+        """
+        site = await self._site()
+        _require_same(site)
+        step = STEPS[name]
+        if obstacle := step.obstacle(site):
+            return self._settle(step, site, Result(state=StepState.NOT_POSSIBLE, text=obstacle))
+        control = self._rig.control(self._axis, client=CLIENT, lease_s=LEASE_S)
+        try:
+            async with control if step.moves else self._rig.watch(self._axis) as axis:
+                result = await step.run(site, await seen(axis))
+        except LdcndError as error:
+            self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
+            raise
+        finally:
+            with suppress(LdcndError, TimeoutError):  # the record says that they are still to be put back
+                await self.put_back_gains()
+        return self._settle(step, site, result)
+
+    async def skip(self, name: str, reason: str) -> StepRecord:
+        """Settle a step without running it, for a reason."""
+        return self._settle(STEPS[name], await self._site(), Result(state=StepState.SKIPPED, text=reason))
+
+    def change(self, name: str) -> Change | None:
+        """Return how a step would change the configuration; None when it proposes nothing that is not there.
+
+        Raises:
+            ConfigError: it has to be put in by hand, or would make no configuration.
+        """
+        tables: dict[str, dict[str, str]] = {}
+        proposals = self.record.of(name).result.proposals
+        for each in proposals:
+            tables.setdefault(each.table, {})[each.key] = each.literal
+        if not tables:
+            return None
+        before, after = self._config.read_text(encoding="utf-8"), edited_for_axis(self._config, self._axis, tables)
+        if before == after:
+            return None
+        named = str(self._config)
+        lines = difflib.unified_diff(before.splitlines(), after.splitlines(), named, named, lineterm="", n=2)
+        return Change(after, tuple(lines), restarts=any(not _is_reloaded(each) for each in proposals))
+
+    def write(self, change: Change) -> None:
+        """Replace the configuration; it was checked whole when the change was made.
+
+        Raises:
+            ConfigError: it cannot be written; it is as it was.
+        """
+        try:
+            with draft_of(self._config) as draft:
+                draft.write_text(change.text, encoding="utf-8")
+                draft.replace(self._config)
+        except OSError as error:
+            raise ConfigError(f"{self._config}: cannot be written: {error.strerror}") from error
+
+    # -- what it stands on -------------------------------------------------------------------------------------------
+
+    async def _site(self) -> Site:
+        config = axis_of(load_config(self._config), self._axis)
+        infos = {info.axis: info for info in await self._rig.describe()}
+        if self._axis not in infos:
+            raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
+        return Site(self._rig, infos[self._axis], config, self._person, self._keep_gains)
+
+    def _kept(self, step: Step, site: Site, result: Result) -> StepRecord:
+        at = self._now().isoformat(timespec="seconds")
+        return StepRecord(step=step.name, result=result, at=at, by=self._by, basis=_basis(step, site))
+
+    def _settle(self, step: Step, site: Site, result: Result) -> StepRecord:
+        kept = self._kept(step, site, result)
+        self._keep(self.record.with_step(kept))
+        return kept
+
+    def _keep(self, record: Record) -> None:
+        records.write(self.path, record)
+        self.record = record
+
+    def _keep_gains(self, gains: dict[str, int] | None) -> None:
+        self._keep(self.record.model_copy(update={"gains_to_put_back": gains}))
+
+
+def axis_of(rig: RigConfig, name: str) -> AxisConfig:
+    """Return the configuration of an axis.
+
+    Raises:
+        UnknownAxis: there is none of that name.
+    """
+    axes: dict[str, AxisConfig] = {axis.name: axis for bus in rig.bus for axis in bus.axis}
+    if name not in axes:
+        raise UnknownAxis(f"there is no axis {name!r}", axis=name, value=name, remedy=f"there are: {', '.join(axes)}")
+    return axes[name]
+
+
+def _basis(step: Step, site: Site) -> dict[str, JsonValue]:
+    """Return what a step depends on: who the drive is, and some of its configuration."""
+    settings = site.config.model_dump(mode="json")
+    basis: dict[str, JsonValue] = {"model": site.info.model, "address": site.info.address}
+    if site.info.identity is not None:  # it answers
+        basis["drive"] = site.info.identity
+    for name in step.depends:
+        value: JsonValue = settings
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        basis[name] = value
+    return basis
+
+
+def _require_same(site: Site) -> None:
+    """Refuse a daemon that runs with another configuration than the file.
+
+    Raises:
+        WrongState: names the settings.
+    """
+    differ = list(_differing(site.info, site.config))
+    if differ:
+        raise WrongState(
+            f"axis {site.info.axis}: the daemon runs with another {' and '.join(differ)} than the file",
+            axis=site.info.axis,
+            remedy="restart the daemon with this file",
+        )
+
+
+def _differing(info: AxisInfo, config: AxisConfig) -> Iterator[str]:
+    for name in SAME_IN_FILE:
+        if getattr(info, name) != getattr(config, name):
+            yield name
+
+
+def _is_reloaded(proposal: Proposal) -> bool:
+    return (proposal.table or proposal.key).partition(".")[0] in RELOADED

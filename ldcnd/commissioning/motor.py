@@ -1,0 +1,173 @@
+"""Motor against encoder: does a positive output turn the motor the way in which the encoder counts forward?
+
+The loop is closed with an output limit that begins with a single PWM step and grows by half, and with a low position
+error limit. The set-point leads away beyond that limit: a motor that turns the wrong way, one that does not turn and an
+encoder that does not count all end in the drive, which opens its loop.
+"""
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+
+from typing_extensions import override
+
+from ldcnd.client.axis import Axis
+from ldcnd.commissioning.lowered_gains import lowered_gains
+from ldcnd.commissioning.record import Figure, Result, Series, StepState
+from ldcnd.commissioning.step import Site, Step, open_loop, refuse_previewed, rest_counts, seen
+from ldcnd.errors import CommandAborted, DriveFault, StopLatched, WrongState
+from ldcnd.model.commands import Verb
+from ldcnd.model.samples import AxisState
+
+MOST_EL_COUNTS = 200
+OUTPUTS = (1, 2, 3, 4, 6, 9, 13, 20, 30, 45, 60)
+"""Output limits that are tried, in PWM steps of 255. A motor that stood at one gets at most twice its friction next."""
+LEAD = 2.0
+"""The set-point goes this many times the position error limit."""
+DURATION_S = 0.5
+"""Time that the set-point takes for that, seconds."""
+RAMP_SHARE = 0.1
+CAUGHT = 3.0
+"""A runaway ends within this many times the position error limit: one until the loop opens; then it coasts, at most
+twice as far, because it was driven with at most twice its friction, which at speed is at least half of that at rest."""
+FORWARD_SHARE = 0.5
+REVERSE_SHARE = 0.125
+"""Shares of the position error limit from which a motion counts as one."""
+DAMPING = 8
+"""kd over kp while the step runs."""
+PWM_PER_GAIN = 256
+"""The drive's output is kp times the error, divided by this."""
+REGISTER_MOST = 0x7FFF
+
+
+class MotorDirection(Step):
+    """Compares the direction of the motor with that of the encoder."""
+
+    name = "motor"
+    title = "Motor against encoder"
+    about = (
+        "The loop is closed with a low output limit and a low position error limit, and asked for a fraction of a turn,"
+        " with a little more output each time, until the encoder counts. If motor and encoder disagree, the position"
+        " error limit opens the loop."
+    )
+    needs = (Verb.POWER, Verb.MOVE_RELATIVE, Verb.SET_GAINS)
+
+    @override
+    def obstacle(self, site: Site) -> str:
+        if site.config.gains is None and not super().obstacle(site):
+            return "not possible without `gains` in the configuration: the loop stays open"
+        return super().obstacle(site)
+
+    @override
+    async def preview(self, site: Site) -> tuple[str, ...]:
+        el = error_limit(site)
+        caught = CAUGHT * el
+        lead = _lead(site, el)
+        await _refuse_what_cannot_be(site, lead)
+        return (
+            (
+                f"{site.info.axis} moves forward by at most {LEAD * el:.0f} counts ({site.length(lead.distance)}), at"
+                f" {site.length(lead.velocity)}/s, with {OUTPUTS[0]} to {OUTPUTS[-1]} of 255 PWM steps"
+            ),
+            (
+                f"a motor that turns the wrong way is caught: the loop opens after {el} counts, and the axis stands"
+                f" within {caught:.0f} counts ({site.length(caught / site.counts_per_unit)}), if its friction stops it"
+            ),
+            (
+                "an encoder that does not count: the loop opens, too, within"
+                f" {lead.distance / lead.velocity:.2g} s each time"
+            ),
+            "the loop is open before, between and after: a load that falls without power must be secured",
+            "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
+        )
+
+    @override
+    async def run(self, site: Site, axis: Axis) -> Result:
+        el = error_limit(site)
+        points: list[tuple[float, float]] = []
+        async with lowered_gains(site, axis) as old:
+            for output in (each for each in OUTPUTS if each <= old["ol"]):
+                moved = await self._try(site, axis, output, el)
+                points.append((output, moved))
+                if moved >= FORWARD_SHARE * el or moved <= -REVERSE_SHARE * el:
+                    break
+        return _judged(el, points)
+
+    async def _try(self, site: Site, axis: Axis, output: int, el: int) -> int:
+        """Ask for a motion with an output limit; return how far the axis is then from where it was, in counts."""
+        # from half the position error limit on the output is at its limit
+        kp = min(math.ceil(2 * PWM_PER_GAIN * output / el), REGISTER_MOST)
+        lowered = {"kp": kp, "kd": min(DAMPING * kp, REGISTER_MOST), "ki": 0, "il": 0, "ol": output, "el": el}
+        await axis.set_gains(**lowered)
+        sign = -1 if site.info.direction == "reverse" else 1
+        before = await rest_counts(axis)
+        lead = _lead(site, el)
+        await axis.power(on=True)
+        motion = await axis.move_relative(lead.distance, velocity=lead.velocity, acceleration=lead.acceleration)
+        with suppress(DriveFault, CommandAborted):  # where the axis is tells more
+            await motion.done()
+        if axis.state.stop_latched:
+            raise StopLatched(f"axis {axis.name}: a stop has come", axis=axis.name)
+        tripped = axis.state.state is AxisState.ERROR_STOP
+        await open_loop(axis)
+        moved = sign * (await rest_counts(axis) - before)
+        if not tripped and abs(moved) < REVERSE_SHARE * el:
+            raise WrongState(
+                f"axis {axis.name} was halted before it could be seen to move", axis=axis.name, remedy="run it again"
+            )
+        return moved
+
+
+def error_limit(site: Site) -> int:
+    """Return the position error limit of the step, in counts: that of the configuration if it is lower."""
+    return min(MOST_EL_COUNTS, site.config.gains.el) if site.config.gains else MOST_EL_COUNTS
+
+
+@dataclass(frozen=True, slots=True)
+class _Lead:
+    """How the set-point leads away from the axis, in axis units."""
+
+    distance: float
+    velocity: float
+    acceleration: float
+
+
+def _lead(site: Site, el: int) -> _Lead:
+    distance, limits = LEAD * el / site.counts_per_unit, site.info.limits
+    velocity = min(distance / DURATION_S, limits.velocity or math.inf)
+    return _Lead(distance, velocity, min(velocity / (RAMP_SHARE * DURATION_S), limits.acceleration or math.inf))
+
+
+async def _refuse_what_cannot_be(site: Site, lead: _Lead) -> None:
+    """Raise what the daemon would refuse about the distance."""
+    async with site.rig.watch(site.info.axis) as axis:
+        if (await seen(axis)).state.stop_latched:
+            raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy="reset it")
+        reply = await axis.preview(distance=lead.distance, velocity=lead.velocity, acceleration=lead.acceleration)
+    refuse_previewed(reply)
+
+
+def _judged(el: int, points: list[tuple[float, float]]) -> Result:
+    output, moved = points[-1]
+    figures = (
+        Figure(what="moved", value=moved, unit="counts"),
+        Figure(what="output limit", value=output, unit="of 255 PWM steps"),
+        Figure(what="position error limit", value=el, unit="counts"),
+        Figure(what="stated distance", value=CAUGHT * el, unit="counts"),
+    )
+    series = (Series(title="Motion by output limit", x="PWM steps of 255", y="counts forward", points=tuple(points)),)
+    if moved >= FORWARD_SHARE * el:
+        text, state = f"motor and encoder agree: it moved forward by {moved:.0f} counts", StepState.DONE
+    elif moved <= -REVERSE_SHARE * el:
+        text = (
+            f"motor and encoder disagree: asked forward, it moved back by {-moved:.0f} counts until the loop opened."
+            " Switch the drive off and swap the two wires of the motor, then run this step again"
+        )
+        state = StepState.FAILED
+    else:
+        text = (
+            f"the encoder did not count with up to {output:.0f} of 255 PWM steps. If the motor turned, the encoder is"
+            " not connected: switch off and check its wires. If it stood, check supply, motor wires and brake"
+        )
+        state = StepState.FAILED
+    return Result(state=state, text=text, figures=figures, series=series)

@@ -1,0 +1,70 @@
+"""The person who commissions an axis, as the checklist meets them: answers, confirmation, and a key that is held."""
+
+import asyncio
+import math
+from abc import ABC, abstractmethod
+from contextlib import AbstractAsyncContextManager
+
+from ldcnd.errors import LdcndError
+
+YES = ("y", "yes")
+NO = ("n", "no")
+
+
+class Left(Exception):
+    """The person has left the checklist: no answer will come."""
+
+
+class Person(ABC):
+    """Answers questions; none of these may block the event loop, because control over the axis is renewed on it."""
+
+    @abstractmethod
+    def tell(self, *lines: str) -> None:
+        """Show lines of text."""
+
+    @abstractmethod
+    async def ask(self, question: str) -> str:
+        """Return the answer to a question, without spaces around it.
+
+        Raises:
+            Left: none will come.
+        """
+
+    @abstractmethod
+    def holding(self, what: str) -> AbstractAsyncContextManager[asyncio.Event]:
+        """Begin when the person holds the key that allows a motion; yields what is set when it is released.
+
+        Args:
+            what: what happens while it is held.
+
+        Raises:
+            Left: the key will not be held.
+        """
+
+    async def confirm(self, question: str) -> bool:
+        """Ask until the answer is yes or no."""
+        while True:
+            answer = (await self.ask(f"{question} [y/n]")).lower()
+            if answer in YES + NO:
+                return answer in YES
+
+    async def number(self, question: str, default: float | None = None) -> float:
+        """Ask until the answer is a finite number; an empty one stands for the default."""
+        shown = question if default is None else f"{question} [{default:g}]"
+        while True:
+            answer = await self.ask(shown)
+            if not answer and default is not None:
+                return default
+            try:
+                number = float(answer)
+            except ValueError:
+                self.tell(f"{answer!r} is no number")
+                continue
+            if math.isfinite(number):
+                return number
+            self.tell("it must be a finite number")
+
+
+def said(error: LdcndError) -> str:
+    """Return an error and its remedy in one line."""
+    return f"{error.message}; {error.remedy}" if error.remedy else error.message

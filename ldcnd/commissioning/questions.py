@@ -1,0 +1,59 @@
+"""Steps that ask and move nothing: a brake or a hanging load, and whether the loop is tuned."""
+
+from typing_extensions import override
+
+from ldcnd.client.axis import Axis
+from ldcnd.commissioning.record import Figure, Result, StepState
+from ldcnd.commissioning.step import Site, Step, done
+from ldcnd.model.commands import Verb
+
+LOADS = ("none", "hangs", "brake", "both")
+SHOWN = ("kp", "kd", "ki", "il", "ol", "el")
+POWERING_OFF = ("bus", "client", "daemon")
+
+
+class Load(Step):
+    """Asks for a hanging load and a brake."""
+
+    name = "load"
+    title = "Brake or hanging load"
+    about = "You say whether something falls when the motor has no power, and whether a brake holds it."
+    moves = False
+    depends = ("loss.client", "loss.bus", "loss.daemon")
+
+    @override
+    async def run(self, site: Site, axis: Axis) -> Result:
+        while (answer := (await site.person.ask(f"what falls without power: {', '.join(LOADS)}")).lower()) not in LOADS:
+            site.person.tell(f"{answer!r} is none of {', '.join(LOADS)}")
+        remark = await site.person.ask("a remark for the report, or nothing")
+        figures = [Figure(what="load", value=answer)]
+        if remark:
+            figures.append(Figure(what="remark", value=remark))
+        text = {
+            "none": "nothing falls without power",
+            "hangs": "the load falls without power: secure it before every step that opens the loop",
+            "brake": "nothing falls, and a brake holds the axis: release it before it moves",
+            "both": "a brake holds the load: see that it closes before the loop opens, and release it before it moves",
+        }[answer]
+        falling = [name for name in POWERING_OFF if getattr(site.config.loss, name).value == "power_off"]
+        if answer in ("hangs", "both") and falling:
+            text += f"; `loss` powers it off when {' and '.join(falling)} is lost: it falls then"
+        return done(text).model_copy(update={"figures": tuple(figures)})
+
+
+class Gains(Step):
+    """Points to tuning."""
+
+    name = "gains"
+    title = "Gains"
+    about = "`ldcnd tune AXIS` measures the axis and proposes gains. This step only asks whether that was done."
+    moves = False
+    needs = (Verb.SET_GAINS,)
+
+    @override
+    async def run(self, site: Site, axis: Axis) -> Result:
+        registers = {each.name: each.value for each in site.info.registers if each.value is not None}
+        figures = tuple(Figure(what=name, value=registers[name]) for name in SHOWN if name in registers)
+        if await site.person.confirm(f"are the gains of {axis.name} tuned, and in the configuration"):
+            return Result(state=StepState.DONE, text="tuned, as the person says", figures=figures)
+        return Result(state=StepState.OPEN, text=f"type: ldcnd tune {axis.name}")

@@ -1,0 +1,320 @@
+"""The checklist of commissioning, step by step, on a whole simulated daemon."""
+
+import asyncio
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from ldcnd.client.rig import Rig
+from ldcnd.commissioning.checklist import STEPS
+from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS
+from ldcnd.commissioning.person import Left
+from ldcnd.commissioning.record import StepState
+from ldcnd.commissioning.report import html_of
+from ldcnd.config.rig import load_config
+from ldcnd.errors import LeaseExpired, StopLatched, WrongState
+from ldcnd.model.commands import Reset
+from tests.support.commissioning import AXIS, GAINS, commissioning_rig, rig_text
+
+
+def figures(record):
+    return {each.what: each.value for each in record.result.figures}
+
+
+def proposed(record):
+    return {each.name: each.value for each in record.result.proposals}
+
+
+async def test_a_motor_that_agrees_with_its_encoder_is_found_within_the_stated_distance(tmp_path):
+    async with commissioning_rig(tmp_path) as rig:
+        checklist = await rig.checklist()
+        preview = await checklist.preview("motor")
+        kept = await checklist.run("motor")
+
+        assert kept.result.state is StepState.DONE
+        assert "agree" in kept.result.text
+        assert any("within 600 counts (0.6 mm)" in line for line in preview)
+        assert 100 <= figures(kept)["moved"] <= 2 * MOST_EL_COUNTS
+        assert abs(rig.drive.shaft.position_counts) <= CAUGHT * MOST_EL_COUNTS
+        assert await rig.registers() == GAINS
+        assert checklist.record.gains_to_put_back is None
+        assert not (await rig.running.client.state(AXIS)).enabled
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+@pytest.mark.parametrize(
+    "plant",
+    [{}, {"friction_nm": 0.05}, {"inertia_kg_m2": 5e-4, "friction_nm": 0.02}, {"counts_per_rev": 40_000}],
+    ids=["light", "stiff", "heavy", "fine"],
+)
+async def test_a_reversed_motor_is_caught_within_the_stated_distance(plant, direction, tmp_path):
+    text = rig_text(direction=direction)
+    async with commissioning_rig(tmp_path, text=text, motor_reversed=True, **plant) as rig:
+        checklist = await rig.checklist()
+        kept = await checklist.run("motor")
+
+        assert kept.result.state is StepState.FAILED
+        assert "swap the two wires of the motor" in kept.result.text
+        assert abs(rig.drive.shaft.position_counts) <= CAUGHT * MOST_EL_COUNTS
+        assert await rig.registers() == GAINS
+
+
+async def test_a_motor_with_friction_is_driven_with_little_more_than_that(tmp_path):
+    async with commissioning_rig(tmp_path, friction_nm=0.05) as rig:
+        kept = await (await rig.checklist()).run("motor")
+
+        assert kept.result.state is StepState.DONE
+        assert figures(kept)["output limit"] * 1.53 / 255 < 2.2 * 0.05
+
+
+async def test_a_motor_that_stands_is_said_to_stand(tmp_path):
+    async with commissioning_rig(tmp_path) as rig:
+        rig.drive.shaft.stalled = True
+        kept = await (await rig.checklist()).run("motor")
+
+        assert kept.result.state is StepState.FAILED
+        assert "did not count" in kept.result.text
+        assert await rig.registers() == GAINS
+
+
+async def test_a_stop_in_the_middle_stays_latched_and_gains_are_put_back_after_a_reset(tmp_path):
+    async with commissioning_rig(tmp_path, friction_nm=0.2) as rig:
+        checklist = await rig.checklist()
+        running = asyncio.create_task(checklist.run("motor"))
+        while (await rig.registers())["el"] != MOST_EL_COUNTS:
+            await asyncio.sleep(0.05)
+        await rig.running.client.stop()
+        with pytest.raises(StopLatched):
+            await running
+        latched = await rig.running.client.state(AXIS)
+        await rig.running.client.command(AXIS, Reset())
+        await checklist.put_back_gains()
+
+        assert latched.stop_latched
+        assert checklist.record.of("motor").result.state is StepState.FAILED
+        assert await rig.registers() == GAINS
+
+
+async def test_gains_are_put_back_when_the_step_is_cancelled(tmp_path):
+    async with commissioning_rig(tmp_path, friction_nm=0.2) as rig:
+        checklist = await rig.checklist()
+        running = asyncio.create_task(checklist.run("motor"))
+        while (await rig.registers())["el"] != MOST_EL_COUNTS:
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(0.7)
+        running.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await running
+
+        assert await rig.registers() == GAINS
+        assert checklist.record.gains_to_put_back is None
+        assert checklist.record.of("motor").result.state is StepState.OPEN
+        assert not (await rig.running.client.state(AXIS)).enabled
+
+
+async def test_gains_that_could_not_be_put_back_are_put_back_by_the_next_call(tmp_path):
+    async with commissioning_rig(tmp_path, friction_nm=0.2) as rig:
+        checklist = await rig.checklist()
+        running = asyncio.create_task(checklist.run("motor"))
+        while (await rig.registers())["el"] != MOST_EL_COUNTS:
+            await asyncio.sleep(0.05)
+        other = Rig(rig.running.client, await rig.running.client.daemon())
+        async with other.control(AXIS, client="other", lease_s=5.0, force=True):
+            with pytest.raises(LeaseExpired):
+                await running
+            assert (await rig.registers())["el"] == MOST_EL_COUNTS
+        again = await rig.checklist()
+        assert again.record.gains_to_put_back is not None
+        await again.put_back_gains()
+
+        assert await rig.registers() == GAINS
+        assert again.record.gains_to_put_back is None
+
+
+async def test_a_wrong_scale_and_a_reversed_encoder_are_found_and_written(tmp_path):
+    script = {"how far shall": "4", "how far did": "-8"}  # half the counts a mm, and backwards
+    async with commissioning_rig(tmp_path, script) as rig:
+        checklist = await rig.checklist()
+        kept = await checklist.run("scale")
+        change = checklist.change("scale")
+        checklist.write(change)
+
+        assert proposed(kept) == {"direction": "reverse", "counts_per_unit": pytest.approx(500, rel=0.01)}
+        assert change.restarts
+        assert '+direction = "reverse"' in change.lines
+        assert 'name = "x" # the slide' in rig.config.read_text()
+        assert "# as ordered" in rig.config.read_text()
+        axis = load_config(rig.config).bus[0].axis[0]
+        assert (axis.direction, axis.counts_per_unit) == ("reverse", proposed(kept)["counts_per_unit"])
+        with pytest.raises(WrongState, match="another counts_per_unit and direction"):
+            await checklist.preview("home")
+
+
+async def test_a_right_scale_proposes_nothing(tmp_path):
+    async with commissioning_rig(tmp_path, {"how far shall": "4", "how far did": "4.0"}) as rig:
+        kept = await (await rig.checklist()).run("scale")
+
+        assert kept.result.state is StepState.DONE
+        assert proposed(kept) == {}
+
+
+async def test_a_motion_ends_when_the_key_is_released(tmp_path):
+    script = {"how far shall": "10", "how far did": "5"}
+    async with commissioning_rig(tmp_path, script) as rig:
+        rig.person.holds_s = 1.0
+        kept = await (await rig.checklist()).run("scale")
+
+        assert 4000 < figures(kept)["counted"] < 6000
+        assert not (await rig.running.client.state(AXIS)).command
+
+
+def pressing(rig, *sides):
+    """Return what presses switches one after the other, by turning the shaft onto them."""
+    places = {"reverse": -20_100.0, "forward": 20_100.0, "none": 0.0}
+
+    async def press():
+        for side in sides:
+            await asyncio.sleep(1.0)
+            for place in (side, "none"):
+                rig.drive.catch_up(asyncio.get_running_loop().time())
+                rig.drive.shaft.position_counts = places[place]
+                await asyncio.sleep(1.0)
+
+    return asyncio.create_task(press())
+
+
+async def test_limit_switches_are_watched_and_nothing_is_sent_that_moves(tmp_path):
+    text = rig_text().replace("velocity = 0.5 }", 'velocity = 0.5, switch_active = "low" }')
+    async with commissioning_rig(tmp_path, {"has the axis": "y"}, text=text) as rig:
+        checklist = await rig.checklist()
+        pressed = pressing(rig, "reverse", "forward")
+        kept = await checklist.run("limits")
+        await pressed
+
+        assert proposed(kept) == {"home.switch_active": "high"}
+        checklist.write(checklist.change("limits"))
+        assert load_config(rig.config).bus[0].axis[0].switch_active == "high"
+        assert not await checklist.refresh()
+
+
+async def test_swapped_switches_are_found(tmp_path):
+    async with commissioning_rig(tmp_path, {"has the axis": "y"}) as rig:
+        pressed = pressing(rig, "forward", "reverse")
+        kept = await (await rig.checklist()).run("limits")
+        await pressed
+
+        assert kept.result.state is StepState.FAILED
+        assert "swapped" in kept.result.text
+
+
+async def test_a_reference_is_searched_several_times(tmp_path):
+    async with commissioning_rig(tmp_path, {"how many": "4"}) as rig:
+        kept = await (await rig.checklist()).run("home")
+
+        assert kept.result.state is StepState.DONE
+        assert figures(kept)["searches"] == 4
+        assert figures(kept)["spread"] <= 0.005
+        assert len(kept.result.series[0].points) == 4
+
+
+async def test_travel_is_jogged_and_typed(tmp_path):
+    answers = iter(["jog -30", "here"])
+    script = {"reverse end": lambda: next(answers), "forward end": "16"}
+    async with commissioning_rig(
+        tmp_path, script, text=rig_text().replace("home =", 'reference = "at_reset"\nhome =')
+    ) as rig:
+        rig.person.holds_s = 1.2
+        checklist = await rig.checklist()
+        kept = await checklist.run("travel")
+        change = checklist.change("travel")
+
+        low = figures(kept)["reverse end"]
+        assert low == pytest.approx(-12, abs=1.5)
+        margin = 0.02 * (16 - low)
+        assert proposed(kept) == {
+            "limits.position_min": pytest.approx(low + margin, abs=0.01),
+            "limits.position_max": pytest.approx(16 - margin, abs=0.01),
+        }
+        assert not change.restarts
+
+
+async def test_speed_is_raised_until_the_drive_does_not_follow(tmp_path):
+    script = {"how far may": "15"}
+    async with commissioning_rig(tmp_path, script, supply_v=4.0) as rig:
+        rig_limits = load_config(rig.config).bus[0].axis[0].limits
+        kept = await (await rig.checklist()).run("speed")
+
+        assert kept.result.state is StepState.DONE
+        best = figures(kept)["highest velocity that it followed"]
+        assert best < rig_limits.velocity
+        assert 10 < best < 20
+        assert proposed(kept)["limits.velocity"] == pytest.approx(0.8 * best, rel=0.01)
+        assert kept.result.series
+
+
+async def test_an_axis_that_follows_up_to_its_limits_keeps_them(tmp_path):
+    text = rig_text().replace("velocity = 40, acceleration = 400", "velocity = 15, acceleration = 150")
+    async with commissioning_rig(tmp_path, {"how far may": "4"}, text=text) as rig:
+        kept = await (await rig.checklist()).run("speed")
+
+        assert kept.result.state is StepState.DONE
+        assert proposed(kept) == {}
+        assert "velocity: it followed up to 15; acceleration: it followed up to 150" in kept.result.text
+
+
+async def test_leaving_in_the_middle_and_resuming(tmp_path):
+    script = {"what falls": "none", "a remark": ""}
+    async with commissioning_rig(tmp_path, script) as rig:
+        checklist = await rig.checklist()
+        await checklist.run("load")
+        await checklist.skip("motor", "seen to be right")
+        with pytest.raises(Left):
+            await checklist.run("scale")
+        again = await rig.checklist()
+
+        assert again.next_open() == "scale"
+        assert again.record.of("load").by == "ada"
+        assert again.record.of("load").at == "2026-11-23T12:00:00+00:00"
+        assert again.record.of("motor").result.text == "seen to be right"
+        assert not (await rig.running.client.state(AXIS)).command
+
+
+async def test_a_changed_configuration_and_another_drive_open_steps_again(tmp_path):
+    async with commissioning_rig(tmp_path, {"how many": "2", "what falls": "none", "a remark": ""}) as rig:
+        checklist = await rig.checklist()
+        await checklist.run("load")
+        await checklist.run("home")
+        rig.config.write_text(rig.config.read_text().replace("velocity = 0.5", "velocity = 0.6"))
+        messages = await checklist.refresh()
+
+        assert len(messages) == 1
+        assert "home" in messages[0].lower()
+        assert checklist.next_open() == "motor"
+        assert checklist.record.of("home").result.state is StepState.OPEN
+        assert checklist.record.of("load").result.state is StepState.DONE
+
+    other = rig_text("ls-182ap")
+    async with commissioning_rig(tmp_path, text=other, module="ls182ap") as rig:
+        await rig.checklist()
+
+        assert any("Brake or hanging load is open again" in line for line in rig.person.told)
+        assert any("model was pic-servo-sc and is ls-182ap" in line for line in rig.person.told)
+
+
+async def test_the_report_is_well_formed_and_has_the_numbers(tmp_path):
+    script = {"how many": "3", "what falls": "none", "a remark": "<b>spring</b> & \x1b[2J"}
+    async with commissioning_rig(tmp_path, script) as rig:
+        checklist = await rig.checklist()
+        await checklist.run("load")
+        kept = await checklist.run("home")
+        report = html_of(checklist.record, STEPS, rig.config.read_text(), "1.2", "now")
+
+    page = ET.fromstring(report.partition("\n")[2])  # noqa: S314 - written here
+    text = " ".join(page.itertext())
+    assert f"{figures(kept)['spread']:.6g} mm" in text
+    assert "<b>spring</b> & \\x1b[2J" in text
+    assert "counts_per_unit = 1000 # as ordered" in text
+    assert len(list(page.iter("svg"))) == 1
+    assert len(list(page.iter("circle"))) == 3
+    assert "http" not in report
+    assert "<script" not in report
