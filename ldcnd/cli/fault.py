@@ -1,5 +1,7 @@
 """`ldcnd fault`: the page of a fault or an error code, for those who have a terminal and nothing else."""
 
+from difflib import get_close_matches
+
 import click
 from click.shell_completion import CompletionItem
 
@@ -23,5 +25,9 @@ def command(code: str | None) -> None:
         return
     page = page_text(code)
     if page is None:
-        raise click.BadParameter(f"there is no page for {code!r}; `ldcnd fault` lists all of them", param_hint="CODE")
+        near = next(iter(get_close_matches(code, codes(), 1)), None)
+        meant = f"did you mean {near!r}? " if near else ""
+        raise click.BadParameter(
+            f"there is no page for {code!r}; {meant}`ldcnd fault` lists all of them", param_hint="CODE"
+        )
     print(page, end="")

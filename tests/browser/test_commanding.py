@@ -212,3 +212,7 @@ async def test_an_output_is_set_and_an_instant_taken_from_the_network_page(house
         await module.get_by_label("Becomes").select_option("input")
         await module.get_by_role("button", name="Set line 4").click()
         await expect(module.get_by_role("status")).to_contain_text("Outputs: none.")
+
+        await desk.page.evaluate("() => { location.hash = '#/rig'; }")
+        await expect(desk.panel("Rig sim").get_by_role("link", name="x", exact=True)).to_be_visible()
+        await expect(desk.page.get_by_text("sim · cabinet")).to_have_count(0)  # a module is no axis without values

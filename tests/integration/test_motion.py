@@ -275,8 +275,9 @@ async def test_homing_finds_the_reference_and_defines_the_position(axis):
         state = await rig.client.wait_for_end(axis, reply.command_id)
 
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
-        if axis == "y":  # reverse limit switch at -120 mm of the power-up position, called -120 there
-            assert await settled(rig, "y") == pytest.approx(-120.0, abs=1.0)
+        if axis == "y":  # reverse limit switch at -120 mm of the power-up position, called -120 there; then to -90
+            assert await settled(rig, "y") == pytest.approx(-90.0, abs=0.1)
+            assert await rig.client.command("y", MoveRelative(distance=1.0))
 
 
 async def test_a_search_that_finds_nothing_ends_with_a_reason():

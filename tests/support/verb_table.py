@@ -133,7 +133,12 @@ def _says(page: Path, pattern: str) -> bool:
 
 
 def _in_sources(pattern: str, files: Iterable[Path]) -> str:
-    found = sorted((file for file in files if _says(file, pattern)), key=lambda file: (file.name == "axis.js", file))
+    """Return the first file that says it: a page before what pages are made of, the page of an axis last."""
+    places = ("pages", "parts", "session", "static", "console")
+    found = sorted(
+        (file for file in files if _says(file, pattern)),
+        key=lambda file: (file.name == "axis.js", places.index(file.parent.name), file),
+    )
     return f"`{found[0].name}`" if found else ""
 
 

@@ -132,7 +132,7 @@ function AxisRow({ axis }) {
     ${cell("Target", number(state?.command?.target, decimals), "number")}
     ${cell("A/D", adc ? html`${number(adc.volts, 2)} <span class="unit">V</span>` : html`<span class="quiet">none</span>`, "number")}
     ${cell("Faults", html`<${FaultWords} axis=${axis} />`)}
-    ${cell("Values", html`<${QualityWord} axis=${axis} />
+    ${cell("Values", html`<${QualityWord} axis=${axis} />${" "}
       <small>${number(health?.rate_hz, 1)} of ${number(health?.rate_wanted_hz, 1)} Hz</small>`)}
     ${cell("Control", html`<${HolderWord} axis=${axis} />`)}
     ${cell("Commands", html`<${AxisCommands} axis=${axis} />`, "commands")}

@@ -35,7 +35,8 @@ function* ofRig(rig) {
     yield { level: "warn", where: rig.name, text: "A line is asked for more than it can carry.", link: "#/network" };
   }
   for (const bus of rig.buses.values()) yield* ofBus(rig, bus);
-  for (const axis of rig.axes.values()) yield* ofAxis(rig, axis);
+  // what has telemetry and no description is an I/O module, or an axis about to be described
+  for (const axis of rig.axes.values()) if (axis.info) yield* ofAxis(rig, axis);
 }
 
 function* ofBus(rig, bus) {
