@@ -1,11 +1,16 @@
 """Tuning through the whole daemon: what is identified, applied and verified, and what comes back afterwards."""
 
 import asyncio
-from contextlib import asynccontextmanager
+import io
+import json
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 
+import click
 import pytest
 
+from ldcnd.cli import tune
+from ldcnd.cli.connection import Target
 from ldcnd.client.lease import control
 from ldcnd.client.rig import Rig
 from ldcnd.config.axis import ApproachConfig
@@ -13,6 +18,7 @@ from ldcnd.config.rig import load_config
 from ldcnd.drivers.ldcn.profiles import LS_182AP
 from ldcnd.errors import (
     DriveFault,
+    LeaseExpired,
     NotReferenced,
     NotSupported,
     PositionLimit,
@@ -21,6 +27,7 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.model.commands import MoveAbsolute, Power, SetGains
+from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant
 from ldcnd.tuning.ldcn.kept_gains import file_of, kept_for, put_back
@@ -85,7 +92,7 @@ async def measuring(rig, until):
 @pytest.mark.timeout(300)  # some seconds of processor time, on a machine that may be busy
 async def test_an_axis_is_identified_tuned_and_verified_and_worse_gains_are_not_kept():
     said = []
-    async with tuned_rig() as (rig, shaft):
+    async with tuned_rig(direction="reverse") as (rig, shaft):
         planned = await plan(rig.client, "x", None)
         found = await measure(rig.client, planned, 20.0, said.append)
         assert await is_off_with_its_old_gains(rig)
@@ -118,6 +125,65 @@ async def test_an_axis_is_identified_tuned_and_verified_and_worse_gains_are_not_
     assert report.farthest <= report.within == WITHIN_COUNTS / 1000
     assert abs(place) <= WITHIN_COUNTS
     assert said[0] == "pulses: does the encoder count the motor's way?"
+
+
+@pytest.fixture
+def loop():
+    """A loop of the test's own, for commands that run one themselves."""
+    jumping = JumpingLoop()
+    yield jumping
+    jumping.close()
+
+
+@contextmanager
+def rig_on(loop):
+    """Run a rig on a loop whenever that runs."""
+    up, end = loop.create_future(), asyncio.Event()
+
+    async def run():
+        async with tuned_rig() as (rig, _):
+            up.set_result(rig)
+            await end.wait()
+
+    running = loop.create_task(run(), name="rig")
+    try:
+        yield loop.run_until_complete(up)
+    finally:
+        end.set()
+        loop.run_until_complete(running)
+
+
+@pytest.mark.timeout(300)  # likewise
+def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(tune, "end_as_interrupted", lambda: None)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    picture = tmp_path / "tune.png"
+
+    with rig_on(loop) as rig:
+        monkeypatch.setattr(Target, "run", lambda _, work: loop.run_until_complete(work(rig.client)))
+        with pytest.raises(click.Abort):  # nothing can be typed here
+            tune.command.main(["x", "--within", "1"], standalone_mode=False)
+        unasked = capsys.readouterr()
+        tune.command.main(["x", "--json", "--dry-run"], standalone_mode=False)
+        dry = capsys.readouterr()
+        untouched = loop.run_until_complete(registers(rig))["kp"]
+        tune.command.main(["x", "--json", "--yes", "--bandwidth", "25", "--plot", str(picture)], standalone_mode=False)
+        done = capsys.readouterr()
+        loaded = loop.run_until_complete(registers(rig))
+        with pytest.raises(WrongState, match="no gains of an unfinished tuning"):
+            tune.command.main(["x", "--put-back"], standalone_mode=False)
+
+    assert "it will stay within 1 mm (1000 counts)" in unasked.out
+    assert "Move x now?" in unasked.err
+    assert untouched == 0
+    assert json.loads(dry.out.splitlines()[-1])["within_counts"] == WITHIN_COUNTS
+    report = json.loads(done.out.splitlines()[-1])
+    assert report["applied"]
+    assert report["gains"] == loaded
+    assert report["margins"]["bandwidth_hz"] == pytest.approx(25, rel=0.1)
+    assert "identifying" in done.err
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
@@ -165,6 +231,16 @@ async def test_a_stop_by_anyone_ends_a_tuning_and_the_gains_are_put_back():
         assert (await rig.client.state("x")).stop_latched
         with pytest.raises(StopLatched):
             await plan(rig.client, "x", None)
+
+
+async def test_gains_come_back_under_a_new_lease_when_the_first_was_lost():
+    async with tuned_rig() as (rig, _), measuring(rig, "pulses") as task:
+        async with control(rig.client, "ann", "x", force=True):
+            pass
+        with pytest.raises(LeaseExpired):
+            await task
+
+        assert await is_off_with_its_old_gains(rig)
 
 
 async def test_gains_wait_on_the_disk_while_another_client_has_control():

@@ -1,4 +1,4 @@
-"""`ldcnd tune` as a process against a daemon as a process, and what is left when it is interrupted or killed."""
+"""`ldcnd tune` as a process against a daemon as a process: what is left when it is interrupted or killed."""
 
 import asyncio
 import json
@@ -14,13 +14,13 @@ from tests.support.process import LDCND, ROOT, client, daemon
 pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(300)]
 CONFIG = ROOT / "config" / "simulated.toml"
 CONFIGURED = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000, "sr": 1, "deadband": 0}
-BEGIN_S = 60.0
+BEGIN_S = 90.0
 
 
 @pytest.fixture
 def state_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    return tmp_path / "ldcnd" / "tuning" / "sim-x.json"
+    return tmp_path / "ldcnd" / "tuning" / "sim@x.json"
 
 
 async def tune(*arguments):
@@ -42,34 +42,11 @@ async def registers(rig):
 
 
 async def others_loaded(rig, running):
-    """Wait until a tuning has loaded gains of its own and closed the loop."""
+    """Wait until a tuning has loaded gains of its own."""
     async with asyncio.timeout(BEGIN_S):
-        while not (await rig.state("x")).enabled or (await registers(rig))["kp"] in (None, CONFIGURED["kp"]):
+        while (await registers(rig))["kd"] in (None, 0, CONFIGURED["kd"]):
             assert running.returncode is None
             await asyncio.sleep(0.05)
-
-
-async def test_a_tuning_prints_its_report_as_json_and_asks_before_it_moves(state_file):
-    async with daemon(CONFIG) as endpoint, client(endpoint) as rig:
-        unasked = await ended(await tune("-e", endpoint, "--json", "--bandwidth", "25"))
-        planned = await ended(await tune("-e", endpoint, "--json", "--dry-run"))
-        untouched = (await registers(rig))["kp"]
-        code, printed, errors = await ended(await tune("-e", endpoint, "--json", "--yes", "--bandwidth", "25"))
-        loaded = await registers(rig)
-        state = await rig.state("x")
-
-    assert unasked[0] == 130
-    assert "Move x now?" in unasked[2]
-    assert planned[0] == 0
-    assert json.loads(planned[1])["within"] == 2.0
-    assert untouched == 0
-    report = json.loads(printed)
-    assert code == (0 if report["applied"] else 1), errors
-    assert report["farthest"] <= report["within"]
-    assert loaded == (report["gains"] if report["applied"] else CONFIGURED)
-    assert not state.enabled
-    assert "identifying" in errors
-    assert not state_file.exists()
 
 
 async def test_ctrl_c_puts_the_gains_back(state_file):

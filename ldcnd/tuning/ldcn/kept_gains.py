@@ -2,7 +2,9 @@
 
 import asyncio
 import os
+from functools import partial
 from pathlib import Path
+from urllib import parse
 
 import pydantic
 
@@ -14,6 +16,8 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import Moving
 
+quote = partial(parse.quote, safe="")
+"""A rig and an axis are called as they like; a file is not."""
 NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
 NEEDED = frozenset(NAMES) - {"cl", "deadband"}
 """Registers that every drive with gains has."""
@@ -38,7 +42,12 @@ class KeptGains(Frozen):
 def file_of(rig: str, axis: str) -> Path:
     """Return where the gains of an axis are kept: below $XDG_STATE_HOME, or ~/.local/state."""
     state = os.environ.get("XDG_STATE_HOME")
-    return (Path(state) if state else Path.home() / ".local" / "state") / "ldcnd" / "tuning" / f"{rig}-{axis}.json"
+    return (
+        (Path(state) if state else Path.home() / ".local" / "state")
+        / "ldcnd"
+        / "tuning"
+        / f"{quote(rig)}@{quote(axis)}.json"
+    )
 
 
 def keep(kept: KeptGains) -> None:
@@ -70,8 +79,16 @@ def kept_for(rig: str, axis: str) -> KeptGains | None:
 
 
 def forget(kept: KeptGains) -> None:
-    """Remove the file: its gains are back, or others were accepted."""
-    durable.remove(file_of(kept.rig, kept.axis))
+    """Remove the file: its gains are back, or others were accepted.
+
+    Raises:
+        ConfigError: it cannot be removed.
+    """
+    path = file_of(kept.rig, kept.axis)
+    try:
+        durable.remove(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be removed: {error.strerror}", remedy="remove it by hand") from error
 
 
 def gains_in(info: AxisInfo) -> dict[str, int]:
@@ -118,12 +135,12 @@ async def at_rest(axis: Axis) -> None:
         ) from None
 
 
-async def put_back(rig: Rig, kept: KeptGains, *, force: bool = False) -> None:
+async def put_back(rig: Rig, kept: KeptGains) -> None:
     """Put the gains of an axis back; the axis is off afterwards.
 
     Raises:
         LdcndError: as the daemon refused it; they are still kept.
     """
-    async with rig.control(kept.axis, client="ldcnd tune", lease_s=LEASE_S, force=force) as axis:
+    async with rig.control(kept.axis, client="ldcnd tune", lease_s=LEASE_S) as axis:
         await load(axis, kept.gains)
     forget(kept)

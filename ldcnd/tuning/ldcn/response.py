@@ -162,7 +162,7 @@ def figures(
     outside = np.flatnonzero(np.abs(position - goal) > window_counts)
     last = float(times[outside[-1]]) if len(outside) else 0.0
     return Figures(
-        overshoot=beyond / max(abs(distance), 1.0),
+        overshoot=beyond / max(float(abs(distance)), 1.0),
         settling_s=max(last - arrived, 0.0),
         settled=last <= float(times[0] + 0.9 * (times[-1] - times[0])),
         following_error_counts=float(np.max(np.abs(command - position))),

@@ -8,7 +8,7 @@ when anything ends a measurement; after the death of this host, when a person as
 import asyncio
 import math
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 
 from ldcnd.client.axis import Axis
@@ -27,12 +27,12 @@ from ldcnd.errors import (
 from ldcnd.model.samples import AxisState
 from ldcnd.model.traces import TakeTrace
 from ldcnd.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
-from ldcnd.tuning.ldcn.excitation import Excitation, Record, Shown, Trial, Trials
+from ldcnd.tuning.ldcn.excitation import Excitation, Purpose, Record, Shown, Trial, Trials
 from ldcnd.tuning.ldcn.identify import Identified, identify
 from ldcnd.tuning.ldcn.kept_gains import LEASE_S, KeptGains, at_rest, forget, gains_in, keep, kept_for, load, put_back
 from ldcnd.tuning.ldcn.plan import Plan, check_off
 from ldcnd.tuning.ldcn.response import Move, simulate
-from ldcnd.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, Measured, measured, objection, worst
+from ldcnd.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
 
 CLIENT = "ldcnd tune"
 PUT_BACK_S = 15.0
@@ -158,7 +158,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
         tell("test move with the proposed gains")
         records = await tests.run(excitation.test(found.proposal.gains, found.move, duration_s(found.move)))
         after = tests.measured(found.known, records)
-        why = objection(worst(after), worst(found.before))
+        why = objection(worst(after), worst(found.before), max(SAME_S, 2 * tests.interval_s))
         if why is None:
             await load(axis, registers_of(found.proposal.gains, kept.gains))
             forget(kept)
@@ -203,10 +203,11 @@ async def _put_back_anew(rig: Rig, kept: KeptGains) -> None:
 
 
 async def _put_back_if_kept(axis: Axis, kept: KeptGains) -> None:
-    """Put gains back if they are still to be put back and this client still has control."""
+    """Put gains back if they are still to be put back and this client still has control; what fails is tried anew."""
     if kept_for(kept.rig, kept.axis) and axis.control and not axis.control.lost:
-        async with asyncio.timeout(PUT_BACK_S):
-            await _restore(axis, kept)
+        with suppress(LdcndError, TimeoutError):
+            async with asyncio.timeout(PUT_BACK_S):
+                await _restore(axis, kept)
 
 
 async def _restore(axis: Axis, kept: KeptGains) -> None:
@@ -227,14 +228,18 @@ async def _named(axis: str) -> AsyncIterator[None]:
 
 
 class _Trials:
-    """Carries out trials on an axis that is controlled here."""
+    """Carries out trials on an axis that is controlled here.
+
+    Attributes:
+        interval_s: time between two samples of the last trace, seconds.
+    """
 
     def __init__(self, client: RigClient, axis: Axis, planned: Plan, old: dict[str, int]) -> None:
         self._client = client
         self._axis = axis
         self._plan = planned
         self._old = old
-        self._interval_s = FIRST_INTERVAL_S
+        self.interval_s = FIRST_INTERVAL_S
 
     async def run(self, trials: Trials) -> tuple[Record, ...]:
         """Carry out all trials of a kind; return what they lead to."""
@@ -256,7 +261,7 @@ class _Trials:
         await axis.set_gains(**registers_of(trial.gains, self._old))
         await axis.power(on=True)
         try:
-            samples = math.ceil((trial.lasts_s + LEAD_S) / self._interval_s)
+            samples = math.ceil((trial.lasts_s + LEAD_S) / self.interval_s)
             request = self._stamped(TakeTrace(channels=("position",), samples=samples))
             async with armed_trace(self._client, axis.name, request) as armed:
                 motion = await axis.move_relative(
@@ -271,14 +276,14 @@ class _Trials:
             tripped = axis.state.state is AxisState.ERROR_STOP
         finally:
             await self._open_loop()
-        self._interval_s = trace.offsets_ns[-1] / 1e9 / (len(trace.offsets_ns) - 1)
-        if self._interval_s > LONGEST_INTERVAL_S:
+        self.interval_s = trace.offsets_ns[-1] / 1e9 / (len(trace.offsets_ns) - 1)
+        if trial.purpose is not Purpose.PULSE and self.interval_s > LONGEST_INTERVAL_S:
             raise ValueOutOfRange(
-                f"axis {axis.name}: its line brings a sample every {self._interval_s * 1e3:.0f} ms",
+                f"axis {axis.name}: its line brings a sample every {self.interval_s * 1e3:.0f} ms",
                 axis=axis.name,
-                value=self._interval_s,
+                value=self.interval_s,
                 limit=LONGEST_INTERVAL_S,
-                remedy="a higher baud rate, or lower `rates` of the other axes",
+                remedy="a higher baud rate, lower `rates` of the other axes, or a host that is less busy",
             )
         rest_counts = await self.rest_counts() - from_counts
         per_unit = abs(counts_per_unit)

@@ -14,7 +14,7 @@ from ldcnd.tuning.ldcn.response import Figures, Floats, figures, simulate
 
 MOST_MEASURED_OVERSHOOT = 0.15
 SAME_S = 0.005
-"""Settling times within two samples of a trace of each other are equal, seconds."""
+"""Settling times that differ by less are equal, seconds: two samples of a trace at 115200 baud."""
 BOTH_WAYS = 2
 
 
@@ -63,12 +63,13 @@ def worst(moves: Sequence[Measured]) -> Figures | None:
     )
 
 
-def objection(new: Figures | None, old: Figures | None) -> str | None:
+def objection(new: Figures | None, old: Figures | None, same_s: float = SAME_S) -> str | None:
     """Return why new gains are not better than old ones; None where they are at least as good.
 
     Args:
         new: figures with them; None where the drive gave up.
         old: figures with the old ones; None where the drive gave up, or they were not tried.
+        same_s: settling times that differ by less are equal, seconds.
     """
     if new is None:
         return "the drive opened its loop in the test move"
@@ -76,6 +77,6 @@ def objection(new: Figures | None, old: Figures | None) -> str | None:
         return f"the test move did not settle: {new.error_counts:+.0f} counts are left"
     if new.overshoot > MOST_MEASURED_OVERSHOOT:
         return f"the test move overshot by {new.overshoot:.0%}, more than {MOST_MEASURED_OVERSHOOT:.0%}"
-    if old is not None and old.settled and new.settling_s > old.settling_s + SAME_S:
+    if old is not None and old.settled and new.settling_s > old.settling_s + same_s:
         return f"it settles in {new.settling_s * 1e3:.0f} ms, with the old gains in {old.settling_s * 1e3:.0f} ms"
     return None
