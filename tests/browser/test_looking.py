@@ -7,6 +7,7 @@ import re
 import pytest
 
 from ldcnd.cli.parameter_file import load_parameters
+from ldcnd.client.trace_file import load_trace
 from ldcnd.client.traces import fetch_trace, trace_header
 from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
 from ldcnd.model.events import CommandStatus
@@ -49,7 +50,7 @@ async def saved(desk, name):
     return await (await download.value).path()
 
 
-async def test_a_trace_is_recorded_drawn_and_saved(house):
+async def test_a_trace_is_recorded_drawn_and_saved(house, tmp_path):
     await house.sim.quiet("x")
     async with house.desk() as desk:
         await desk.open("trace/sim/x")
@@ -66,6 +67,12 @@ async def test_a_trace_is_recorded_drawn_and_saved(house):
         assert {row["channel"] for row in rows} == {"x position", "x velocity", "x following error"}
         assert len(rows) == 180
         assert (await saved(desk, "Save PNG")).read_bytes().startswith(b"\x89PNG")
+        async with desk.page.expect_download() as downloading:
+            await desk.panel("Captures").get_by_role("link", name="last trace of x").click()
+        download = await downloading.value
+        whole = tmp_path / download.suggested_filename
+        await download.save_as(whole)
+        assert load_trace(whole).header.trace_id == header.trace_id
 
         await desk.button("Record").click()
         await expect(desk.panel("Captures").get_by_text("60 samples in")).to_have_count(2)

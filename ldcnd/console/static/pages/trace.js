@@ -110,7 +110,7 @@ function Captured() {
       }${
         one.header.missed ? `, ${one.header.missed} missed` : ""
       }${one.header.problem ? `; ${one.header.problem}` : ""}</span>
-      <a href=${`${axisPath(one.axis.rig.name, one.axis.name)}/trace.csv`} download>last trace of ${one.axis.name}, as ldcnd saves it</a>
+      <a href=${`${axisPath(one.axis.rig.name, one.axis.name)}/trace`} download=${`${one.axis.name}-trace.json`}>last trace of ${one.axis.name}, for ldcnd trace show</a>
       <button type="button" class="plain"
         onClick=${() => discard(one)}>Forget<span class="unseen"> the capture of ${clock(one.header.t)}</span></button>
     </li>`,
