@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,17 @@ def twice(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Path]]:
                     os.utime(path, (1.6e9 + age_s, 1.6e9 + age_s))
             results.append(built(source, place / "dist"))
     return results
+
+
+def test_the_same_interpreters_are_declared_promised_and_tested() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = [name.rpartition(" ")[2] for name in project["classifiers"] if name.startswith("Programming")]
+    (tested,) = re.findall(r"(?m)^PYTHONS \?= (.*)$", (ROOT / "Makefile").read_text())
+    (promised,) = re.findall(r"CPython (\S+) to (\S+) on Linux", (ROOT / "README.md").read_text())
+
+    assert project["requires-python"] == f">={declared[0]}"
+    assert tested.split() == [f"python{version}" for version in declared]
+    assert promised == (declared[0], declared[-1])
 
 
 @pytest.mark.system
