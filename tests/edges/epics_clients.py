@@ -133,7 +133,7 @@ def ophyd_async_motor(record: str) -> None:
 
 
 def caproto_tools(record: str) -> None:
-    """`caproto-get` and `caproto-put`: another implementation of the protocol."""
+    """`caproto-get`, `caproto-put` and `caproto-monitor`: another implementation of the protocol."""
     import subprocess
     from pathlib import Path
 
@@ -145,8 +145,14 @@ def caproto_tools(record: str) -> None:
         ).stdout
 
     assert "motor" in run("caproto-get", "--no-repeater", f"{record}.RTYP")
-    run("caproto-put", "--no-repeater", "--notify", "--timeout", "60", record, "1.5")
-    assert "1.5" in run("caproto-get", "--no-repeater", f"{record}.VAL")
+    watched = [tools / "caproto-monitor", "--no-repeater", "--maximum", "3", f"{record}.VAL"]
+    with subprocess.Popen(watched, stdout=subprocess.PIPE, text=True) as monitor:
+        assert monitor.stdout
+        assert "0" in monitor.stdout.readline()
+        for target in ("1.5", "2.5"):
+            run("caproto-put", "--no-repeater", "--notify", "--timeout", "60", record, target)
+        assert ["1.5" in monitor.stdout.readline(), "2.5" in monitor.stdout.readline()] == [True, True]
+    assert "2.5" in run("caproto-get", "--no-repeater", f"{record}.VAL")
 
 
 CLIENTS = {

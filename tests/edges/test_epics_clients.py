@@ -15,7 +15,7 @@ from ldcnd.model.samples import Moving
 from tests.edges.epics_clients import CLIENTS
 from tests.support.process import ROOT, client, daemon, free_port, process
 
-pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(400)]
 
 
 @asynccontextmanager
@@ -56,10 +56,10 @@ async def test_libca_sees_a_record_that_it_cannot_write() -> None:
     program = """
 import epics
 pv = epics.PV("T:x")
-pv.wait_for_connection(10)
+pv.wait_for_connection(60)
 assert (pv.read_access, pv.write_access) == (True, False), pv
 try:
-    epics.caput("T:x", 5.0, wait=True, timeout=3)
+    epics.caput("T:x", 5.0, wait=True, timeout=30)
 except epics.ca.CASeverityException as refused:
     assert "denied" in str(refused)
 else:
@@ -79,5 +79,5 @@ async def run(name: str, environment: dict[str, str]) -> int:
     running = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "tests.edges.epics_clients", name, "T:x", env=environment, cwd=ROOT
     )
-    async with asyncio.timeout(120):
+    async with asyncio.timeout(240):
         return await running.wait()
