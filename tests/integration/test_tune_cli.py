@@ -7,7 +7,7 @@ from asyncio.subprocess import DEVNULL, PIPE
 
 import pytest
 
-from ldcnd.model.rig_commands import ListHolders
+from ldcnd.model.leases import ListHolders
 from ldcnd.tuning.ldcn.kept_gains import LEASE_S
 from tests.support.process import LDCND, ROOT, client, daemon
 
