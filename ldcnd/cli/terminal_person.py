@@ -32,7 +32,8 @@ class TerminalPerson(Person):
 
     @override
     def tell(self, *lines: str) -> None:
-        show_lines(*lines, err=True)
+        if lines:
+            show_lines(*lines, err=True)
 
     @override
     async def ask(self, question: str) -> str:

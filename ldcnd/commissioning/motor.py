@@ -14,8 +14,8 @@ from typing_extensions import override
 from ldcnd.client.axis import Axis
 from ldcnd.commissioning.lowered_gains import lowered_gains
 from ldcnd.commissioning.record import Figure, Result, Series, StepState
-from ldcnd.commissioning.step import Site, Step, open_loop, refuse_previewed, rest_counts, seen
-from ldcnd.errors import CommandAborted, DriveFault, StopLatched, WrongState
+from ldcnd.commissioning.step import Site, Step, open_loop, refuse_latched, refuse_previewed, rest_counts, seen
+from ldcnd.errors import CommandAborted, DriveFault, WrongState
 from ldcnd.model.commands import Verb
 from ldcnd.model.samples import AxisState
 
@@ -78,6 +78,7 @@ class MotorDirection(Step):
                 f" {lead.distance / lead.velocity:.2g} s each time"
             ),
             "the loop is open before, between and after: a load that falls without power must be secured",
+            "Ctrl-C halts it and opens the loop",
             "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
         )
 
@@ -106,8 +107,7 @@ class MotorDirection(Step):
         motion = await axis.move_relative(lead.distance, velocity=lead.velocity, acceleration=lead.acceleration)
         with suppress(DriveFault, CommandAborted):  # where the axis is tells more
             await motion.done()
-        if axis.state.stop_latched:
-            raise StopLatched(f"axis {axis.name}: a stop has come", axis=axis.name)
+        refuse_latched(axis)
         tripped = axis.state.state is AxisState.ERROR_STOP
         await open_loop(axis)
         moved = sign * (await rest_counts(axis) - before)
@@ -141,8 +141,7 @@ def _lead(site: Site, el: int) -> _Lead:
 async def _refuse_what_cannot_be(site: Site, lead: _Lead) -> None:
     """Raise what the daemon would refuse about the distance."""
     async with site.rig.watch(site.info.axis) as axis:
-        if (await seen(axis)).state.stop_latched:
-            raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy="reset it")
+        refuse_latched(await seen(axis))
         reply = await axis.preview(distance=lead.distance, velocity=lead.velocity, acceleration=lead.acceleration)
     refuse_previewed(reply)
 
@@ -160,8 +159,8 @@ def _judged(el: int, points: list[tuple[float, float]]) -> Result:
         text, state = f"motor and encoder agree: it moved forward by {moved:.0f} counts", StepState.DONE
     elif moved <= -REVERSE_SHARE * el:
         text = (
-            f"motor and encoder disagree: asked forward, it moved back by {-moved:.0f} counts until the loop opened."
-            " Switch the drive off and swap the two wires of the motor, then run this step again"
+            f"motor and encoder disagree: asked forward, it moved back by {-moved:.0f} counts until the loop opened,"
+            " unless a load pulled it. Switch the drive off, swap the two wires of the motor, and run this step again"
         )
         state = StepState.FAILED
     else:

@@ -30,6 +30,12 @@ class Scale(Step):
     depends = ("direction", "counts_per_unit", "unit")
 
     @override
+    def obstacle(self, site: Site) -> str:
+        if site.info.counts_per_unit is None and not super().obstacle(site):
+            return "not possible while the axis works in counts: give it `unit` and a guess of `counts_per_unit`"
+        return super().obstacle(site)
+
+    @override
     async def preview(self, site: Site) -> tuple[str, ...]:
         velocity = SHARE * site.config.velocity
         return (
@@ -80,7 +86,7 @@ def _judged(site: Site, distance: float, counts: int, measured: float) -> Result
     proposals = []
     if direction != site.info.direction:
         proposals.append(Proposal(table="", key="direction", value=direction))
-    if abs(scale / site.counts_per_unit - 1) > AGREES and site.info.counts_per_unit is not None:
+    if abs(scale / site.counts_per_unit - 1) > AGREES:
         proposals.append(Proposal(table="", key="counts_per_unit", value=scale))
     if not proposals:
         return done("direction and scale are as configured").model_copy(update={"figures": figures})

@@ -12,7 +12,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.commissioning.person import Person
 from ldcnd.commissioning.record import Result, StepState
 from ldcnd.config.axis import AxisConfig
-from ldcnd.errors import LdcndError, SessionError, StopLatched, WrongState
+from ldcnd.errors import LdcndError, Remedy, SessionError, StopLatched, WrongState, step
 from ldcnd.messaging.codec import rebuild_error
 from ldcnd.model.commands import PreviewReply, Verb
 from ldcnd.model.meta import AxisInfo
@@ -21,7 +21,7 @@ from ldcnd.model.samples import AxisState, Moving
 REST_S = 5.0
 """Longest time that an axis takes to come to rest, seconds."""
 LOOK_S = 0.05
-STILL_COUNTS = 1
+STILL_COUNTS = 2
 """Two positions that differ by no more are the same place."""
 
 
@@ -133,6 +133,18 @@ async def at_rest(axis: Axis) -> None:
         raise WrongState(f"axis {axis.name} does not come to rest within {REST_S:g} s", axis=axis.name) from None
 
 
+def refuse_latched(axis: Axis) -> None:
+    """Raise if a stop is latched.
+
+    Raises:
+        StopLatched: only a person clears it.
+    """
+    if axis.state.stop_latched:
+        raise StopLatched(
+            f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset", "reset it"))
+        )
+
+
 async def rest_counts(axis: Axis) -> int:
     """Wait until an axis stands, by two positions of which neither is older than this call; return it in counts.
 
@@ -179,8 +191,7 @@ async def open_loop(axis: Axis) -> None:
         StopLatched: a stop came; only a person clears it.
         LdcndError: as the daemon refused it.
     """
-    if axis.state.stop_latched:
-        raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name)
+    refuse_latched(axis)
     if axis.state.state is AxisState.ERROR_STOP:
         await at_rest(axis)
         await axis.reset()

@@ -1,12 +1,14 @@
 """The checklist of commissioning, step by step, on a whole simulated daemon."""
 
 import asyncio
+import re
+import shutil
 from xml.etree import ElementTree as ET
 
 import pytest
 
 from ldcnd.client.rig import Rig
-from ldcnd.commissioning.checklist import STEPS
+from ldcnd.commissioning.checklist import STEPS, Checklist
 from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS
 from ldcnd.commissioning.person import Left
 from ldcnd.commissioning.record import StepState
@@ -14,7 +16,9 @@ from ldcnd.commissioning.report import html_of
 from ldcnd.config.rig import load_config
 from ldcnd.errors import LeaseExpired, StopLatched, WrongState
 from ldcnd.model.commands import Reset
-from tests.support.commissioning import AXIS, GAINS, commissioning_rig, rig_text
+from tests.support.commissioning import AXIS, GAINS, ScriptedPerson, commissioning_rig, rig_text
+from tests.support.process import ROOT
+from tests.support.rig import running_rig
 
 
 def figures(record):
@@ -318,3 +322,31 @@ async def test_the_report_is_well_formed_and_has_the_numbers(tmp_path):
     assert len(list(page.iter("circle"))) == 3
     assert "http" not in report
     assert "<script" not in report
+
+
+async def test_a_drive_that_takes_no_motion_over_its_line_has_the_steps_that_ask(tmp_path):
+    config = tmp_path / "rig.toml"
+    shutil.copy(ROOT / "config" / "mixed.toml", config)
+    async with running_rig(load_config(config)) as running:
+        rig = Rig(running.client, await running.client.daemon())
+        checklist = Checklist(rig, config, "feed", ScriptedPerson({"what falls": "brake", "a remark": ""}), by="ada")
+        await checklist.refresh()
+        await checklist.run("load")
+
+        assert checklist.next_open() is None
+        states = {name: checklist.record.of(name).result.state for name in STEPS}
+        assert states.pop("load") is StepState.DONE
+        assert set(states.values()) == {StepState.NOT_POSSIBLE}
+        assert "a smartstep has no" in checklist.record.of("motor").result.text
+
+
+async def test_an_axis_in_counts_has_no_scale_to_find(tmp_path):
+    text = rig_text().replace('unit = "mm"\ncounts_per_unit = 1000 # as ordered\n', "")
+    axis, rates, rest = text.partition("rates")
+    axis = re.sub(r"(velocity|acceleration|position_min|position_max) = (-?[0-9.]+)", r"\1 = \g<2>000", axis)
+    async with commissioning_rig(tmp_path, text=axis + rates + rest) as rig:
+        checklist = await rig.checklist()
+        kept = await checklist.run("motor")
+
+        assert kept.result.state is StepState.DONE
+        assert checklist.record.of("scale").result.state is StepState.NOT_POSSIBLE

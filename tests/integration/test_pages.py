@@ -58,6 +58,9 @@ NOT_RUN = {
     ("docs/how-to/console.md", "openssl rand -hex 32 > token; chmod 600 token"): (
         "test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls"
     ),
+    ("docs/how-to/commission-a-first-drive.md", "ldcnd commission x --config rig.toml"): (
+        "test_all_steps_are_gone_through_and_the_change_is_shown_and_written"
+    ),
     ("docs/how-to/confirm-on-hardware.md", "ldcnd accept /dev/ldcn-FT4ABCDE-00 --out acceptance"): (
         "test_drives_that_are_as_the_documents_say_confirm_every_assumption_that_reading_can"
     ),
@@ -169,6 +172,7 @@ async def test_a_first_drive_is_commissioned_jogged_homed_tuned_and_moved_in_a_g
             await reader.follow(ROOT / page, NOT_RUN)
 
     assert (tmp_path / "before.csv").exists()
+    assert "motor and encoder agree" in (tmp_path / "x.html").read_text()
 
 
 @pytest.mark.system
