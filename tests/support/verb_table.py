@@ -47,7 +47,6 @@ EXPLAINED = {
     ("release", "command line"): "a lease of the command line ends with its command",
     ("renew", "command line"): "a command that holds control renews it by itself",
     ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
-    ("why", "command line"): "`ldcnd why`",
     ("rehearse", "command line"): "`ldcnd drill`",
 }
 """Why a verb is not in a place; everything else is there."""
