@@ -9,7 +9,7 @@ from ldcnd.cli.quantities import decimals, sample_text, state_word
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import PositionSample, Sample, StateSample, TelemetryItem
+from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
 
 
 @click.command("list")
@@ -17,14 +17,13 @@ from ldcnd.model.samples import PositionSample, Sample, StateSample, TelemetryIt
 def list_axes(target: Target) -> None:
     """Show every axis with its state and position."""
 
-    async def work(client: RigClient) -> list[tuple[AxisInfo, StateSample | None, Sample | None]]:
-        return [
-            (axis, await client.state(axis.axis), await client.last(axis.axis, TelemetryItem.POSITION))
-            for axis in await client.axes()
-        ]
+    async def work(client: RigClient) -> tuple[list[AxisInfo], dict[str, StateSample], dict[str, PositionSample]]:
+        return await client.axes(), await client.states(), await client.positions()
 
-    for axis, state, position in target.run(work):
-        where = f"{position.value:12.{decimals(axis)}f} {axis.unit}" if isinstance(position, PositionSample) else "?"
+    axes, states, positions = target.run(work)
+    for axis in axes:
+        state, position = states.get(axis.axis), positions.get(axis.axis)
+        where = f"{position.value:12.{decimals(axis)}f} {axis.unit}" if position else "?"
         what = state_word(state) if state else "unknown"
         target.show(axis, f"{axis.axis:8} {axis.model:14} {axis.bus}/{axis.address:<4} {where:20} {what}")
 

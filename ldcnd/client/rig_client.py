@@ -136,13 +136,15 @@ class RigClient:
 
     async def states(self) -> dict[str, StateSample]:
         """Return the last state of every axis that has one."""
-        answers = await self.session.query(self.keys.telemetry_pattern("*", TelemetryItem.STATE))
-        return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, StateSample) for answer in answers}
+        return await self._of_all_axes(TelemetryItem.STATE, StateSample)
+
+    async def positions(self) -> dict[str, PositionSample]:
+        """Return the last position of every axis that has one."""
+        return await self._of_all_axes(TelemetryItem.POSITION, PositionSample)
 
     async def faults(self) -> dict[str, FaultSample]:
         """Return what is wrong with every axis that has published enough to tell."""
-        answers = await self.session.query(self.keys.telemetry_pattern("*", TelemetryItem.FAULT))
-        return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, FaultSample) for answer in answers}
+        return await self._of_all_axes(TelemetryItem.FAULT, FaultSample)
 
     async def state(self, axis: str) -> StateSample | None:
         """Return the axis's last state, or None when there is none yet."""
@@ -179,6 +181,10 @@ class RigClient:
             LdcndError: as the daemon refused it, of the same class.
         """
         return await self._answer(axis, command, timeout_s)
+
+    async def _of_all_axes(self, item: TelemetryItem, model: type[ModelT]) -> dict[str, ModelT]:
+        answers = await self.session.query(self.keys.telemetry_pattern("*", item))
+        return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, model) for answer in answers}
 
     async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
         payload, encoding = encode(command, Encoding.MSGPACK)
