@@ -107,7 +107,7 @@ class MotorRecord:
         self._val = here(limits=limits)
         record: dict[str, Field] = {
             "VAL": self._val,
-            "DVAL": here(),
+            "DVAL": self._val,  # dial and user values are the same: OFF is 0 and DIR is Pos
             "RBV": here(),
             "DRBV": here(),
             "RRBV": integer(),

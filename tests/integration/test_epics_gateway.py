@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import re
 from contextlib import asynccontextmanager
 
 import pytest
@@ -22,6 +23,7 @@ from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import LinkState, Moving
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, shows
+from tests.support.process import ROOT
 from tests.support.rig import running_rig, two_axes
 
 FIELDS = [
@@ -104,6 +106,7 @@ async def test_a_put_returns_when_the_axis_stands_at_its_target():
         state = await running.client.state("x")
 
         assert made.variables["T:x.DMOV"].value == 1
+        assert (made.variables["T:x.VAL"].value, made.variables["T:x.DVAL"].value) == (3.0, 3.0)
         assert state.moving is Moving.NO
         assert made.variables["T:x.RBV"].value == pytest.approx(3, abs=0.02)
         assert made.variables["T:x.RBV"].timestamp == pytest.approx(state.t * 1e-9, abs=1)
@@ -117,6 +120,12 @@ async def test_the_record_has_the_fields_that_clients_use():
 
     assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
     assert beside == {"adc", "control", "faults", "first_fault", "inputs", "message", "state", "velocity"}
+
+
+def test_the_page_names_every_field():
+    page = (ROOT / "docs" / "how-to" / "use-epics.md").read_text()
+
+    assert [field for field in FIELDS if not re.search(rf"\b{field}\b", page)] == []
 
 
 async def test_a_jog_runs_until_it_is_released():
