@@ -19,6 +19,7 @@ from ldcnd.errors import ConfigError, WrongState
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ldcnd.tuning.ldcn.kept_gains import KeptGains
     from ldcnd.tuning.ldcn.plan import Plan
     from ldcnd.tuning.ldcn.report import MoveFigures, TuningReport
     from ldcnd.tuning.ldcn.response import Floats
@@ -69,7 +70,8 @@ def command(
     not better; if this program or its host dies, --put-back restores them. Needs the extra `tune`.
     """
     if put_back:
-        show_lines(target.run(lambda client: _put_back(client, axis)))
+        kept = target.run(lambda client: _put_back(client, axis))
+        target.show(kept, f"{axis}: off, with its old gains: {_gains(kept.gains)}")
         return
     _require_numpy()
     from ldcnd.tuning.ldcn import plan as plans  # noqa: PLC0415 - needs an optional package
@@ -120,7 +122,7 @@ def _tell(line: str) -> None:
     show_lines(line, err=True)
 
 
-async def _put_back(client: RigClient, axis: str) -> str:
+async def _put_back(client: RigClient, axis: str) -> "KeptGains":
     from ldcnd.tuning.ldcn.kept_gains import file_of, kept_for, put_back  # noqa: PLC0415 - nothing else needs it
 
     await axis_of(client, axis)
@@ -133,7 +135,7 @@ async def _put_back(client: RigClient, axis: str) -> str:
             remedy="type it on the host that tuned; or restart the daemon, which loads the configured gains",
         )
     await put_back(rig, kept)
-    return f"{axis}: off, with its old gains: {_gains(kept.gains)}"
+    return kept
 
 
 def _gains(gains: dict[str, int]) -> str:

@@ -7,6 +7,7 @@ import pytest
 
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.errors import DriveFault, ValueOutOfRange
+from ldcnd.model.commands import SetGains
 from ldcnd.sim.plant import MotorPlant
 from ldcnd.tuning.ldcn.design import (
     GAIN_MARGIN_DB,
@@ -186,6 +187,37 @@ def test_pulses_end_in_the_drive_itself():
             assert 0 < sum(abs(run.pwm)) <= PULSE_COUNTS * trial.gains.ol
             assert not run.pwm[-1]
             trial = pulses.send(nothing)
+
+
+@pytest.mark.parametrize("within", [200, 20_000, 1_000_000])
+def test_every_trial_has_gains_that_a_request_takes(within):
+    excitation = Excitation(PIC_SERVO_SC, Bounds(within, velocity_counts_per_s=1000.0))
+    trials = (excitation.pulses(), excitation.soft(), excitation.stiff(REFERENCE))
+
+    for trial in (*map(next, trials), next(excitation.test(REFERENCE, excitation.wanted(), 1.0))):
+        gains = trial.gains
+        SetGains(kp=gains.kp, kd=gains.kd, ki=gains.ki, il=gains.il, ol=gains.ol, el=gains.el, sr=gains.sr)
+        assert gains.el > 0
+        assert trial.move.speed_counts_per_s <= 1000.0
+        assert abs(trial.move.distance_counts) <= within // 2
+
+
+def test_an_axis_that_is_carried_away_between_moves_gets_no_move_that_could_leave_the_distance():
+    excitation = Excitation(PIC_SERVO_V4, Bounds(1000), offset_counts=970)
+    pulses = excitation.pulses()
+    refused = None
+    trial = next(pulses)
+
+    try:
+        while True:  # by two counts, which pass for noise
+            assert abs(excitation.offset_counts + trial.move.distance_counts) <= 1000
+            still = Record(trial.gains, trial.move, Start(), (0.0,), (0,))
+            trial = pulses.send(Shown(still, tripped=False, rest_counts=2))
+    except DriveFault as error:
+        refused = error
+
+    assert "counts from where it stood: the next move could leave" in str(refused)
+    assert 990 < refused.value <= 1000
 
 
 def test_a_distance_that_is_too_short_is_refused():

@@ -46,6 +46,8 @@ SOFT_SHARE = 0.6
 SOFT_S = 0.6
 SOFT_DERIVATIVE_TICKS = 8
 STIFF_S = 0.3
+MOST_ERROR_LIMIT = 0x3FFF
+"""Largest EL that `set_gains` takes, counts; some drives would take more."""
 
 
 class Purpose(StrEnum):
@@ -187,7 +189,7 @@ class Excitation:
         """
         most = min(int(self.most_impulse / PULSE_COUNTS), MOST_PULSE_LEVEL)
         margin = max(PULSE_MARGIN_COUNTS, int(PULSE_MARGIN_SHARE * self._bounds.within_counts))
-        limit = min(PULSE_COUNTS + margin, self._profile.most_error_limit)
+        limit = min(PULSE_COUNTS + margin, MOST_ERROR_LIMIT)
         cycle_s = self._profile.servo_cycle_s
         self.level = 1
         silent = [1, -1]
@@ -223,7 +225,7 @@ class Excitation:
         Raises:
             DriveFault: it does not, or the drive gave up.
         """
-        reach = min(self._bounds.within_counts // 4, self._profile.most_error_limit * 3 // 4)
+        reach = min(self._bounds.within_counts // 4, MOST_ERROR_LIMIT * 3 // 4)
         level = max(self.level * FIRST_SOFT_SHARE, 1.0)
         while level <= MOST_SOFT_LEVEL:
             kp = max(round(256 * level / reach), 1)
@@ -262,7 +264,7 @@ class Excitation:
         Raises:
             DriveFault: the drive gave up.
         """
-        reach = min(self._bounds.within_counts // 8, self._profile.most_error_limit // 2)
+        reach = min(self._bounds.within_counts // 8, MOST_ERROR_LIMIT // 2)
         gains = replace(gains, ki=0, il=0, ol=MOST_SOFT_LEVEL, el=2 * reach)
         records = []
         for distance in self._there_and_back(reach):
@@ -287,7 +289,7 @@ class Excitation:
             move: there.
             lasts_s: time for one way, with settling.
         """
-        gains = replace(gains, cl=0, el=min(gains.el, max(self._bounds.within_counts // 2, 1)))
+        gains = replace(gains, cl=0, el=min(gains.el, self._bounds.within_counts // 2))
         records = []
         for distance in self._there_and_back(abs(move.distance_counts)):
             there = replace(move, distance_counts=distance)
@@ -304,11 +306,12 @@ class Excitation:
         return first, -first
 
     def _trial(self, purpose: Purpose, gains: Gains, move: Move, lasts_s: float) -> Trial:
-        if abs(self.offset_counts + move.distance_counts) > self._bounds.within_counts:
+        stands, ends = self.offset_counts, self.offset_counts + move.distance_counts
+        if max(abs(stands), abs(ends)) > self._bounds.within_counts:
             raise DriveFault(
-                f"the axis stands {self.offset_counts:+d} counts from where it stood: the next move could leave the"
+                f"the axis stands {stands:+d} counts from where it stood: the next move could leave the"
                 f" {self._bounds.within_counts} counts that it may go",
-                value=self.offset_counts,
+                value=stands,
                 limit=self._bounds.within_counts,
                 remedy="secure the load, which carries it away between moves",
             )

@@ -27,7 +27,7 @@ from ldcnd.errors import (
 from ldcnd.model.samples import AxisState
 from ldcnd.model.traces import TakeTrace
 from ldcnd.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
-from ldcnd.tuning.ldcn.excitation import Excitation, Purpose, Record, Shown, Trial, Trials
+from ldcnd.tuning.ldcn.excitation import MOST_ERROR_LIMIT, Excitation, Purpose, Record, Shown, Trial, Trials
 from ldcnd.tuning.ldcn.identify import Identified, identify
 from ldcnd.tuning.ldcn.kept_gains import LEASE_S, KeptGains, at_rest, forget, gains_in, keep, kept_for, load, put_back
 from ldcnd.tuning.ldcn.plan import Plan, check_off
@@ -349,8 +349,8 @@ def registers_of(gains: Gains, old: dict[str, int]) -> dict[str, int]:
 
 
 def _as_allowed(gains: Gains, old: dict[str, int]) -> Gains:
-    """Keep an output limit that a person has set lower."""
-    return replace(gains, ol=min(gains.ol, old["ol"]))
+    """Keep an output limit that a person has set lower, and an error limit that `set_gains` takes."""
+    return replace(gains, ol=min(gains.ol, old["ol"]), el=min(gains.el, MOST_ERROR_LIMIT))
 
 
 def _is_worth_a_try(profile: Profile, known: Identified, gains: Gains, move: Move) -> bool:
