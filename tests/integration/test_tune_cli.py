@@ -58,6 +58,7 @@ async def test_ctrl_c_puts_the_gains_back(state_file):
         loaded, state = await registers(rig), await rig.state("x")
 
     assert code == 130, errors
+    assert "x: off, with its old gains" in errors.splitlines()
     assert loaded == CONFIGURED
     assert not state.enabled
     assert not state_file.exists()

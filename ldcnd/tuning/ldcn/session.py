@@ -109,7 +109,7 @@ async def measure(client: RigClient, planned: Plan, bandwidth_hz: float | None, 
     """
     excitation = Excitation(planned.profile, planned.bounds)
     profile = planned.profile
-    async with _tuned_axis(client, planned) as (axis, kept), _named(axis.name):
+    async with _tuned_axis(client, planned, tell) as (axis, kept), _named(axis.name):
         tests = _Trials(client, axis, planned, kept.gains)
         tell("pulses: does the encoder count the motor's way?")
         origin_counts = await tests.rest_counts()
@@ -144,7 +144,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
         LdcndError: as the daemon refused it; also when control was lost. The old gains are put back then.
     """
     planned, profile = found.plan, found.plan.profile
-    async with _tuned_axis(client, planned) as (axis, kept), _named(axis.name):
+    async with _tuned_axis(client, planned, tell) as (axis, kept), _named(axis.name):
         tests = _Trials(client, axis, planned, kept.gains)
         offset_counts = await tests.rest_counts() - found.origin_counts
         if abs(offset_counts) > planned.bounds.within_counts // 2:
@@ -168,7 +168,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
 
 
 @asynccontextmanager
-async def _tuned_axis(client: RigClient, planned: Plan) -> AsyncIterator[tuple[Axis, KeptGains]]:
+async def _tuned_axis(client: RigClient, planned: Plan, tell: Tell) -> AsyncIterator[tuple[Axis, KeptGains]]:
     """Control an axis whose gains are kept; puts them back, with a new lease if need be, unless that was done."""
     rig = Rig(client, await client.daemon())
     name = planned.info.axis
@@ -183,13 +183,13 @@ async def _tuned_axis(client: RigClient, planned: Plan) -> AsyncIterator[tuple[A
             try:
                 yield axis, kept
             finally:
-                await _put_back_if_kept(axis, kept)
+                await _put_back_if_kept(axis, kept, tell)
     finally:
         if kept is not None and kept_for(rig.name, name):
-            await _put_back_anew(rig, kept)
+            await _put_back_anew(rig, kept, tell)
 
 
-async def _put_back_anew(rig: Rig, kept: KeptGains) -> None:
+async def _put_back_anew(rig: Rig, kept: KeptGains, tell: Tell) -> None:
     """Put gains back under a lease of their own: that of the tuning was lost."""
     try:
         async with asyncio.timeout(PUT_BACK_S):
@@ -200,14 +200,16 @@ async def _put_back_anew(rig: Rig, kept: KeptGains) -> None:
             axis=kept.axis,
             remedy=f"once it can be controlled again, type: ldcnd tune {kept.axis} --put-back",
         ) from error
+    tell(f"{kept.axis}: off, with its old gains")
 
 
-async def _put_back_if_kept(axis: Axis, kept: KeptGains) -> None:
+async def _put_back_if_kept(axis: Axis, kept: KeptGains, tell: Tell) -> None:
     """Put gains back if they are still to be put back and this client still has control; what fails is tried anew."""
     if kept_for(kept.rig, kept.axis) and axis.control and not axis.control.lost:
         with suppress(LdcndError, TimeoutError):
             async with asyncio.timeout(PUT_BACK_S):
                 await _restore(axis, kept)
+                tell(f"{kept.axis}: off, with its old gains")
 
 
 async def _restore(axis: Axis, kept: KeptGains) -> None:
