@@ -12,7 +12,7 @@ GENERATED = shutil.ignore_patterns("faults", "install.md")
 
 
 @pytest.mark.system
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(400)
 def test_the_site_is_built_without_a_warning(tmp_path):
     """From a copy, because a build gathers pages from elsewhere among the sources."""
     for beside in ROOT.iterdir():
@@ -25,7 +25,7 @@ def test_the_site_is_built_without_a_warning(tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=150,
+        timeout=350,
         check=False,
     )
 
