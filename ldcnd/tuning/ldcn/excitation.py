@@ -40,6 +40,8 @@ MOST_SOFT_LEVEL = 64
 """Largest output of a soft or a stiff move, PWM steps."""
 FIRST_SOFT_SHARE = 1 / 3
 """Soft moves begin at this share of the output at which the axis gave way to a pulse."""
+LEAST_SOFT_LEVEL = 5.0
+"""With less output, PWM steps, the steps themselves hide what a trace could tell."""
 SOFT_STEP = 1.5
 SOFT_SHARE = 0.6
 """A soft move has arrived with this share of its distance: friction holds it there."""
@@ -226,7 +228,7 @@ class Excitation:
             DriveFault: it does not, or the drive gave up.
         """
         reach = min(self._bounds.within_counts // 4, MOST_ERROR_LIMIT * 3 // 4)
-        level = max(self.level * FIRST_SOFT_SHARE, 1.0)
+        level = max(self.level * FIRST_SOFT_SHARE, LEAST_SOFT_LEVEL)
         while level <= MOST_SOFT_LEVEL:
             kp = max(round(256 * level / reach), 1)
             gains = Gains(
