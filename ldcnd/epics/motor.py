@@ -78,7 +78,7 @@ class MotorRecord:
         self._stop = stop
         self._clients = clients
         self._pending = 0
-        self._stopping = False
+        self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._synchronised = False
         self._moving = Moving.UNKNOWN
         self._changed = asyncio.Event()
@@ -337,7 +337,8 @@ class MotorRecord:
         step = sign * float(self["TWV"].value)
         target = (float(self._val.value) if self._pending else axis.position.value) + step
         put = await self._moved(lambda: self._absolute(axis, target), target)
-        await self._val.show(target)
+        if put.value is not None:
+            await self._val.show(put.value)
         return Put(0, put.end)
 
     async def _put_home(self, asked: Value, sign: int) -> Put:
@@ -354,8 +355,9 @@ class MotorRecord:
 
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
         """Begin a jog, or end the one under way."""
+        halts = self._halts
         await self._end_jog()
-        if not asked:
+        if not asked or self._halts != halts:
             return Put(0)
         axis, begun = self._movable(), asyncio.get_running_loop().create_future()
         self._released = asyncio.Event()
@@ -396,9 +398,10 @@ class MotorRecord:
         return Put(0)
 
     async def _put_spmg(self, asked: Value) -> Put:
+        await self["SPMG"].show(asked)  # from here on what moves is refused
         if asked in ("Stop", "Pause"):
             await self._halt()
-        return Put(asked)
+        return Put()
 
     async def _put_cnen(self, asked: Value) -> Put:
         await self._controlled().power(on=asked == "Enable")
@@ -433,30 +436,37 @@ class MotorRecord:
         )
 
     async def _moved(self, starting: Callable[[], Awaitable[Motion]], target: float | None = None) -> Put:
-        """Begin a motion; DMOV is 0 from here to its end, however short it is."""
+        """Begin a motion, unless a halt is put meanwhile; DMOV is 0 from here to its end, however short it is."""
+        halts = self._halts
         await self._end_jog()  # the end of a jog is a halt, which must not come later
         self._pending += 1
-        self._stopping = False
         await self.show_motion()
         try:
-            motion = await starting()
+            self._movable()
+            motion = await starting() if self._halts == halts else None
         except BaseException as error:
             self._pending -= 1
             await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
             await self.show_motion()
             raise
-        await self["LVIO"].show(0)
+        if motion is None:
+            self._pending -= 1
+            await self.show_motion()
+            return Put()
         # the motion goes on when the client is gone that has put it, as it does with every motor record
-        end = asyncio.shield(self._start(self._until_end(motion), f"motion of {self.info.axis}"))
+        end = asyncio.shield(self._start(self._until_end(motion, halts), f"motion of {self.info.axis}"))
+        await self["LVIO"].show(0)
         return Put(target, end)
 
-    async def _until_end(self, motion: Motion) -> None:
+    async def _until_end(self, motion: Motion, halts: int) -> None:
         try:
+            if self._halts != halts:  # put while the motion was on its way to the daemon
+                await self._controlled().halt()
             await motion.done()
         except CommandAborted as error:
             if self._pending == 1:  # not sent elsewhere: it comes to rest
                 await self._rest()
-                if not self._stopping:
+                if self._halts == halts:
                     await self._show_beside("message", str(error))
                     raise
         except LdcndError as error:
@@ -476,7 +486,7 @@ class MotorRecord:
 
     async def _halt(self) -> None:
         """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""
-        self._stopping = True
+        self._halts += 1
         self._released.set()
         if self._axis is None:
             await self._stop(self.info.axis)

@@ -3,7 +3,7 @@
 import asyncio
 import random
 import re
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 import pytest
 from caproto import AccessRights, AlarmSeverity, Forbidden
@@ -306,6 +306,39 @@ async def test_spmg_halts_and_refuses_and_go_starts_nothing():
         await asyncio.sleep(2)
 
         assert (await running.client.state("x")).moving is Moving.NO
+
+
+@pytest.mark.parametrize(("field", "value"), [("STOP", 1), ("SPMG", "Pause"), ("SPMG", "Stop")])
+async def test_a_move_that_waits_for_the_end_of_a_jog_does_not_begin_after_a_stop(field: str, value: float | str):
+    async with records() as (running, made):
+        await put(made, "T:x.JVEL", 2.0)
+        await put(made, "T:x.JOGF", 1)
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        moving = asyncio.create_task(put(made, "T:x", 40.0))
+        await asyncio.sleep(0)
+        await put(made, f"T:x.{field}", value)
+        with suppress(WrongState):
+            await moving
+        await shows(made, "T:x.DMOV", 1)
+        await asyncio.sleep(3)
+
+        assert made.variables["T:x.RBV"].value < 5
+        assert (await running.client.state("x")).moving is Moving.NO
+
+
+async def test_a_stop_right_after_a_put_leaves_the_axis_at_rest():
+    async with records() as (running, made):
+        for turns in range(1, 13):
+            began = made.variables["T:x.RBV"].value
+            moving = asyncio.create_task(put(made, "T:x", 50.0 if began < 0 else -50.0))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            await put(made, "T:x.STOP", 1)
+            await moving
+            await asyncio.sleep(1)
+
+            assert made.variables["T:x.RBV"].value == pytest.approx(began, abs=3), turns
+            assert (await running.client.state("x")).moving is Moving.NO
 
 
 async def test_tweaks_homing_and_set_mode():

@@ -24,6 +24,9 @@ pytestmark = pytest.mark.timeout(3600)
 
 PLACES = {"x": 1, "y": 2}
 STILL_COUNTS = 3
+SETTLING_COUNTS = 50
+SETTLING_S = 3.0
+"""By how much, and for how long, the loop goes on after the end of a profile that a halt has cut short."""
 MOVES = {"move_absolute", "home", "jog"}
 
 
@@ -64,7 +67,10 @@ class Campaign:
         control = self.rig.control("x", client="ann", force=True, lease_s=60)
         self.ann = await self.taken.enter_async_context(control)
         await self.running.until("x", lambda state: state.moving is Moving.NO)
+        ended_at = self.counts("x")
+        await asyncio.sleep(SETTLING_S)
         self.rests_at = self.counts("x")
+        assert abs(self.rests_at - ended_at) <= SETTLING_COUNTS
 
     async def give(self) -> None:
         """Let it go, and wait until the gateway controls x again: nothing that was put before begins then."""
