@@ -378,13 +378,21 @@ class Axis(ReadableAxis):
         target: float | None = None,
         began: asyncio.Future[None] | None = None,
     ) -> None:
+        if self._is_stopped():
+            starting.close()
+            raise CommandAborted(
+                f"axis {self._info.axis}: it was stopped before the motion began", axis=self._info.axis
+            )
         motion = await starting
         self._setpoint = target
         if began and not began.done():
             began.set_result(None)
-        if self._stopped is not None:  # it overtook the motion on its way to the daemon
+        if self._is_stopped():  # it overtook the motion on its way to the daemon
             await self._axis.halt()
         await motion.done()
+
+    def _is_stopped(self) -> bool:
+        return self._stopped is not None
 
     async def _halt(self, *, success: bool) -> None:
         if not self._under_way:

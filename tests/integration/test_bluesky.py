@@ -291,6 +291,22 @@ def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory)
         assert lab.truth("x") < 30
 
 
+def test_a_stop_while_a_flight_is_checked_begins_no_motion(lab: Laboratory):
+    async def prepare_and_stop():
+        status = x.prepare(Fly(40, 50))
+        await asyncio.sleep(0)  # the check is on its way
+        await x.stop(success=True)
+        return status
+
+    with lab.powered("x") as (x,):
+        before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
+        ended = lab.loop.run(prepare_and_stop()).exception(20)
+        events = lab.loop.run(lab.running.client.ask(ReadEvents(from_number=before.end_number))).events
+
+    assert ended is None
+    assert [event.verb for event in events if event.verb == "move_absolute"] == []
+
+
 def test_a_stop_of_a_standing_axis_sends_nothing(lab: Laboratory):
     with lab.powered("x") as (x,):
         before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
