@@ -21,8 +21,8 @@ quote = partial(parse.quote, safe="")
 NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
 NEEDED = frozenset(NAMES) - {"cl", "deadband"}
 """Registers that every drive with gains has."""
-LEASE_S = 2.0
-"""So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
+LEASE_S = 5.0
+"""So soon the daemon applies `loss.client` of the axis when this program disappears, seconds: no trial lasts longer."""
 STAND_S = 5.0
 """Longest time that an axis takes to come to rest with its loop open, seconds."""
 LOOK_S = 0.05
