@@ -177,16 +177,21 @@ def test_wrong_wires_are_found_by_pulses_within_the_distance(wrong, said):
 def test_pulses_end_in_the_drive_itself():
     (plant,) = drawn_plants(SEED, 1)
     blind = replace(plant.motor, encoder_disconnected=True)
-    pulses = Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts)).pulses()
+    excitation = Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts))
+    pulses = excitation.pulses()
     nothing = Shown(Record(REFERENCE, MOVE, Start(), (0.0,), (0,)), tripped=False, rest_counts=0)
 
+    forward = []
     trial = next(pulses)
     with suppress(DriveFault):
         while True:
             run = simulate(PIC_SERVO_V4, blind, trial.gains, trial.move, 0.1)
             assert 0 < sum(abs(run.pwm)) <= PULSE_COUNTS * trial.gains.ol
             assert not run.pwm[-1]
+            forward.append(max(sum(run.pwm), 0))
             trial = pulses.send(nothing)
+
+    assert sum(forward) <= 2 * excitation.most_impulse
 
 
 @pytest.mark.parametrize("within", [200, 20_000, 1_000_000])
@@ -203,7 +208,7 @@ def test_every_trial_has_gains_that_a_request_takes(within):
 
 
 def test_an_axis_that_is_carried_away_between_moves_gets_no_move_that_could_leave_the_distance():
-    excitation = Excitation(PIC_SERVO_V4, Bounds(1000), offset_counts=970)
+    excitation = Excitation(PIC_SERVO_V4, Bounds(1000), offset_counts=980)
     pulses = excitation.pulses()
     refused = None
     trial = next(pulses)

@@ -35,10 +35,11 @@ PULSE_MARGIN_COUNTS = 20
 PULSE_MARGIN_SHARE = 0.05
 """An axis may run away in a pulse by these counts, or this share of the distance, before the drive opens its loop."""
 PULSE_S = 0.25
-LEVEL_STEP = 1.25
+ALL_PULSES = 2
+"""Each level of pulses is half of the next: all of one direction together are at most so many times the last one."""
 MOST_SOFT_LEVEL = 64
 """Largest output of a soft or a stiff move, PWM steps."""
-FIRST_SOFT_SHARE = 1 / 3
+FIRST_SOFT_SHARE = 1 / 4
 """Soft moves begin at this share of the output at which the axis gave way to a pulse."""
 LEAST_SOFT_LEVEL = 5.0
 """With less output, PWM steps, the steps themselves hide what a trace could tell."""
@@ -177,11 +178,12 @@ class Excitation:
         """The largest pulse, PWM steps times ticks.
 
         Without any friction a motor is carried by a pulse as far as full output would carry it in the same share of the
-        time. It is taken to be no faster at full output than its drive can count.
+        time. It is taken to be no faster at full output than its drive can count. A load may keep it from coming back,
+        so all pulses of one direction together stay within the distance.
         """
         profile = self._profile
         full_counts = profile.encoder_counts_per_s * profile.servo_cycle_s / FULL_PWM
-        return min(self._bounds.within_counts / full_counts, MOST_IMPULSE)
+        return min(self._bounds.within_counts / full_counts / ALL_PULSES, MOST_IMPULSE)
 
     def pulses(self) -> Trials:
         """Find the output at which the axis gives way, and whether its encoder then counts the motor's way.
@@ -189,13 +191,13 @@ class Excitation:
         Raises:
             DriveFault: it counts the other way, or not at all.
         """
-        most = min(int(self.most_impulse / PULSE_COUNTS), MOST_PULSE_LEVEL)
+        most = min(max(int(self.most_impulse / PULSE_COUNTS), 1), MOST_PULSE_LEVEL)
         margin = max(PULSE_MARGIN_COUNTS, int(PULSE_MARGIN_SHARE * self._bounds.within_counts))
         limit = min(PULSE_COUNTS + margin, MOST_ERROR_LIMIT)
         cycle_s = self._profile.servo_cycle_s
-        self.level = 1
         silent = [1, -1]
-        while silent and self.level <= most:
+        for halvings in reversed(range(most.bit_length())):
+            self.level = most >> halvings
             for direction in tuple(silent):  # a load may make one of them easier
                 gains = Gains(kp=0, kd=256 * self.level, ki=0, il=0, ol=self.level, cl=0, el=limit, sr=1)
                 move = self._bounds.move(direction * PULSE_COUNTS, 1 / cycle_s, 1 / cycle_s**2)
@@ -210,10 +212,8 @@ class Excitation:
                     )
                 if gone >= SEEN_COUNTS:
                     silent.remove(direction)
-            if silent:
-                self.level = max(self.level + 1, math.ceil(self.level * LEVEL_STEP))
-        if not silent:
-            return ()
+            if not silent:
+                return ()
         raise DriveFault(
             f"the encoder counted nothing at {most} of {FULL_PWM} PWM steps, {PULSE_COUNTS} servo ticks long",
             value=most,
