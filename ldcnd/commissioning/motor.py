@@ -24,15 +24,17 @@ OUTPUTS = (1, 2, 3, 4, 6, 9, 13, 20, 30, 45, 60)
 """Output limits that are tried, in PWM steps of 255. A motor that stood at one gets at most twice its friction next."""
 LEAD = 2.0
 """The set-point goes this many times the position error limit."""
-DURATION_S = 0.5
+DURATION_S = 0.2
 """Time that the set-point takes for that, seconds."""
 RAMP_SHARE = 0.1
 CAUGHT = 3.0
 """A runaway ends within this many times the position error limit: one until the loop opens; then it coasts, at most
 twice as far, because it was driven with at most twice its friction, which at speed is at least half of that at rest."""
-FORWARD_SHARE = 0.5
+FORWARD_SHARE = 0.25
 REVERSE_SHARE = 0.125
 """Shares of the position error limit from which a motion counts as one."""
+COUNTING = 4
+"""An encoder that counts less, counts nothing: the person is asked whether the axis moved."""
 DAMPING = 8
 """kd over kp while the step runs."""
 PWM_PER_GAIN = 256
@@ -66,16 +68,16 @@ class MotorDirection(Step):
         await _refuse_what_cannot_be(site, lead)
         return (
             (
-                f"{site.info.axis} moves forward by at most {LEAD * el:.0f} counts ({site.length(lead.distance)}), at"
+                f"{site.info.axis} moves forward by about {LEAD * el:.0f} counts ({site.length(lead.distance)}), at"
                 f" {site.length(lead.velocity)}/s, with {OUTPUTS[0]} to {OUTPUTS[-1]} of 255 PWM steps"
             ),
             (
-                f"a motor that turns the wrong way is caught: the loop opens after {el} counts, and the axis stands"
-                f" within {caught:.0f} counts ({site.length(caught / site.counts_per_unit)}), if its friction stops it"
+                f"it stays within {caught:.0f} counts ({site.length(caught / site.counts_per_unit)}): a motor that"
+                f" turns the wrong way is caught after {el} counts, where the loop opens, and its friction stops it"
             ),
             (
                 "an encoder that does not count: the loop opens, too, within"
-                f" {lead.distance / lead.velocity:.2g} s each time"
+                f" {lead.distance / lead.velocity:.2g} s, and you are asked whether the axis moved: watch it"
             ),
             "the loop is open before, between and after: a load that falls without power must be secured",
             "Ctrl-C halts it and opens the loop",
@@ -92,6 +94,9 @@ class MotorDirection(Step):
                 points.append((output, moved))
                 if moved >= FORWARD_SHARE * el or moved <= -REVERSE_SHARE * el:
                     break
+                nothing = f"the encoder counted nothing with {output} of 255 PWM steps"
+                if abs(moved) < COUNTING and await site.person.confirm(f"{nothing}: did the axis move"):
+                    return _blind(nothing, el, points)
         return _judged(el, points)
 
     async def _try(self, site: Site, axis: Axis, output: int, el: int) -> int:
@@ -146,15 +151,13 @@ async def _refuse_what_cannot_be(site: Site, lead: _Lead) -> None:
     refuse_previewed(reply)
 
 
+def _blind(nothing: str, el: int, points: list[tuple[float, float]]) -> Result:
+    text = f"{nothing}, and the axis moved: switch the drive off and check the wires of the encoder"
+    return _result(StepState.FAILED, text, el, points)
+
+
 def _judged(el: int, points: list[tuple[float, float]]) -> Result:
     output, moved = points[-1]
-    figures = (
-        Figure(what="moved", value=moved, unit="counts"),
-        Figure(what="output limit", value=output, unit="of 255 PWM steps"),
-        Figure(what="position error limit", value=el, unit="counts"),
-        Figure(what="stated distance", value=CAUGHT * el, unit="counts"),
-    )
-    series = (Series(title="Motion by output limit", x="PWM steps of 255", y="counts forward", points=tuple(points)),)
     if moved >= FORWARD_SHARE * el:
         text, state = f"motor and encoder agree: it moved forward by {moved:.0f} counts", StepState.DONE
     elif moved <= -REVERSE_SHARE * el:
@@ -164,9 +167,18 @@ def _judged(el: int, points: list[tuple[float, float]]) -> Result:
         )
         state = StepState.FAILED
     else:
-        text = (
-            f"the encoder did not count with up to {output:.0f} of 255 PWM steps. If the motor turned, the encoder is"
-            " not connected: switch off and check its wires. If it stood, check supply, motor wires and brake"
-        )
+        text = f"it stood with up to {output:.0f} of 255 PWM steps: check supply, wires of the motor, and brake"
         state = StepState.FAILED
+    return _result(state, text, el, points)
+
+
+def _result(state: StepState, text: str, el: int, points: list[tuple[float, float]]) -> Result:
+    output, moved = points[-1]
+    figures = (
+        Figure(what="moved", value=moved, unit="counts"),
+        Figure(what="output limit", value=output, unit="of 255 PWM steps"),
+        Figure(what="position error limit", value=el, unit="counts"),
+        Figure(what="stated distance", value=CAUGHT * el, unit="counts"),
+    )
+    series = (Series(title="Motion by output limit", x="PWM steps of 255", y="counts forward", points=tuple(points)),)
     return Result(state=state, text=text, figures=figures, series=series)
