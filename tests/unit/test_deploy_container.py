@@ -91,6 +91,8 @@ def test_prometheus_and_grafana_find_what_they_are_given():
     assert any(place.startswith(provided["providers"][0]["options"]["path"]) for place in mounted)
     assert prometheus["scrape_configs"][0]["static_configs"][0]["targets"] == ["127.0.0.1:9464"]
     assert sources["datasources"][0]["url"] == "http://127.0.0.1:9090"
+    assert "--storage.tsdb.path=/prometheus" in SERVICES["prometheus"]["command"]
+    assert "prometheus:/prometheus" in SERVICES["prometheus"]["volumes"]
     assert re.search(r"listen-address=127\.0\.0\.1:9090", str(SERVICES["prometheus"]["command"]))
 
 
