@@ -53,10 +53,11 @@ class PageReader:
     async def follow(self, page: Path, left_out: Container[tuple[str, str]] = ()) -> None:
         """Do what a page says, but for some blocks, named by page and first line."""
         for block in blocks_of(page):
+            if (block.page, block.first_line) in left_out:
+                continue  # what is said of Ctrl-C there is said of what is left out
             if "Ctrl-C" in block.prose and self._running:
                 await self._interrupt()
-            if (block.page, block.first_line) not in left_out:
-                await self._do(block)
+            await self._do(block)
             assert all(process.returncode is None for process in self._running), f"{block}: what should serve has ended"
 
     async def start_daemon(self, config: str) -> None:
