@@ -28,6 +28,8 @@ from ldcnd.model.samples import Sample as Measurement
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
 
+TAKING_CONTROL = "acquire"
+"""The verb after which commands are meant for the daemon that runs then."""
 KEPT_SAMPLES = 256
 """Maximum number of samples kept for a slow watcher; the oldest are dropped."""
 
@@ -180,7 +182,10 @@ class RigClient:
         Raises:
             LdcndError: as the daemon refused it, of the same class.
         """
-        return await self._answer(axis, command, timeout_s)
+        reply = await self._answer(axis, command, timeout_s)
+        if command.verb == TAKING_CONTROL:
+            self._instance = None  # control is of the daemon that runs now, restarted or not
+        return reply
 
     async def _of_all_axes(self, item: TelemetryItem, model: type[ModelT]) -> dict[str, ModelT]:
         answers = await self.session.query(self.keys.telemetry_pattern("*", item))

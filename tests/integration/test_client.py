@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -20,14 +20,18 @@ from ldcnd.client import blocking
 from ldcnd.client.axis import Axis
 from ldcnd.client.loop_thread import loop_thread
 from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedRequest, SessionError, UnknownAxis
+from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.catalogue import COMMANDS
 from ldcnd.model.commands import About, Halt
 from ldcnd.model.events import CommandStatus
 from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
 from tests.support.process import ROOT, daemon
-from tests.support.rig import RunningRig, running_rig
+from tests.support.rig import EPOCH_NS, RunningRig, running_rig, two_axes
 from tests.support.session_pair import free_endpoint
 
 CLIENT = ROOT / "ldcnd" / "client"
@@ -116,6 +120,39 @@ async def test_a_value_that_a_command_cannot_have_is_refused_before_it_is_sent()
     async with client_rig() as (_, rig), rig.control("x", client="ann") as x:
         with pytest.raises(MalformedRequest, match="velocity"):
             await x.move_absolute(1, velocity=-1)
+
+
+async def test_a_program_goes_on_with_the_daemon_that_follows_a_restart():
+    broker = MemoryBroker()
+
+    @asynccontextmanager
+    async def life(instance: str) -> AsyncIterator[Daemon]:
+        async with broker.session() as session, asyncio.TaskGroup() as group:
+            made = build_daemon(two_axes(), session, lambda: EPOCH_NS, instance, {})
+            running = group.create_task(made.run(), name=instance)
+            async with asyncio.timeout(60):
+                while any(axis.tracker.link is not LinkState.UP for axis in made.rig.axes.values()):
+                    await asyncio.sleep(0.05)
+            yield made
+            made.end()
+            await running
+
+    async with broker.session() as session:
+        client = RigClient(session, "sim")
+        async with AsyncExitStack() as watching:
+            async with life("first") as first:
+                rig = Rig(client, await client.daemon())
+                y = await watching.enter_async_context(rig.watch("y"))
+                with pytest.raises(LeaseExpired):  # noqa: PT012 - raised where the program waits
+                    async with rig.control("x", client="ann") as x:
+                        await x.power(on=True)
+                        first.end()
+                        await asyncio.sleep(60)
+            positions = y.positions()
+            async with life("second"), rig.control("x", client="ann") as x:
+                await x.power(on=True)
+                await (await x.move_relative(1)).done()
+                assert (await anext(positions)).quality is Quality.GOOD
 
 
 async def test_control_that_is_taken_away_is_an_error_where_the_program_waits():
