@@ -29,7 +29,7 @@ PULSE_COUNTS = 10
 MOST_PULSE_LEVEL = 100
 MOST_IMPULSE = 1000.0
 """Most that a pulse may be: PWM steps times servo ticks."""
-SEEN_COUNTS = 3
+SEEN_COUNTS = 2
 """An axis that has moved so far has moved: one count is noise."""
 PULSE_MARGIN_COUNTS = 20
 PULSE_MARGIN_SHARE = 0.05
@@ -46,6 +46,8 @@ LEAST_SOFT_LEVEL = 5.0
 SOFT_STEP = 1.5
 SOFT_SHARE = 0.6
 """A soft move has arrived with this share of its distance: friction holds it there."""
+FRACTION_OF_GAIN = 256
+"""The drive divides what its gains make by this."""
 SOFT_S = 0.6
 SOFT_DERIVATIVE_TICKS = 8
 STIFF_S = 0.3
@@ -248,8 +250,9 @@ class Excitation:
                 self._account(shown)
                 if shown.tripped:
                     raise _gave_up("a soft move")
-                if abs(shown.rest_counts) < SOFT_SHARE * reach:
-                    break
+                left = reach - abs(shown.rest_counts)
+                if left > (1 - SOFT_SHARE) * reach or kp * left >= FRACTION_OF_GAIN * gains.ol:
+                    break  # at its limit all the way, the output tells only by how much it exceeds friction
                 records.append(shown.record)
             if len(records) == 2:  # noqa: PLR2004 - there and back
                 return tuple(records)
