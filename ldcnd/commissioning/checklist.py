@@ -43,7 +43,7 @@ STEPS: dict[str, Step] = {
 }
 """All of them, in the order in which they build on each other."""
 CLIENT = "ldcnd commission"
-LEASE_S = 1.0
+LEASE_S = 2.0
 """So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
 SETTLED = (StepState.DONE, StepState.SKIPPED, StepState.NOT_POSSIBLE)
 SAME_IN_FILE = ("model", "address", "unit", "counts_per_unit", "direction", "modulo", "limits")

@@ -153,7 +153,8 @@ def rig_on(loop):
         loop.run_until_complete(running)
 
 
-@pytest.mark.timeout(300)  # likewise
+@pytest.mark.system  # the picture takes ten seconds of processor time
+@pytest.mark.timeout(300)
 def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(tune, "end_as_interrupted", lambda: None)
