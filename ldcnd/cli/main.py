@@ -41,6 +41,7 @@ COMMANDS = {
     "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
     "trace": ("ldcnd.cli.trace", "Record an axis against time, show the result, draw it."),
     "tune": ("ldcnd.cli.tune", "Find gains for an axis: move it a little, identify it, propose, apply, verify."),
+    "shadow": ("ldcnd.cli.shadow", "Watch axes for growing friction, a changed load, a coupling that slips."),
     "doctor": ("ldcnd.cli.doctor", "Examine a line by reading only, before a daemon uses it."),
     "accept": ("ldcnd.cli.accept", "Try real drives against what the documents say, and keep a report of it."),
     "pki": ("ldcnd.cli.pki", "Make certificates and access rules for a network with mutual TLS."),

@@ -1,0 +1,121 @@
+"""A shadow beside a whole daemon: it learns, says what has changed, learns anew, and sends no command."""
+
+import asyncio
+import json
+from contextlib import asynccontextmanager
+from dataclasses import asdict, replace
+
+import pytest
+
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.axis import RatesConfig
+from ldcnd.config.rig import load_config
+from ldcnd.errors import ConfigError, NotSupported
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.plant import MotorPlant, Shaft
+from ldcnd.tuning.ldcn import shadow
+from ldcnd.tuning.ldcn.plant import Plant
+from ldcnd.tuning.ldcn.report import Estimate
+from ldcnd.tuning.ldcn.watching import WatchedAxis, memory_file, watch
+from tests.support.rig import SIMULATED, running_rig
+from tests.unit.test_cli_tune import REPORT
+
+MACHINE = MotorPlant(inertia_kg_m2=2e-4, friction_nm=0.02)
+TUNED = REPORT.model_copy(
+    update={
+        "plant": {name: Estimate(value=value, interval=0, unit="") for name, value in asdict(Plant.of(MACHINE)).items()}
+    }
+)
+
+
+@pytest.fixture(autouse=True)
+def few_motions_teach(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr(shadow, "LEARNT_MOTIONS", 8)
+    monkeypatch.setattr(shadow, "WINDOWS", (4,))
+
+
+@asynccontextmanager
+async def working_rig(**changes):
+    config = load_config(SIMULATED)
+    (bus,) = config.bus
+    axis = bus.axis[0].model_copy(update={"rates": RatesConfig(position=100)} | changes)
+    one = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (axis,), "group": ()}),)})
+    chain = build_chain(ChainSpec(modules=(ModuleSpec("ls182ap", MACHINE),)))
+    async with running_rig(one, {"line0": chain}) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        yield rig, chain.modules[0]
+
+
+class Observer(RigClient):
+    """A client that cannot command."""
+
+    async def _answer(self, *_args):
+        raise AssertionError("the shadow has sent a command")
+
+
+@asynccontextmanager
+async def watched(rig, alarms, said):
+    end = asyncio.Event()
+    async with rig.broker.session() as session, asyncio.TaskGroup() as group:
+        client = Observer(session, rig.client.rig)
+        task = group.create_task(watch(client, [TUNED], alarms.append, said.append, end), name="shadow")
+        yield
+        end.set()
+        await task
+
+
+async def move(axis, motions):
+    for motion in range(motions):
+        await (await axis.move_absolute(2.0 if motion % 2 == 0 else 0.0)).done()
+        await asyncio.sleep(0.3)
+
+
+def kept():
+    return json.loads(memory_file("sim", "x").read_text())
+
+
+async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_observer():
+    alarms, said = [], []
+    async with working_rig() as (rig, module):
+        usual = Rig(rig.client, await rig.client.daemon())
+        async with usual.control("x", client="test") as axis:
+            await axis.power(on=True)
+            async with watched(rig, alarms, said):
+                await move(axis, 10)
+            learnt = kept()["learnt"]
+            heavy = Shaft(replace(MACHINE, inertia_kg_m2=2 * MACHINE.inertia_kg_m2), module.profile.servo_cycle_s)
+            heavy.position_counts = module.shaft.position_counts
+            module.loop.shaft = heavy
+            async with watched(rig, alarms, said):
+                await move(axis, 6)
+                healthy_gains = kept()["gains"]
+                await axis.set_gains(kp=300)
+                await asyncio.sleep(15)
+
+    assert "x: learnt; from now on its motions are compared" in said
+    assert learnt["inertia"]["value"] == pytest.approx(1.0, abs=0.2)
+    (heavier,) = [alarm for alarm in alarms if alarm.figure == "inertia"]
+    assert heavier.latest == pytest.approx(2.0, abs=0.3)
+    assert heavier.value > heavier.high
+    assert heavier.meaning.startswith("a heavier load")
+    assert not any(alarm.over for alarm in alarms)
+    assert ["learnt before" in line for line in said if "with these gains" in line] == [False, True, False]
+    assert kept()["learnt"] == {}
+    assert kept()["gains"] == {**healthy_gains, "kp": 300}
+
+
+async def test_what_cannot_be_watched_is_refused_and_slow_positions_are_said():
+    said = []
+    async with working_rig(rates=RatesConfig(position=10)) as (rig, _):
+        with pytest.raises(ConfigError, match="has no axis 'w'; it has x"):
+            await watch(rig.client, [TUNED.model_copy(update={"axis": "w"})], print, said.append, asyncio.Event())
+        (info,) = await rig.client.axes()
+        with pytest.raises(NotSupported, match="a pic-servo-v4 does not report its position error"):
+            WatchedAxis("sim", info.model_copy(update={"model": "pic-servo-v4"}), TUNED, print, said.append)
+        async with watched(rig, [], said):
+            await asyncio.sleep(3)
+
+    assert said[0] == "x: waits until its loop has been closed once: its gains are not known"
+    assert "x: its position comes every 100 ms: motions shorter than 1.2 s are not judged" in said[-1]
