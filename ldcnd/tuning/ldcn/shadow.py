@@ -32,7 +32,7 @@ LIKE = 1.3
 """A motion is like those that taught when its top speed and way are within their range, widened by this factor."""
 LEAST_FRICTION_PWM = 0.2
 LEAST_FRICTION_SHARE = 0.2
-LEAST_INERTIA = 0.2
+LEAST_INERTIA = 0.1
 LEAST_MISFIT_PWM = 0.05
 """Changes below these do not matter: PWM steps, a share of the identified friction, of the identified inertia, and of
 what the model leaves, PWM steps."""
