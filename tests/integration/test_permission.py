@@ -181,7 +181,13 @@ async def test_a_stop_between_the_halt_and_the_start_of_an_aborting_move_wins():
 
 async def test_a_homing_whose_lease_was_lost_begins_no_further_leg():
     """The axis stands on its switch: the first leg moves off it; the search would be the second one."""
-    async with running_rig(config()) as rig:
+    rig_config = config()
+    bus = rig_config.bus[0]
+    axes = tuple(
+        axis.model_copy(update={"home": axis.home.model_copy(update={"move_to": None})}) if axis.name == "y" else axis
+        for axis in bus.axis
+    )
+    async with running_rig(rig_config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})) as rig:
         await rig.until("y", lambda state: state.link == "up")
         async with control(rig.client, "ann", "y", lease_s=60.0) as held:
             await held.command("y", Power(on=True))
