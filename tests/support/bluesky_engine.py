@@ -2,8 +2,9 @@
 
 import asyncio
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 from bluesky import RunEngine
@@ -19,6 +20,9 @@ from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.rig import RunningRig, running_rig, two_axes
+
+with suppress(ImportError):
+    import_module("ophyd")  # an engine imports it where it is, beside a loop that leaves hardly any time for that
 
 TICK_S = 1.0
 MODELS = ("ls182ap", "ls182ap")
