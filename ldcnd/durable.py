@@ -3,6 +3,14 @@
 import contextlib
 import os
 from pathlib import Path
+from urllib.parse import quote
+
+
+def state_file(kind: str, rig: str, axis: str) -> Path:
+    """Return where a program keeps what it knows of an axis: below $XDG_STATE_HOME, or ~/.local/state."""
+    state = os.environ.get("XDG_STATE_HOME")
+    folder = (Path(state) if state else Path.home() / ".local" / "state") / "ldcnd" / kind
+    return folder / f"{quote(rig, safe='')}@{quote(axis, safe='')}.json"  # names may have what files may not
 
 
 def replace(path: Path, text: str) -> None:

@@ -112,12 +112,10 @@ class _Session:
 
     async def put_back_gains(self) -> None:
         """Put gains back that an earlier call has left in the drive, once the person agrees."""
-        if self._checklist.record.gains_to_put_back is not None:
-            self._person.tell(
-                "an earlier call was killed in the middle of a step: the drive has low gains of that step"
-            )
+        if self._checklist.gains_to_put_back:
+            self._person.tell("an earlier step, or `ldcnd tune`, was killed in its middle: the drive has gains of that")
             if not await self._person.confirm("put the former gains back now? The loop is opened for it"):
-                raise Left("the gains are still low")
+                raise Left("the former gains are still to be put back")
             await self._checklist.put_back_gains()
 
     async def go_through(self, name: str | None) -> bool:

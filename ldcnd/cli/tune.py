@@ -19,7 +19,7 @@ from ldcnd.errors import ConfigError, WrongState
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ldcnd.tuning.ldcn.kept_gains import KeptGains
+    from ldcnd.client.kept_gains import KeptGains
     from ldcnd.tuning.ldcn.plan import Plan
     from ldcnd.tuning.ldcn.report import MoveFigures, TuningReport
     from ldcnd.tuning.ldcn.response import Floats
@@ -123,7 +123,7 @@ def _tell(line: str) -> None:
 
 
 async def _put_back(client: RigClient, axis: str) -> "KeptGains":
-    from ldcnd.tuning.ldcn.kept_gains import file_of, kept_for, put_back  # noqa: PLC0415 - nothing else needs it
+    from ldcnd.client.kept_gains import file_of, kept_for, put_back  # noqa: PLC0415 - nothing else needs it
 
     await axis_of(client, axis)
     rig = Rig(client, await client.daemon())
@@ -134,7 +134,7 @@ async def _put_back(client: RigClient, axis: str) -> "KeptGains":
             axis=axis,
             remedy="type it on the host that tuned; or restart the daemon, which loads the configured gains",
         )
-    await put_back(rig, kept)
+    await put_back(rig, kept, "ldcnd tune")
     return kept
 
 

@@ -101,9 +101,13 @@ async def _end(client: RigClient, axis: str, trace_id: str) -> None:
 
 
 async def wait_for_trace(
-    client: RigClient, axis: str, trace_id: str, within_s: float, told: Callable[[TraceHeader], None] = lambda _: None
+    client: RigClient,
+    axis: str,
+    trace_id: str,
+    within_s: float,
+    progress: Callable[[TraceHeader], None] = lambda _: None,
 ) -> TraceHeader:
-    """Wait for the end of a trace, good or bad; `told` is called with how far it is.
+    """Wait for the end of a trace, good or bad; `progress` is called with how far it is.
 
     Raises:
         OutcomeUnknown: it did not end in time, or gave way to another one.
@@ -114,7 +118,7 @@ async def wait_for_trace(
                 header = await _header(client, axis, trace_id)
                 if header.phase not in UNDER_WAY:
                     return header
-                told(header)
+                progress(header)
                 await asyncio.sleep(LOOK_S)
     except TimeoutError:
         raise OutcomeUnknown(

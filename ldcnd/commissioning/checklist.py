@@ -1,5 +1,6 @@
 """The checklist of one axis: which steps there are, which are open, and what happens around the run of one."""
 
+import asyncio
 import difflib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -9,18 +10,19 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
+from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back
 from ldcnd.client.rig import Rig
+from ldcnd.client.standstill import seen
 from ldcnd.commissioning import record as records
 from ldcnd.commissioning.homing import HomeRepeatability
 from ldcnd.commissioning.limit_switches import LimitSwitches
-from ldcnd.commissioning.lowered_gains import put_back
 from ldcnd.commissioning.motor import MotorDirection
 from ldcnd.commissioning.person import Person, said
 from ldcnd.commissioning.questions import Gains, Load
 from ldcnd.commissioning.record import Proposal, Record, Result, StepRecord, StepState
 from ldcnd.commissioning.scale import Scale
 from ldcnd.commissioning.speed import HighestSpeed
-from ldcnd.commissioning.step import Site, Step, seen
+from ldcnd.commissioning.step import Site, Step
 from ldcnd.commissioning.travel import Travel
 from ldcnd.config.axis import AxisConfig, MovedAxisConfig
 from ldcnd.config.edit import draft_of, edited_for_axis
@@ -122,15 +124,25 @@ class Checklist:
             self._keep(record)
         return messages
 
+    @property
+    def gains_to_put_back(self) -> KeptGains | None:
+        """Gains that a step, or a tuning, that was cut short has not put back; None without such.
+
+        Raises:
+            ConfigError: the file that keeps them cannot be read.
+        """
+        return kept_for(self._rig.name, self._axis)
+
     async def put_back_gains(self) -> None:
-        """Put gains back that a step, or an earlier run that was killed, has left low; nothing without such.
+        """Put back what `gains_to_put_back` says; nothing without such.
 
         Raises:
             LdcndError: as the daemon refused it; they are still to be put back.
             TimeoutError: it takes too long; likewise.
         """
-        if self.record.gains_to_put_back is not None:
-            await put_back(self._rig, self._axis, self.record.gains_to_put_back, self._keep_gains)
+        if kept := self.gains_to_put_back:
+            async with asyncio.timeout(PUT_BACK_S):
+                await put_back(self._rig, kept, CLIENT)
 
     async def preview(self, name: str) -> tuple[str, ...]:
         """Return in words what a step would do now; nothing is sent to the drive.
@@ -166,7 +178,7 @@ class Checklist:
             self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
             raise
         finally:
-            with suppress(LdcndError, TimeoutError):  # the record says that they are still to be put back
+            with suppress(LdcndError, TimeoutError):  # they are still kept
                 await self.put_back_gains()
         return self._settle(step, site, result)
 
@@ -213,7 +225,7 @@ class Checklist:
         infos = {info.axis: info for info in await self._rig.describe()}
         if self._axis not in infos:
             raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
-        return Site(self._rig, infos[self._axis], config, self._person, self._keep_gains)
+        return Site(self._rig, infos[self._axis], config, self._person)
 
     def _kept(self, step: Step, site: Site, result: Result) -> StepRecord:
         at = self._now().isoformat(timespec="seconds")
@@ -227,9 +239,6 @@ class Checklist:
     def _keep(self, record: Record) -> None:
         records.write(self.path, record)
         self.record = record
-
-    def _keep_gains(self, gains: dict[str, int] | None) -> None:
-        self._keep(self.record.model_copy(update={"gains_to_put_back": gains}))
 
 
 def axis_of(rig: RigConfig, name: str) -> AxisConfig:

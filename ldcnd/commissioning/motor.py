@@ -5,17 +5,20 @@ error limit. The set-point leads away beyond that limit: a motor that turns the 
 encoder that does not count all end in the drive, which opens its loop.
 """
 
+import asyncio
 import math
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
-from ldcnd.commissioning.lowered_gains import lowered_gains
+from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, forget, gains_in, keep, load, open_loop
+from ldcnd.client.standstill import seen
 from ldcnd.commissioning.record import Figure, Result, Series, StepState
-from ldcnd.commissioning.step import Site, Step, open_loop, refuse_latched, refuse_previewed, rest_counts, seen
-from ldcnd.errors import CommandAborted, DriveFault, WrongState
+from ldcnd.commissioning.step import Site, Step, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.errors import CommandAborted, DriveFault, LdcndError, WrongState
 from ldcnd.model.commands import Verb
 from ldcnd.model.samples import AxisState
 
@@ -88,7 +91,7 @@ class MotorDirection(Step):
     async def run(self, site: Site, axis: Axis) -> Result:
         el = error_limit(site)
         points: list[tuple[float, float]] = []
-        async with lowered_gains(site, axis) as old:
+        async with _lent_gains(site, axis) as old:
             for output in (each for each in OUTPUTS if each <= old["ol"]):
                 moved = await self._try(site, axis, output, el)
                 points.append((output, moved))
@@ -121,6 +124,31 @@ class MotorDirection(Step):
                 f"axis {axis.name} was halted before it could be seen to move", axis=axis.name, remedy="run it again"
             )
         return moved
+
+
+@asynccontextmanager
+async def _lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
+    """Open the loop, yield the gains that the drive has, and put them back at the end, whatever ends the context.
+
+    The loop is open afterwards. Where control was lost meanwhile they stay kept: the checklist puts them back.
+
+    Raises:
+        WrongState: the gains are not known, or the axis does not come to rest.
+        LdcndError: as the daemon refused it.
+    """
+    refuse_latched(axis)
+    await open_loop(axis)
+    await axis.set_gains()  # a drive that was not powered on since its reset has none yet
+    info = next(each for each in await site.rig.describe() if each.axis == axis.name)
+    kept = KeptGains(rig=site.rig.name, axis=axis.name, gains=gains_in(info))
+    keep(kept)
+    try:
+        yield kept.gains
+    finally:
+        with suppress(LdcndError, TimeoutError):
+            async with asyncio.timeout(PUT_BACK_S):
+                await load(axis, kept.gains)
+                forget(kept)
 
 
 def error_limit(site: Site) -> int:

@@ -107,8 +107,6 @@ class Record(Frozen):
     """The axis."""
     steps: dict[str, StepRecord] = Field(default_factory=dict)
     """By their names; a missing one is open."""
-    gains_to_put_back: dict[str, int] | None = None
-    """Gains that the axis had before a step lowered them; null when they are in the drive."""
 
     def of(self, step: str) -> StepRecord:
         """Return what is kept of a step."""

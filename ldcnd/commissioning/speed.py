@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
+from ldcnd.client.kept_gains import open_loop
 from ldcnd.commissioning.record import Figure, Proposal, Result, Series, StepState
-from ldcnd.commissioning.step import Site, Step, ended_while_held, open_loop, refuse_previewed
+from ldcnd.commissioning.step import Site, Step, ended_while_held, refuse_previewed
 from ldcnd.errors import CommandAborted, DriveFault, LdcndError
 from ldcnd.model.commands import Verb
 
@@ -22,7 +23,7 @@ LAG_SHARE = 0.5
 """Share of the position error limit from which the drive does not follow any more."""
 LATE_S = 0.5
 LATE_SHARE = 0.2
-"""A motion may take so much longer than its profile, with what settling takes on top."""
+"""Longest delay of the end of a motion behind its profile: seconds, and a share of its duration."""
 SHARE = 0.8
 """Share of the fastest motion that it followed that is proposed."""
 CRUISE = 1.5
@@ -141,7 +142,7 @@ async def _try(
 
 async def _watch(axis: Axis, lags: list[float]) -> None:
     """Collect following errors until cancelled."""
-    with suppress(LdcndError):  # whoever waits for the motion raises it
+    with suppress(LdcndError):  # the wait for the motion raises it
         async for sample in axis.positions():
             if sample.following_error is not None:
                 lags.append(abs(sample.following_error))  # noqa: PERF401 - it does not end

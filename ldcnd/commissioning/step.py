@@ -2,25 +2,22 @@
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from dataclasses import dataclass
 from typing import ClassVar
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
+from ldcnd.client.standstill import REST_S, at_rest
 from ldcnd.commissioning.person import Person
 from ldcnd.commissioning.record import Result, StepState
 from ldcnd.config.axis import AxisConfig
-from ldcnd.errors import LdcndError, Remedy, SessionError, StopLatched, WrongState, step
+from ldcnd.errors import LdcndError, Remedy, StopLatched, WrongState, step
 from ldcnd.messaging.codec import rebuild_error
 from ldcnd.model.commands import PreviewReply, Verb
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import AxisState, Moving
 
-REST_S = 5.0
-"""Longest time that an axis takes to come to rest, seconds."""
-LOOK_S = 0.05
 STILL_COUNTS = 2
 """Two positions that differ by no more are the same place."""
 
@@ -34,15 +31,12 @@ class Site:
         info: the axis, as the daemon describes it.
         config: the axis, as the file has it.
         person: answers, and allows motion.
-        keep_gains: has these gains put back by whoever runs the checklist next, if this program does not; None when
-            they are back.
     """
 
     rig: Rig
     info: AxisInfo
     config: AxisConfig
     person: Person
-    keep_gains: Callable[[dict[str, int] | None], None]
 
     @property
     def counts_per_unit(self) -> float:
@@ -101,38 +95,6 @@ def done(text: str) -> Result:
     return Result(state=StepState.DONE, text=text)
 
 
-async def seen(axis: Axis) -> Axis:
-    """Wait for the first state and position of an axis; return it.
-
-    Raises:
-        SessionError: nothing is received from it.
-    """
-    deadline_s = asyncio.get_running_loop().time() + REST_S
-    while True:
-        try:
-            _ = axis.state, axis.position
-        except SessionError:
-            if asyncio.get_running_loop().time() > deadline_s:
-                raise
-            await axis.news(LOOK_S)
-        else:
-            return axis
-
-
-async def at_rest(axis: Axis) -> None:
-    """Wait until an axis stands.
-
-    Raises:
-        WrongState: it does not come to rest.
-    """
-    try:
-        async with asyncio.timeout(REST_S):
-            while axis.state.moving is not Moving.NO:
-                await axis.news(LOOK_S)
-    except TimeoutError:
-        raise WrongState(f"axis {axis.name} does not come to rest within {REST_S:g} s", axis=axis.name) from None
-
-
 def refuse_latched(axis: Axis) -> None:
     """Raise if a stop is latched.
 
@@ -182,21 +144,6 @@ def refuse_previewed(reply: PreviewReply) -> None:
             axis=reply.axis,
             remedy="take `approach` out of the configuration while it is commissioned",
         )
-
-
-async def open_loop(axis: Axis) -> None:
-    """Open the loop and wait for standstill; clear the trip of a drive that has opened it by itself.
-
-    Raises:
-        StopLatched: a stop came; only a person clears it.
-        LdcndError: as the daemon refused it.
-    """
-    refuse_latched(axis)
-    if axis.state.state is AxisState.ERROR_STOP:
-        await at_rest(axis)
-        await axis.reset()
-    await axis.power(on=False)
-    await at_rest(axis)
 
 
 async def ended_while_held(

@@ -15,6 +15,11 @@ MOVING = {Command.LOAD_TRAJECTORY, Command.START_MOTION, Command.STOP_MOTOR, Com
 """Commands by which an axis could begin to move, or its loop be closed or changed."""
 
 
+@pytest.fixture(autouse=True)
+def state_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+
 @pytest.fixture
 def config(tmp_path):
     path = tmp_path / "rig.toml"

@@ -9,6 +9,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
+from ldcnd.client.kept_gains import KeptGains, keep
 from ldcnd.client.rig import Rig
 from ldcnd.commissioning.checklist import STEPS, Checklist
 from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS
@@ -17,11 +18,16 @@ from ldcnd.commissioning.record import StepState
 from ldcnd.commissioning.report import html_of
 from ldcnd.config.rig import load_config
 from ldcnd.errors import LeaseExpired, StopLatched, WrongState
-from ldcnd.model.commands import Reset
 from tests.support.commissioning import AXIS, GAINS, ScriptedPerson, commissioning_rig, rig_text
 from tests.support.process import ROOT
 from tests.support.rig import running_rig
 from tests.support.simulated_plants import drawn_plants
+
+
+@pytest.fixture(autouse=True)
+def state_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
 
 SEED = 7
 STANDS = {"did the axis move": "n"}
@@ -47,7 +53,7 @@ async def test_a_motor_that_agrees_with_its_encoder_is_found_within_the_stated_d
         assert 50 <= figures(kept)["moved"] <= CAUGHT * MOST_EL_COUNTS
         assert abs(rig.drive.shaft.position_counts) <= CAUGHT * MOST_EL_COUNTS
         assert await rig.registers() == GAINS
-        assert checklist.record.gains_to_put_back is None
+        assert checklist.gains_to_put_back is None
         assert not (await rig.running.client.state(AXIS)).enabled
 
 
@@ -127,7 +133,7 @@ async def test_a_motor_that_stands_is_said_to_stand(tmp_path):
         assert await rig.registers() == GAINS
 
 
-async def test_a_stop_in_the_middle_stays_latched_and_gains_are_put_back_after_a_reset(tmp_path):
+async def test_a_stop_in_the_middle_stays_latched_and_the_gains_are_put_back(tmp_path):
     async with commissioning_rig(tmp_path, STANDS, friction_nm=0.2) as rig:
         checklist = await rig.checklist()
         running = asyncio.create_task(checklist.run("motor"))
@@ -137,10 +143,9 @@ async def test_a_stop_in_the_middle_stays_latched_and_gains_are_put_back_after_a
         with pytest.raises(StopLatched):
             await running
         latched = await rig.running.client.state(AXIS)
-        await rig.running.client.command(AXIS, Reset())
-        await checklist.put_back_gains()
 
         assert latched.stop_latched
+        assert checklist.gains_to_put_back is None
         assert checklist.record.of("motor").result.state is StepState.FAILED
         assert await rig.registers() == GAINS
 
@@ -157,7 +162,7 @@ async def test_gains_are_put_back_when_the_step_is_cancelled(tmp_path):
             await running
 
         assert await rig.registers() == GAINS
-        assert checklist.record.gains_to_put_back is None
+        assert checklist.gains_to_put_back is None
         assert checklist.record.of("motor").result.state is StepState.OPEN
         assert not (await rig.running.client.state(AXIS)).enabled
 
@@ -174,11 +179,22 @@ async def test_gains_that_could_not_be_put_back_are_put_back_by_the_next_call(tm
                 await running
             assert (await rig.registers())["el"] == MOST_EL_COUNTS
         again = await rig.checklist()
-        assert again.record.gains_to_put_back is not None
+        assert again.gains_to_put_back is not None
         await again.put_back_gains()
 
         assert await rig.registers() == GAINS
-        assert again.record.gains_to_put_back is None
+        assert again.gains_to_put_back is None
+
+
+async def test_gains_that_another_program_has_lent_are_never_taken_for_those_of_the_machine(tmp_path):
+    async with commissioning_rig(tmp_path, STANDS) as rig:
+        checklist = await rig.checklist()
+        keep(KeptGains(rig=checklist.record.rig, axis=AXIS, gains=GAINS))
+        with pytest.raises(WrongState, match="still to be put back"):
+            await checklist.run("motor")
+
+        assert await rig.registers() == GAINS
+        assert checklist.gains_to_put_back is None  # the end of a step puts them back, whoever has lent others
 
 
 async def test_a_wrong_scale_and_a_reversed_encoder_are_found_and_written(tmp_path):

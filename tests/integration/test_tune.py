@@ -11,6 +11,7 @@ import pytest
 
 from ldcnd.cli import tune
 from ldcnd.cli.connection import Target
+from ldcnd.client.kept_gains import file_of, kept_for, put_back
 from ldcnd.client.lease import control
 from ldcnd.client.rig import Rig
 from ldcnd.config.axis import ApproachConfig
@@ -30,7 +31,6 @@ from ldcnd.model.commands import MoveAbsolute, Power, SetGains
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.tuning.ldcn.kept_gains import file_of, kept_for, put_back
 from ldcnd.tuning.ldcn.plan import plan
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.report import plan_reported, reported
@@ -253,7 +253,7 @@ async def test_gains_wait_on_the_disk_while_another_client_has_control():
                 await plan(rig.client, "x", None)
         assert await registers(rig) != CONFIGURED
 
-        await put_back(Rig(rig.client, await rig.client.daemon()), kept_for("sim", "x"))
+        await put_back(Rig(rig.client, await rig.client.daemon()), kept_for("sim", "x"), "ldcnd tune")
 
         assert await is_off_with_its_old_gains(rig)
     assert "ldcnd tune x --put-back" in str(refused.value.remedy)

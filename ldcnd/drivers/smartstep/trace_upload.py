@@ -24,8 +24,8 @@ from ldcnd.exchange import Exchange
 ROUNDS = 4
 """Maximum readings of a piece until two agree, and maximum time-outs of one reading."""
 
-TOLD_EACH = 0.01
-"""Least growth of the share that has been read before it is told again."""
+REPORTED_EACH = 0.01
+"""Least growth of the share that has been read between two reports."""
 IDLE_LOOK_S = 0.005
 LONGEST_REST_S = 5.0
 """Maximum pause between two pieces on a line that is never idle, seconds; in it others send some 700 characters."""
@@ -59,14 +59,14 @@ class TraceUpload:
             DriveFault: the drive declined.
             BusError: the line failed.
         """
-        data, told = b"", 0.0
+        data, reported = b"", 0.0
         chunks = chunk_plan(trace, self._profile.trace_chunk_bytes)
         whole = sum(chunk.byte_count for chunk in chunks)
         for chunk in chunks:
             data += await self._fetch(chunk)
-            if len(data) / whole >= told + TOLD_EACH:
-                told = len(data) / whole
-                read(told)
+            if len(data) / whole >= reported + REPORTED_EACH:
+                reported = len(data) / whole
+                read(reported)
         return split_words(data, self._profile.trace_byte_order)
 
     async def _fetch(self, chunk: Chunk) -> bytes:

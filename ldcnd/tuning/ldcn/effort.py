@@ -20,7 +20,7 @@ from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.tuning.ldcn.plant import Plant
 
 REST_S = 0.1
-"""An axis whose position stays where it is for so long is at rest, seconds."""
+"""Shortest time without a change of position after which an axis is at rest, seconds."""
 STILL_COUNTS = 1
 STILL_SHARE = 0.005
 """It stays where it is as long as it moves by no more than this share of the way that it came, or `STILL_COUNTS`."""
@@ -68,7 +68,7 @@ class Effort:
         left_pwm: root of the mean square of what the fit leaves of the output's impulse, over the duration.
         top_counts_per_s: highest speed.
         way_counts: signed.
-        samples: so many were used.
+        samples: number of samples used.
     """
 
     t_s: float

@@ -25,7 +25,7 @@ from ldcnd.tuning.ldcn.response import Move, Start
 LEAST_WITHIN_COUNTS = 200
 """Within less than this, moves are too short to tell of an axis, counts."""
 PULSE_COUNTS = 10
-"""Distance of the command of a pulse, counts, one a servo tick at most: its output lasts so many ticks at most."""
+"""Distance of the command of a pulse, counts, one a servo tick at most: also the longest output, in ticks."""
 MOST_PULSE_LEVEL = 100
 MOST_IMPULSE = 1000.0
 """Most that a pulse may be: PWM steps times servo ticks."""
@@ -51,6 +51,8 @@ FRACTION_OF_GAIN = 256
 SOFT_S = 0.6
 SOFT_DERIVATIVE_TICKS = 8
 STIFF_S = 0.3
+BOTH_WAYS = 2
+"""Records of a move: one there, one back."""
 MOST_ERROR_LIMIT = 0x3FFF
 """Largest EL that `set_gains` takes, counts; some drives would take more."""
 
@@ -254,7 +256,7 @@ class Excitation:
                 if left > (1 - SOFT_SHARE) * reach or kp * left >= FRACTION_OF_GAIN * gains.ol:
                     break  # at its limit all the way, the output tells only by how much it exceeds friction
                 records.append(shown.record)
-            if len(records) == 2:  # noqa: PLR2004 - there and back
+            if len(records) == BOTH_WAYS:
                 return tuple(records)
             level *= SOFT_STEP
         raise DriveFault(

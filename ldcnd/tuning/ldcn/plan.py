@@ -4,14 +4,15 @@ import math
 from dataclasses import dataclass
 
 from ldcnd.client.axis import Axis
+from ldcnd.client.kept_gains import kept_for
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
+from ldcnd.client.standstill import at_rest
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
 from ldcnd.errors import NotReferenced, NotSupported, PositionLimit, Remedy, StopLatched, WrongState, step
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import AxisState
 from ldcnd.tuning.ldcn.excitation import Bounds, Excitation
-from ldcnd.tuning.ldcn.kept_gains import at_rest, kept_for
 
 WITHIN_COUNTS = 2000
 """Distance where none is wanted, counts."""

@@ -12,6 +12,18 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 
 from ldcnd.client.axis import Axis
+from ldcnd.client.kept_gains import (
+    LEASE_S,
+    PUT_BACK_S,
+    KeptGains,
+    forget,
+    gains_in,
+    keep,
+    kept_for,
+    load,
+    open_loop,
+    put_back,
+)
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
@@ -29,14 +41,11 @@ from ldcnd.model.traces import TakeTrace
 from ldcnd.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
 from ldcnd.tuning.ldcn.excitation import MOST_ERROR_LIMIT, Excitation, Purpose, Record, Shown, Trial, Trials
 from ldcnd.tuning.ldcn.identify import Identified, identify
-from ldcnd.tuning.ldcn.kept_gains import LEASE_S, KeptGains, at_rest, forget, gains_in, keep, kept_for, load, put_back
 from ldcnd.tuning.ldcn.plan import Plan, check_off
 from ldcnd.tuning.ldcn.response import Move, simulate
 from ldcnd.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
 
 CLIENT = "ldcnd tune"
-PUT_BACK_S = 15.0
-"""Longest time that the old gains may take to come back, seconds."""
 LEAD_S = 0.1
 """Samples are taken for so much longer than the trial lasts, seconds."""
 FIRST_INTERVAL_S = 0.0025
@@ -193,7 +202,7 @@ async def _put_back_anew(rig: Rig, kept: KeptGains, tell: Tell) -> None:
     """Put gains back under a lease of their own: that of the tuning was lost."""
     try:
         async with asyncio.timeout(PUT_BACK_S):
-            await put_back(rig, kept)
+            await put_back(rig, kept, CLIENT)
     except (LdcndError, TimeoutError) as error:
         raise WrongState(
             f"axis {kept.axis}: tuning was cut short, and its old gains could not be put back: {error}",
@@ -277,7 +286,7 @@ class _Trials:
                 raise StopLatched(f"axis {axis.name} was stopped while it was tuned", axis=axis.name)
             tripped = axis.state.state is AxisState.ERROR_STOP
         finally:
-            await self._open_loop()
+            await open_loop(axis)
         self.interval_s = trace.offsets_ns[-1] / 1e9 / (len(trace.offsets_ns) - 1)
         if trial.purpose is not Purpose.PULSE and self.interval_s > LONGEST_INTERVAL_S:
             raise ValueOutOfRange(
@@ -296,14 +305,6 @@ class _Trials:
         )
         times, positions = _until_rest(trace, from_counts)
         return Shown(Record(trial.gains, move, trial.start, times, positions), tripped, rest_counts)
-
-    async def _open_loop(self) -> None:
-        """Open the loop; clear the trip of a drive that has opened it by itself."""
-        axis = self._axis
-        if axis.state.state is AxisState.ERROR_STOP and not axis.state.stop_latched:
-            await at_rest(axis)
-            await axis.reset()
-        await axis.power(on=False)
 
     async def rest_counts(self) -> int:
         """Wait until the axis stands, by samples of its own; return where, in counts."""

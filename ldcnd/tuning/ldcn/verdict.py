@@ -7,7 +7,7 @@ import numpy as np
 
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.tuning.ldcn.design import WINDOW_COUNTS, WINDOW_SHARE
-from ldcnd.tuning.ldcn.excitation import Record
+from ldcnd.tuning.ldcn.excitation import BOTH_WAYS, Record
 from ldcnd.tuning.ldcn.identify import begin_s
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.response import Figures, Floats, figures, simulate
@@ -15,7 +15,6 @@ from ldcnd.tuning.ldcn.response import Figures, Floats, figures, simulate
 MOST_MEASURED_OVERSHOOT = 0.15
 SAME_S = 0.005
 """Settling times that differ by less are equal, seconds: two samples of a trace at 115200 baud."""
-BOTH_WAYS = 2
 
 
 @dataclass(frozen=True, slots=True)

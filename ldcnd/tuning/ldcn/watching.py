@@ -1,15 +1,14 @@
 """Following axes of a running rig by what it publishes: no lease, no command; what was learnt stays on this host."""
 
 import asyncio
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from urllib import parse
 
 import pydantic
 
 from ldcnd import durable
+from ldcnd.client.kept_gains import gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
 from ldcnd.drivers.ldcn.registers import Gains
@@ -18,7 +17,6 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import PositionSample, Quality, StateSample
 from ldcnd.tuning.ldcn.effort import FEWEST_SAMPLES, Seen
-from ldcnd.tuning.ldcn.kept_gains import gains_in
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.report import TuningReport
 from ldcnd.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Learnt, Memory, Shadow, Shown
@@ -88,10 +86,8 @@ class KeptMemory(Frozen):
 
 
 def memory_file(rig: str, axis: str) -> Path:
-    """Return where it is kept what an axis has taught: below $XDG_STATE_HOME, or ~/.local/state."""
-    state = os.environ.get("XDG_STATE_HOME")
-    name = f"{parse.quote(rig, safe='')}@{parse.quote(axis, safe='')}.json"
-    return (Path(state) if state else Path.home() / ".local" / "state") / "ldcnd" / "shadow" / name
+    """Return where it is kept what an axis has taught."""
+    return durable.state_file("shadow", rig, axis)
 
 
 def read_report(path: Path) -> TuningReport:

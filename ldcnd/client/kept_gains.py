@@ -1,31 +1,30 @@
-"""The gains that an axis had before it was tuned: a file on this host until they are back, or others were accepted."""
+"""The gains that an axis had before a program lent it others: a file on this host until they are back.
 
-import asyncio
-import os
-from functools import partial
+Tuning and commissioning load gains of their own for some moves. One file for both says what has to come back, so that
+neither takes the gains of the other for those of the machine.
+"""
+
 from pathlib import Path
-from urllib import parse
 
 import pydantic
 
 from ldcnd import durable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
+from ldcnd.client.standstill import at_rest, seen
 from ldcnd.errors import ConfigError, WrongState
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import Moving
+from ldcnd.model.samples import AxisState
 
-quote = partial(parse.quote, safe="")
-"""A rig and an axis are called as they like; a file is not."""
 NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
 NEEDED = frozenset(NAMES) - {"cl", "deadband"}
 """Registers that every drive with gains has."""
 LEASE_S = 5.0
 """So soon the daemon applies `loss.client` of the axis when this program disappears, seconds: no trial lasts longer."""
-STAND_S = 5.0
-"""Longest time that an axis takes to come to rest with its loop open, seconds."""
-LOOK_S = 0.05
+
+PUT_BACK_S = 15.0
+"""Longest time that the gains may take to come back, seconds."""
 
 
 class KeptGains(Frozen):
@@ -40,23 +39,24 @@ class KeptGains(Frozen):
 
 
 def file_of(rig: str, axis: str) -> Path:
-    """Return where the gains of an axis are kept: below $XDG_STATE_HOME, or ~/.local/state."""
-    state = os.environ.get("XDG_STATE_HOME")
-    return (
-        (Path(state) if state else Path.home() / ".local" / "state")
-        / "ldcnd"
-        / "tuning"
-        / f"{quote(rig)}@{quote(axis)}.json"
-    )
+    """Return where the gains of an axis are kept."""
+    return durable.state_file("gains", rig, axis)
 
 
 def keep(kept: KeptGains) -> None:
     """Write them down, so that they outlive this program and this host.
 
     Raises:
+        WrongState: others are kept already: what the drive has now was lent to it.
         ConfigError: the file cannot be written; nothing has been changed then.
     """
     path = file_of(kept.rig, kept.axis)
+    if path.exists():
+        raise WrongState(
+            f"axis {kept.axis}: its gains are still to be put back ({path})",
+            axis=kept.axis,
+            remedy=f"type: ldcnd tune {kept.axis} --put-back",
+        )
     try:
         durable.replace(path, kept.model_dump_json(indent=1))
     except OSError as error:
@@ -107,40 +107,38 @@ def gains_in(info: AxisInfo) -> dict[str, int]:
     return known
 
 
-async def load(axis: Axis, gains: dict[str, int]) -> None:
-    """Open the loop, wait for standstill, and load gains: a closed loop would turn any position error into a jump.
+async def open_loop(axis: Axis) -> None:
+    """Open the loop and wait for standstill; clear the trip of a drive that has opened it by itself, never a latch.
 
     Raises:
         LdcndError: as the daemon refused it.
         WrongState: it does not come to rest.
     """
+    state = (await seen(axis)).state
+    if state.state is AxisState.ERROR_STOP and not state.stop_latched:
+        await at_rest(axis)
+        await axis.reset()
     await axis.power(on=False)
     await at_rest(axis)
+
+
+async def load(axis: Axis, gains: dict[str, int]) -> None:
+    """Open the loop and load gains: a closed one would turn any position error into a jump.
+
+    Raises:
+        LdcndError: as the daemon refused it.
+        WrongState: it does not come to rest.
+    """
+    await open_loop(axis)
     await axis.set_gains(**gains)
 
 
-async def at_rest(axis: Axis) -> None:
-    """Wait until an axis stands.
-
-    Raises:
-        WrongState: it does not come to rest.
-    """
-    try:
-        async with asyncio.timeout(STAND_S):
-            while axis.state.moving is not Moving.NO:
-                await axis.news(LOOK_S)
-    except TimeoutError:
-        raise WrongState(
-            f"axis {axis.name} does not come to rest within {STAND_S:g} s with its loop open", axis=axis.name
-        ) from None
-
-
-async def put_back(rig: Rig, kept: KeptGains) -> None:
-    """Put the gains of an axis back; the axis is off afterwards.
+async def put_back(rig: Rig, kept: KeptGains, client: str) -> None:
+    """Put the gains of an axis back under control of this client's own; the axis is off afterwards.
 
     Raises:
         LdcndError: as the daemon refused it; they are still kept.
     """
-    async with rig.control(kept.axis, client="ldcnd tune", lease_s=LEASE_S) as axis:
+    async with rig.control(kept.axis, client=client, lease_s=LEASE_S) as axis:
         await load(axis, kept.gains)
     forget(kept)
