@@ -16,14 +16,13 @@ from ldcnd.cli.typed import Finite
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.commissioning.checklist import STEPS, Checklist, axis_of
-from ldcnd.commissioning.person import Left, Person
-from ldcnd.commissioning.record import StepRecord, StepState
+from ldcnd.commissioning.record import StepRecord
 from ldcnd.commissioning.report import html_of
+from ldcnd.commissioning.walk import Walk
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
+from ldcnd.person import Left, Person
 from ldcnd.version import version
-
-RUN, SKIP, LATER = ("y", "yes"), ("s", "skip"), ("n", "no")
 
 
 @click.command()
@@ -80,7 +79,7 @@ def command(
         try:
             if only_list:
                 return await session.show_list()
-            await session.put_back_gains()
+            await session.walk.put_back_gains()
             return await session.go_through(name)
         except Left as left:
             person.tell(f"{left}; the same command goes on from here")
@@ -95,13 +94,17 @@ def command(
 
 
 class _Session:
-    """One call of the command."""
+    """One call of the command.
+
+    Attributes:
+        walk: of its person through the checklist.
+    """
 
     def __init__(self, target: Target, person: Person, checklist: Checklist, config: Path) -> None:
         self._target = target
         self._person = person
         self._checklist = checklist
-        self._config = config
+        self.walk = Walk(checklist, person, str(config), self._show)
 
     async def show_list(self) -> bool:
         """Show every step with what is known of it."""
@@ -110,22 +113,14 @@ class _Session:
             self._show(self._checklist.record.of(name))
         return True
 
-    async def put_back_gains(self) -> None:
-        """Put gains back that an earlier call has left in the drive, once the person agrees."""
-        if self._checklist.gains_to_put_back:
-            self._person.tell("an earlier step, or `ldcnd tune`, was killed in its middle: the drive has gains of that")
-            if not await self._person.confirm("put the former gains back now? The loop is opened for it"):
-                raise Left("the former gains are still to be put back")
-            await self._checklist.put_back_gains()
-
     async def go_through(self, name: str | None) -> bool:
         """Go through one step, or through all open ones; tell whether none has failed."""
         await self._refresh()
         if name:
-            return await self._one(name) is not False
+            return await self.walk.one(name) is not False
         name = self._checklist.next_open()
         while name:
-            goes_on = await self._one(name)
+            goes_on = await self.walk.one(name)
             if goes_on is not None:
                 return goes_on
             name = self._checklist.next_open(after=name)
@@ -134,44 +129,6 @@ class _Session:
 
     async def _refresh(self) -> None:
         self._person.tell(*await self._checklist.refresh())
-
-    async def _one(self, name: str) -> bool | None:
-        """Explain a step, run it if the person agrees; None when the next one may follow, else whether all is well."""
-        step = STEPS[name]
-        self._person.tell("", f"{step.title} ({name})", f"  {step.about}")
-        self._person.tell(*(f"  * {line}" for line in await self._checklist.preview(name)))
-        answer = ""
-        while answer not in RUN + SKIP + LATER:
-            answer = (await self._person.ask("run it: [y]es, [s]kip it for a reason, [n]ot now")).lower()
-        if answer in LATER:
-            return None
-        if answer in SKIP:
-            while not (reason := await self._person.ask("for which reason")):
-                pass
-            self._show(await self._checklist.skip(name, reason))
-            return None
-        kept = await self._checklist.run(name)
-        self._show(kept)
-        if kept.result.state is StepState.FAILED:
-            return False
-        return await self._offer(name)
-
-    async def _offer(self, name: str) -> bool | None:
-        """Show what a step proposes as a change of the configuration, and write it if the person agrees."""
-        change = self._checklist.change(name)
-        if change is None:
-            return None
-        self._person.tell(*change.lines)
-        if not await self._person.confirm(f"write this into {self._config}"):
-            return None
-        self._checklist.write(change)
-        if change.restarts:
-            self._person.tell(f"{self._config} is changed: restart the daemon, then give the same command again")
-        else:
-            self._person.tell(
-                f"{self._config} is changed: SIGHUP lets the daemon read it; then give the same command again"
-            )
-        return True
 
     def _show(self, kept: StepRecord) -> None:
         result = kept.result

@@ -12,8 +12,8 @@ from typing_extensions import override
 
 from ldcnd.cli.keyboard import keys, repetitions
 from ldcnd.cli.output import show_lines
-from ldcnd.commissioning.person import Left, Person
 from ldcnd.errors import ConfigError
+from ldcnd.person import Left, Person
 
 HELD = " "
 PART_BYTES = 4096

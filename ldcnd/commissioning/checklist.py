@@ -14,10 +14,10 @@ from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import seen
 from ldcnd.commissioning import record as records
+from ldcnd.commissioning.first_settings import FirstSettings
 from ldcnd.commissioning.homing import HomeRepeatability
 from ldcnd.commissioning.limit_switches import LimitSwitches
 from ldcnd.commissioning.motor import MotorDirection
-from ldcnd.commissioning.person import Person, said
 from ldcnd.commissioning.questions import Gains, Load
 from ldcnd.commissioning.record import Proposal, Record, Result, StepRecord, StepState
 from ldcnd.commissioning.scale import Scale
@@ -29,11 +29,13 @@ from ldcnd.config.edit import draft_of, edited_for_axis
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.errors import ConfigError, LdcndError, UnknownAxis, WrongState
 from ldcnd.model.meta import AxisInfo
+from ldcnd.person import Person, said
 
 STEPS: dict[str, Step] = {
     each.name: each
     for each in (
         Load(),
+        FirstSettings(),
         MotorDirection(),
         Scale(),
         LimitSwitches(),
@@ -47,7 +49,8 @@ STEPS: dict[str, Step] = {
 CLIENT = "ldcnd commission"
 LEASE_S = 2.0
 """So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
-SETTLED = (StepState.DONE, StepState.SKIPPED, StepState.NOT_POSSIBLE)
+WITHOUT_RUN = (StepState.NOT_POSSIBLE, StepState.NOT_NEEDED)
+SETTLED = (StepState.DONE, StepState.SKIPPED, *WITHOUT_RUN)
 SAME_IN_FILE = ("model", "address", "unit", "counts_per_unit", "direction", "modulo", "limits")
 """Settings in which the running daemon and the file must agree, or lengths and limits would mean something else."""
 RELOADED = MovedAxisConfig.reloadable
@@ -109,17 +112,18 @@ class Checklist:
         record = self.record
         for name, step in STEPS.items():
             kept = record.of(name)
-            differs = records.changes(kept, _basis(step, site)) if kept.result.state is not StepState.OPEN else []
-            if differs:
+            begun = kept.result.state not in (StepState.OPEN, *WITHOUT_RUN)
+            if begun and (differs := records.changes(kept, _basis(step, site))):
                 why = f"{step.title} is open again: {'; '.join(differs)}"
                 messages.append(why)
                 opened = Result(state=StepState.OPEN, text="", proposals=())
                 record = record.with_step(StepRecord(step=name, result=opened, reopened=why))
-            elif kept.result.state is StepState.OPEN and (obstacle := step.obstacle(site)):
-                impossible = Result(state=StepState.NOT_POSSIBLE, text=obstacle)
-                record = record.with_step(self._kept(step, site, impossible))
-            elif kept.result.state is StepState.NOT_POSSIBLE and not step.obstacle(site):
-                record = record.with_step(StepRecord(step=name))
+            elif not begun:
+                by_itself = _without_run(step, site)
+                if by_itself is None and kept.result.state is not StepState.OPEN:
+                    record = record.with_step(StepRecord(step=name))
+                elif by_itself is not None and by_itself != kept.result:
+                    record = record.with_step(self._kept(step, site, by_itself))
         if record != self.record:
             self._keep(record)
         return messages
@@ -182,9 +186,9 @@ class Checklist:
                 await self.put_back_gains()
         return self._settle(step, site, result)
 
-    async def skip(self, name: str, reason: str) -> StepRecord:
-        """Settle a step without running it, for a reason."""
-        return self._settle(STEPS[name], await self._site(), Result(state=StepState.SKIPPED, text=reason))
+    async def settle(self, name: str, result: Result) -> StepRecord:
+        """Keep the result of a step that was carried out elsewhere, or skipped for a reason."""
+        return self._settle(STEPS[name], await self._site(), result)
 
     def change(self, name: str) -> Change | None:
         """Return how a step would change the configuration; None when it proposes nothing that is not there.
@@ -251,6 +255,15 @@ def axis_of(rig: RigConfig, name: str) -> AxisConfig:
     if name not in axes:
         raise UnknownAxis(f"there is no axis {name!r}", axis=name, value=name, remedy=f"there are: {', '.join(axes)}")
     return axes[name]
+
+
+def _without_run(step: Step, site: Site) -> Result | None:
+    """Return the result of a step that cannot be run, or need not be; None for any other."""
+    if obstacle := step.obstacle(site):
+        return Result(state=StepState.NOT_POSSIBLE, text=obstacle)
+    if unneeded := step.unneeded(site):
+        return Result(state=StepState.NOT_NEEDED, text=unneeded)
+    return None
 
 
 def _basis(step: Step, site: Site) -> dict[str, JsonValue]:

@@ -7,7 +7,12 @@ from ldcnd.commissioning.record import Figure, Result, StepState
 from ldcnd.commissioning.step import Site, Step, done
 from ldcnd.model.commands import Verb
 
-LOADS = ("none", "hangs", "brake", "both")
+LOADS = {
+    "none": "nothing, and there is no brake",
+    "hangs": "the load: it hangs",
+    "brake": "nothing: a brake holds the axis",
+    "both": "the load, unless its brake holds it",
+}
 SHOWN = ("kp", "kd", "ki", "il", "ol", "el")
 POWERING_OFF = ("bus", "client", "daemon")
 
@@ -23,8 +28,7 @@ class Load(Step):
 
     @override
     async def run(self, site: Site, axis: Axis) -> Result:
-        while (answer := (await site.person.ask(f"what falls without power: {', '.join(LOADS)}")).lower()) not in LOADS:
-            site.person.tell(f"{answer!r} is none of {', '.join(LOADS)}")
+        answer = await site.person.choose("what falls without power", LOADS)
         remark = await site.person.ask("a remark for the report, or nothing")
         figures = [Figure(what="load", value=answer)]
         if remark:

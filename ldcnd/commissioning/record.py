@@ -19,6 +19,7 @@ class StepState(StrEnum):
     SKIPPED = "skipped"
     FAILED = "failed"
     NOT_POSSIBLE = "not_possible"
+    NOT_NEEDED = "not_needed"
 
 
 class Figure(Frozen):
@@ -52,7 +53,7 @@ class Proposal(Frozen):
     """Table below the axis, such as `limits`; empty for a key of the axis itself."""
     key: str
     """Key in that table."""
-    value: float | str
+    value: int | float | str
     """The value."""
 
     @property

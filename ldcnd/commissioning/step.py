@@ -10,13 +10,13 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import REST_S, at_rest
-from ldcnd.commissioning.person import Person
 from ldcnd.commissioning.record import Result, StepState
 from ldcnd.config.axis import AxisConfig
 from ldcnd.errors import LdcndError, Remedy, StopLatched, WrongState, step
 from ldcnd.messaging.codec import rebuild_error
 from ldcnd.model.commands import PreviewReply, Verb
 from ldcnd.model.meta import AxisInfo
+from ldcnd.person import Person
 
 STILL_COUNTS = 2
 """Two positions that differ by no more are the same place."""
@@ -67,6 +67,10 @@ class Step(ABC):
         """Return why it is not possible with this axis; empty when it is."""
         missing = [verb.value for verb in self.needs if verb not in site.info.capabilities]
         return f"not possible on this model: a {site.info.model} has no {', '.join(missing)}" if missing else ""
+
+    def unneeded(self, site: Site) -> str:  # noqa: ARG002 - most steps are needed
+        """Return why there is nothing to do; empty when there is."""
+        return ""
 
     async def preview(self, site: Site) -> tuple[str, ...]:
         """Return what would move, how far, how fast, and which limits catch it.

@@ -12,12 +12,13 @@ import pytest
 from ldcnd.client.kept_gains import KeptGains, keep
 from ldcnd.client.rig import Rig
 from ldcnd.commissioning.checklist import STEPS, Checklist
+from ldcnd.commissioning.first_settings import SOFT_GAINS
 from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS
-from ldcnd.commissioning.person import Left
-from ldcnd.commissioning.record import StepState
+from ldcnd.commissioning.record import Result, StepState
 from ldcnd.commissioning.report import html_of
 from ldcnd.config.rig import load_config
 from ldcnd.errors import LeaseExpired, StopLatched, WrongState
+from ldcnd.person import Left
 from tests.support.commissioning import AXIS, GAINS, ScriptedPerson, commissioning_rig, rig_text
 from tests.support.process import ROOT
 from tests.support.rig import running_rig
@@ -30,6 +31,7 @@ def state_home(tmp_path, monkeypatch):
 
 
 SEED = 7
+VELOCITIES = "velocity = 1000\nacceleration = 5000"
 STANDS = {"did the axis move": "n"}
 
 
@@ -333,7 +335,7 @@ async def test_leaving_in_the_middle_and_resuming(tmp_path):
     async with commissioning_rig(tmp_path, script) as rig:
         checklist = await rig.checklist()
         await checklist.run("load")
-        await checklist.skip("motor", "seen to be right")
+        await checklist.settle("motor", Result(state=StepState.SKIPPED, text="seen to be right"))
         with pytest.raises(Left):
             await checklist.run("scale")
         again = await rig.checklist()
@@ -400,6 +402,38 @@ async def test_a_drive_that_takes_no_motion_over_its_line_has_the_steps_that_ask
         assert states.pop("load") is StepState.DONE
         assert set(states.values()) == {StepState.NOT_POSSIBLE}
         assert "a smartstep has no" in checklist.record.of("motor").result.text
+
+
+async def test_a_configuration_that_a_scan_has_begun_gets_unit_scale_and_soft_gains(tmp_path):
+    text = rig_text()
+    text = text.replace('unit = "mm"\ncounts_per_unit = 1000 # as ordered\nd', 'unit = "count" # your unit\nd')
+    text = re.sub(r"velocity = 10\nacceleration = 100\nlimits.*\ngains.*\nhome.*", VELOCITIES, text)
+    script = {"unit of the axis": "mm", "counts of one mm": "1000", "of its moves": "", "reference position": "index"}
+    async with commissioning_rig(tmp_path, script, text=text) as rig:
+        checklist = await rig.checklist()
+        impossible = checklist.record.of("motor").result
+        kept = await checklist.run("settings")
+        change = checklist.change("settings")
+        checklist.write(change)
+        told = await checklist.refresh()
+
+    assert impossible.state is StepState.NOT_POSSIBLE
+    assert kept.result.state is StepState.DONE
+    assert change.restarts
+    axis = load_config(rig.config).bus[0].axis[0]
+    assert (axis.unit, axis.counts_per_unit, axis.velocity, axis.acceleration) == ("mm", 1000, 1, 5)
+    assert axis.gains.model_dump(include=set(SOFT_GAINS)) == SOFT_GAINS
+    assert (axis.home.method.value, axis.home.velocity) == ("index", 0.1)
+    assert told == []
+    assert checklist.record.of("motor").result.state is StepState.OPEN
+
+
+async def test_settings_that_are_there_are_not_asked_for(tmp_path):
+    async with commissioning_rig(tmp_path) as rig:
+        checklist = await rig.checklist()
+
+        assert checklist.record.of("settings").result.state is StepState.NOT_NEEDED
+        assert checklist.next_open(after="load") == "motor"
 
 
 async def test_an_axis_in_counts_has_no_scale_to_find(tmp_path):

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from ldcnd.cli.terminal_person import TerminalPerson
-from ldcnd.commissioning.person import Left
 from ldcnd.errors import ConfigError
+from ldcnd.person import Left
 
 pytestmark = pytest.mark.real_time
 TICKS = 5

@@ -11,8 +11,8 @@ from typing_extensions import override
 
 from ldcnd.client.rig import Rig
 from ldcnd.commissioning.checklist import Checklist
-from ldcnd.commissioning.person import Left, Person
 from ldcnd.config.rig import load_config
+from ldcnd.person import Left, Person
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

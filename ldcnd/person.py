@@ -1,8 +1,13 @@
-"""The person who commissions an axis, as the checklist meets them: answers, confirmation, and a key that is held."""
+"""The person whom a program asks: answers, confirmation, and a key that is held while something moves.
+
+Commissioning and tuning know neither terminal nor browser: `ldcnd commission` and a page of the console are two such
+persons.
+"""
 
 import asyncio
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 
 from ldcnd.errors import LdcndError
@@ -12,7 +17,7 @@ NO = ("n", "no")
 
 
 class Left(Exception):
-    """The person has left the checklist: no answer will come."""
+    """The person has left: no answer will come."""
 
 
 class Person(ABC):
@@ -40,6 +45,27 @@ class Person(ABC):
         Raises:
             Left: the key will not be held.
         """
+
+    async def choose(self, question: str, choices: Mapping[str, str]) -> str:
+        """Ask until the answer is one of some words, or begins one of them only; return that word.
+
+        Args:
+            question: without the words.
+            choices: what each word means, where a word alone does not say it.
+        """
+        while True:
+            answer = (await self.ask(f"{question}: {', '.join(choices)}")).lower()
+            found = [word for word in choices if answer == word] or [
+                word for word in choices if word.startswith(answer)
+            ]
+            if answer and len(found) == 1:
+                return found[0]
+            self.tell(f"{answer!r} is none of {', '.join(choices)}")
+
+    async def approve(self, file: str, change: Sequence[str]) -> bool:
+        """Show the change of a file, as `diff -u` does, and ask whether to write it."""
+        self.tell(*change)
+        return await self.confirm(f"write this into {file}")
 
     async def confirm(self, question: str) -> bool:
         """Ask until the answer is yes or no."""
