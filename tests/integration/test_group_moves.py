@@ -9,15 +9,17 @@ from ldcnd.daemon.command.dispatch import move_together
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.registers import FRACTION
 from ldcnd.errors import (
+    CommandIdReused,
     MalformedRequest,
     NotSupported,
     PositionLimit,
     StopLatched,
     UnknownAxis,
     ValueOutOfRange,
+    WrongState,
 )
 from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.rig_commands import AxisMove, MoveTogether, PreviewTogether
+from ldcnd.model.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether
 from ldcnd.model.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
@@ -125,6 +127,38 @@ async def test_a_query_of_the_rig_starts_a_group_once():
 
     assert [part.axis for part in reply.replies] == ["x", "y"]
     assert [packet.address for packet in starts(rig)] == [0x81]
+
+
+async def test_a_group_move_that_is_sent_again_is_answered_alike_and_starts_once():
+    async with rig_on(chain_of(), GANTRY) as rig:
+        await powered(rig, "x", "y")
+        request = MoveTogether(
+            moves=(AxisMove(axis="x", position=5.0, command_id="1"), AxisMove(axis="y", position=6.0, command_id="2")),
+            path=LinePath.LINEAR,
+        )
+
+        first = await rig.client.ask(request)
+        again = await rig.client.ask(request)
+        with pytest.raises(CommandIdReused):
+            await rig.client.ask(request.model_copy(update={"path": LinePath.INDEPENDENT}))
+
+    assert again == first
+    assert first.deviation is not None
+    assert len(starts(rig)) == 1
+
+
+async def test_a_group_move_of_one_new_and_one_old_id_starts_nothing():
+    async with rig_on(chain_of(), GANTRY) as rig:
+        await powered(rig, "x", "y")
+        x, y = (AxisMove(axis="x", position=5.0, command_id="1"), AxisMove(axis="y", position=6.0, command_id="2"))
+        await rig.client.ask(MoveTogether(moves=(x, y)))
+        for move in (x, y):
+            await rig.client.wait_for_end(move.axis, move.command_id)
+
+        with pytest.raises(WrongState):
+            await rig.client.ask(MoveTogether(moves=(x.model_copy(update={"command_id": "3"}), y)))
+
+    assert len(starts(rig)) == 1
 
 
 async def test_an_axis_named_twice_is_refused():

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import NotSupported, PositionLimit, ValueOutOfRange
+from ldcnd.errors import CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange
 from ldcnd.model.commands import Halt, Power, Stop
 from ldcnd.model.leases import Acquire, Release
 from ldcnd.model.rig_commands import AxisPath, PathReply, WalkPath
@@ -127,6 +127,26 @@ async def test_a_path_beyond_a_limit_or_too_far_from_its_line_moves_nothing():
             state = await rig.client.state(name)
             assert state is not None
             assert state.state is AxisState.STANDSTILL
+
+
+async def test_a_path_that_is_sent_again_is_answered_alike_and_walked_once():
+    chain, ids = sc_chain(), {"z": "one", "c": "two"}
+    async with two_sc(chain) as rig:
+        request = path(speed=30.0)
+        request = request.model_copy(
+            update={"moves": tuple(move.model_copy(update={"command_id": ids[move.axis]}) for move in request.moves)}
+        )
+        first = await rig.client.ask(request)
+        again = await rig.client.ask(request)
+        with pytest.raises(CommandIdReused):
+            await rig.client.ask(request.model_copy(update={"speed": 10.0}))
+        ended = [await rig.client.wait_for_end(name, command_id) for name, command_id in ids.items()]
+        late = await rig.client.ask(request)
+        rested = await rests(chain)
+
+    assert again == late == first
+    assert [state.last_error for state in ended] == [None, None]
+    assert rested
 
 
 async def halt_one(rig: ChainRig, _chain: Chain) -> None:

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import random
 from collections.abc import AsyncIterator, Sequence
+from dataclasses import dataclass
 
 import pytest
 from structlog.testing import capture_logs
@@ -18,8 +19,18 @@ from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.errors import LdcndError
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, MoveRelative, MoveVelocity, Power, Reset
+from ldcnd.model.commands import (
+    AxisCommand,
+    BufferMode,
+    CommandReply,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Reset,
+    SetPosition,
+)
 from ldcnd.model.leases import Acquire, Release, Renew
+from ldcnd.model.rig_commands import AxisPath, WalkPath
 from ldcnd.model.samples import LinkState
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
@@ -33,27 +44,55 @@ LINE_S = 1.0
 it decelerates."""
 BACK_WITHIN_S = 20.0
 KINDS = [kind for kind in FaultKind if kind not in (FaultKind.UNPLUGGED, FaultKind.ECHO, FaultKind.REPLY_FALSIFIED)]
+CORNERS = 3
+"""Of a path that is walked in a schedule."""
 
 
-def config(start: str) -> RigConfig:
-    axis = {
-        "name": "x",
-        "address": 1,
-        "model": "ls-182ap",
-        "unit": "mm",
-        "counts_per_unit": 1000.0,
-        "velocity": 20.0,
-        "acceleration": 500.0,
-        "jog_horizon_s": 60.0,  # a jog that nobody stops is seen
-        "gains": {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000},
-        "rates": {"position": 6, "velocity": 0, "adc": 0, "state": 6},
-    }
-    line = {"name": "a", "port": "sim:a", "baud": 115_200, "margin_ms": 5, "start": start, "axis": [axis]}
-    sim = {"name": "a", "module": [{"model": "ls182ap"}]}
-    return RigConfig.model_validate({"rig": "sim", "authority": "leased", "bus": [line], "sim": [sim]})
+@dataclass(frozen=True)
+class Machine:
+    """The axes that a campaign is about: one, or a group that walks along paths too."""
+
+    model: str
+    module: str
+    names: tuple[str, ...]
+
+    def config(self, start: str) -> RigConfig:
+        gains = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000}
+        axes = [
+            {
+                "name": name,
+                "address": at,
+                "model": self.model,
+                "unit": "mm",
+                "counts_per_unit": 1000.0,
+                "velocity": 20.0,
+                "acceleration": 500.0,
+                "jog_horizon_s": 60.0,  # a jog that nobody stops is seen
+                "gains": gains,
+                **({"reference": "at_reset"} if self.walks else {}),
+                "rates": {"position": 6, "velocity": 0, "adc": 0, "state": 6},
+            }
+            for at, name in enumerate(self.names, 1)
+        ]
+        groups = [{"name": "plane", "axes": list(self.names)}] if self.walks else []
+        line = {"name": "a", "port": "sim:a", "baud": 115_200, "margin_ms": 5, "start": start}
+        sim = {"name": "a", "module": [{"model": self.module}] * len(self.names)}
+        bus = line | {"axis": axes, "group": groups}
+        return RigConfig.model_validate({"rig": "sim", "authority": "leased", "bus": [bus], "sim": [sim]})
+
+    @property
+    def walks(self) -> bool:
+        return len(self.names) > 1
+
+    def witness(self) -> Witness:
+        chain = build_chain(ChainSpec((ModuleSpec(self.module),) * len(self.names)))
+        addresses = {at: (name,) for at, name in enumerate(self.names, 1)}
+        return Witness(chain, addresses | ({GROUP_ADDRESS: self.names} if self.walks else {}))
 
 
-FIRST, NEXT = config("reset"), config("adopt")
+ONE_AXIS = Machine("ls-182ap", "ls182ap", ("x",))
+TWO_ON_PATHS = Machine("pic-servo-sc", "picservo-sc", ("x", "y"))
+GROUP_ADDRESS = 0x81
 
 
 def now_ns() -> int:
@@ -63,11 +102,12 @@ def now_ns() -> int:
 class Schedule:
     """What happens in one copy: clients that command x, and what befalls them, the daemon and the line."""
 
-    def __init__(self, seed: int, chain: Chain, witness: Witness) -> None:
+    def __init__(self, seed: int, machine: Machine, witness: Witness) -> None:
         self.dice = random.Random(seed)
-        self.chain = chain
+        self.machine = machine
+        self.chain = witness.chain
         self.witness = witness
-        self.sent: list[AxisCommand[CommandReply]] = []
+        self.sent: list[tuple[str, AxisCommand[CommandReply]] | WalkPath] = []
         self.numbers = iter(range(10**6))
 
     async def act(self, rig: RigClient, client: str, until_s: float) -> None:
@@ -87,16 +127,39 @@ class Schedule:
                     lease = None
                 command = self.next_command(lease)
                 with contextlib.suppress(LdcndError):
-                    await rig.command("x", command, timeout_s=dice.choice((0.01, 0.05, 0.5)))
+                    timeout_s = dice.choice((0.01, 0.05, 0.5))
+                    if isinstance(command, WalkPath):
+                        await rig.ask(command, timeout_s=timeout_s)
+                    else:
+                        await rig.command(*command, timeout_s=timeout_s)
                 if dice.random() < 0.03:
                     await rig.stop("x", timeout_s=0.2)
             await asyncio.sleep(dice.uniform(0.0, 0.08))
 
-    def next_command(self, lease: str | None) -> AxisCommand[CommandReply]:
+    def next_command(self, lease: str | None) -> tuple[str, AxisCommand[CommandReply]] | WalkPath:
         dice = self.dice
         if self.sent and dice.random() < 0.3:
             return dice.choice(self.sent[-6:])  # again, or from an earlier life
+        walks = self.machine.walks and dice.random() < 0.6
+        command = self.path(lease) if walks else self.axis_command(lease)
+        self.sent.append(command)
+        return command
+
+    def path(self, lease: str | None) -> WalkPath:
+        """Return a path of all axes, each share under an id of its own."""
+
+        def share(name: str) -> AxisPath:
+            *via, end = (self.dice.uniform(-4, 4) for _ in range(CORNERS))
+            return AxisPath(axis=name, via=tuple(via), position=end, lease=lease, command_id=f"c{next(self.numbers)}")
+
+        return WalkPath(moves=tuple(share(name) for name in self.machine.names))
+
+    def axis_command(self, lease: str | None) -> tuple[str, AxisCommand[CommandReply]]:
+        """Return a command of one axis."""
+        dice = self.dice
         proofs = {"lease": lease, "command_id": f"c{next(self.numbers)}"}
+        if self.machine.walks and dice.random() < 0.3:  # after an adoption no axis is referenced
+            return dice.choice(self.machine.names), SetPosition(position=0.0, **proofs)
         distance, mode = dice.uniform(-3, 3), dice.choice(list(BufferMode))
         command = dice.choice(
             (
@@ -107,8 +170,7 @@ class Schedule:
                 Reset(**proofs),
             )
         )
-        self.sent.append(command)
-        return command
+        return dice.choice(self.machine.names) if self.machine.walks else self.machine.names[0], command
 
     async def befall(self, until_s: float) -> None:
         """Cut the cable and freeze the process now and then."""
@@ -134,22 +196,27 @@ class Schedule:
 
     async def judge(self, daemon: Daemon) -> list[str]:
         """Look at a rig whose clients are all dead."""
-        loop = asyncio.get_running_loop()
         self.chain.replug()
         self.chain._injector = FaultInjector(FaultPlan())
-        axis = daemon.rig.axis("x")
+        axes = daemon.rig.axes
         try:
             async with asyncio.timeout(BACK_WITHIN_S):
                 await daemon.wait_up()
-                while axis.tracker.link is not LinkState.UP:
-                    await asyncio.sleep(0.05)
+                await all_up(daemon)
         except TimeoutError:
-            return [*self.witness.wrong, f"x is {axis.tracker.link} {BACK_WITHIN_S:g} s after its line came back"]
+            links = {name: axis.tracker.link for name, axis in axes.items()}
+            return [*self.witness.wrong, f"{links}, {BACK_WITHIN_S:g} s after the line came back"]
         await asyncio.sleep(LEASE_S + LINE_S)
         await self.witness.look(daemon, {})
-        if loop.time() and axis.tracker.command is not None:
-            self.witness.wrong.append(f"x stands and carries out {axis.tracker.command.verb}")
+        for name, axis in axes.items():
+            if axis.tracker.command is not None:
+                self.witness.wrong.append(f"{name} stands and carries out {axis.tracker.command.verb}")
         return self.witness.wrong
+
+
+async def all_up(daemon: Daemon) -> None:
+    while any(axis.tracker.link is not LinkState.UP for axis in daemon.rig.axes.values()):
+        await asyncio.sleep(0.05)
 
 
 @contextlib.asynccontextmanager
@@ -163,19 +230,17 @@ async def life(settings: RigConfig, chain: Chain, instance: str) -> AsyncIterato
         await running
 
 
-def live_through(seed: int, loop: CopiedLoop, chain: Chain, witness: Witness) -> Schedule:
+def live_through(seed: int, loop: CopiedLoop, machine: Machine, witness: Witness) -> Schedule:
     """Return a schedule, with its faults on the line."""
-    schedule = Schedule(seed, chain, witness)
+    schedule = Schedule(seed, machine, witness)
     share = schedule.dice.choice((0.0, 0.02, 0.1))
     faults = tuple(Fault(kind, share / len(KINDS), loop.time(), longest_s=0.02) for kind in KINDS)
-    chain._injector = FaultInjector(FaultPlan(faults, seed))
+    witness.chain._injector = FaultInjector(FaultPlan(faults, seed))
     return schedule
 
 
-async def play(seed: int, loop: CopiedLoop, daemon: Daemon, broker: MemoryBroker, witness: Witness) -> None:
+async def play(schedule: Schedule, loop: CopiedLoop, daemon: Daemon, broker: MemoryBroker) -> None:
     """Live through one schedule, in a copy."""
-    chain = witness.chain
-    schedule = live_through(seed, loop, chain, witness)
     dice = schedule.dice
     try:
         if dice.random() < 0.5:
@@ -189,14 +254,14 @@ async def play(seed: int, loop: CopiedLoop, daemon: Daemon, broker: MemoryBroker
             wrong = in_new_loop(lambda: next_life(schedule), loop.time() + dice.choice((0.0, 0.1, 2.0)))
     except BaseException as error:  # noqa: BLE001 - nothing of a copy may be lost
         wrong = [f"{type(error).__name__}: {error}"]
-    loop.leave(wrong, sum(witness.started.values()))
+    loop.leave(wrong, sum(schedule.witness.started.values()))
 
 
 async def next_life(schedule: Schedule) -> list[str]:
     """Let another daemon take the line over, with clients that send old commands again."""
     witness = schedule.witness
     witness.daemon = None
-    async with life(NEXT, schedule.chain, "second") as (daemon, broker):
+    async with life(schedule.machine.config("adopt"), schedule.chain, "second") as (daemon, broker):
         try:
             async with asyncio.timeout(BACK_WITHIN_S):
                 await daemon.wait_up()
@@ -211,26 +276,26 @@ async def next_life(schedule: Schedule) -> list[str]:
         return await schedule.judge(daemon)
 
 
-def campaign(seeds: Sequence[int]) -> Interruptions:
+def campaign(seeds: Sequence[int], machine: Machine = ONE_AXIS) -> Interruptions:
     """Live through schedules; print how many, and how many motions they made."""
-    chain = build_chain(ChainSpec((ModuleSpec("ls182ap"),)))
-    witness = Witness(chain, {1: ("x",)})
+    witness = machine.witness()
 
     async def scenario() -> None:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, CopiedLoop)
-        async with life(FIRST, chain, "first") as (daemon, broker), broker.session() as session:
+        config = machine.config("reset")
+        async with life(config, witness.chain, "first") as (daemon, broker), broker.session() as session:
             witness.daemon = daemon
             rig = RigClient(session, "sim")
             await daemon.wait_up()
-            while daemon.rig.axis("x").tracker.link is not LinkState.UP:
-                await asyncio.sleep(0.05)
+            await all_up(daemon)
             lease = (await rig.ask(Acquire(client="first", lease_s=LEASE_S))).lease
-            await rig.command("x", Power(on=True, lease=lease))
+            for name in machine.names:
+                await rig.command(name, Power(on=True, lease=lease))
             await rig.ask(Release(lease=lease))
             for seed in seeds:
                 if loop.copy(f"seed {seed}"):
-                    await play(seed, loop, daemon, broker, witness)
+                    await play(live_through(seed, loop, machine, witness), loop, daemon, broker)
 
     with capture_logs():
         came = run_with_copies(scenario)
@@ -257,3 +322,15 @@ def test_no_schedule_moves_anything_twice_unasked_or_with_nobody_in_charge(seeds
 @pytest.mark.parametrize("batch", range(100))
 def test_no_schedule_ever_moves_anything_twice_unasked_or_with_nobody_in_charge(batch):
     campaign(range(1000 * batch, 1000 * (batch + 1)))
+
+
+@pytest.mark.timeout(600)
+def test_no_path_goes_on_twice_unasked_or_with_nobody_in_charge():
+    campaign(range(20), TWO_ON_PATHS)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600 * 6)
+@pytest.mark.parametrize("batch", range(20))
+def test_no_path_ever_goes_on_twice_unasked_or_with_nobody_in_charge(batch):
+    campaign(range(500 * batch, 500 * (batch + 1)), TWO_ON_PATHS)

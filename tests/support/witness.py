@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
-from ldcnd.drivers.ldcn.received import LoadTrajectory, StopMotor, received_command
+from ldcnd.drivers.ldcn.received import AddPathPoints, LoadTrajectory, StopMotor, received_command
+from ldcnd.drivers.ldcn.registers import FRACTION
 from ldcnd.drivers.ldcn.trajectory import ProfileMode
 from ldcnd.model.commands import Verb
 from ldcnd.model.samples import LinkState, Moving
@@ -77,20 +78,26 @@ class Witness:
                 self._count(self.daemon, name, now_s)
 
     def _moves(self, packet: Packet, name: str) -> tuple[bool, bool]:
-        """Tell whether a packet begins a motion of an axis, and whether it closes an open loop."""
+        """Tell whether a packet begins a motion of an axis, and whether it closes an open loop or prolongs a path."""
         drive = self.drive(name)
         command = received_command(drive.dialect, packet)
         match command:
             case LoadTrajectory(trajectory):
                 return trajectory.start_now and bool(trajectory.velocity), False
+            case AddPathPoints(points, _):
+                return not points, bool(points) and drive.loop.trajectory.path.running
             case StopMotor(control, _):
                 stops = control & (StopControl.ABRUPT | StopControl.SMOOTH)
                 idle = not drive.loop.servo_on and not drive.loop.pwm
                 return bool(control & StopControl.HERE), bool(stops) and idle
         if packet.command is not Command.START_MOTION:
             return False, False
-        loaded = drive._trajectory
-        return not (loaded.mode is ProfileMode.VELOCITY and loaded.servo and loaded.velocity == 0), False
+        loaded, profile = drive._trajectory, drive.loop.trajectory
+        if loaded.mode is ProfileMode.VELOCITY:
+            return not (loaded.servo and loaded.velocity == 0), False
+        here = loaded.position == profile.position // FRACTION and not loaded.relative
+        goes_nowhere = loaded.servo and profile.done and here
+        return not goes_nowhere, goes_nowhere and not drive.loop.servo_on
 
     def _forbidden(self, daemon: Daemon, name: str, now_s: float) -> str | None:
         """Return why an axis must not be moved now."""

@@ -345,11 +345,18 @@ class Dispatcher:
         self, command: MoveTogether | WalkPath, login: str | None
     ) -> MoveTogetherReply | PathReply:
         execute = partial(self.carry_out, login=login)
+        reply: MoveTogetherReply | PathReply
         if isinstance(command, WalkPath):
-            return await walk_path(self._rig, command, execute)
-        moves = _shares(command)
-        straight = command.path is LinePath.LINEAR
-        return await move_together(self._rig, moves, execute, straight=straight, max_deviation=command.max_deviation)
+            reply = await walk_path(self._rig, command, execute)
+        else:
+            straight, deviation = command.path is LinePath.LINEAR, command.max_deviation
+            reply = await move_together(
+                self._rig, _shares(command), execute, straight=straight, max_deviation=deviation
+            )
+        share = self._ledger.get(reply.replies[0].command_id).command
+        if isinstance(share, (GroupMoveRequest, PathShareRequest)):  # the first time that these ids came
+            reply = share.rendezvous.reply(reply.replies)
+        return reply
 
     # -- the rig as a whole; nothing here moves anything -----------------------------------------------------------
 
@@ -445,7 +452,7 @@ async def move_together(
     meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)
 
     requests = {name: GroupMoveRequest.of(move, meeting) for name, move in moves.items()}
-    return MoveTogetherReply(replies=await _all_of(requests, meeting, execute), deviation=meeting.deviation)
+    return meeting.reply(await _all_of(requests, meeting, execute))
 
 
 async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:

@@ -20,6 +20,7 @@ from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.network import Network
 from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
 from ldcnd.model.commands import CommandReply, MoveAbsolute
+from ldcnd.model.rig_commands import MoveTogetherReply
 from ldcnd.model.samples import AxisState
 
 MEETING_S = 2.0
@@ -29,19 +30,19 @@ MEETING_S = 2.0
 class GroupMoveRequest(MoveAbsolute):
     """One member's share of a group move; made by the daemon, never read from the network."""
 
-    _meeting: "Meeting"
+    _rendezvous: "Meeting"
 
     @classmethod
     def of(cls, move: MoveAbsolute, meeting: "Meeting") -> "GroupMoveRequest":
         """Return the share of an axis."""
         request = cls(**move.model_dump())
-        request._meeting = meeting
+        request._rendezvous = meeting
         return request
 
     @property
-    def meeting(self) -> "Meeting":
+    def rendezvous(self) -> "Meeting":
         """Where the members wait for each other."""
-        return self._meeting
+        return self._rendezvous
 
 
 def plans_on_line(
@@ -68,12 +69,24 @@ def plans_on_line(
 
 
 class Rendezvous(ABC):
-    """Where the members of one motion wait until all have their turns, and where it is started once."""
+    """Where the members of one motion wait until all have their turns, and where it is started once.
 
-    def __init__(self, names: frozenset[str]) -> None:
+    Equal to another one that was asked for alike: so a request that comes again is known by the ids of its shares.
+    """
+
+    def __init__(self, names: frozenset[str], *asked: object) -> None:
+        self._asked = (names, *asked)
         self._missing = set(names)
         self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._started.add_done_callback(_look)
+
+    @override
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Rendezvous) and type(self) is type(other) and self._asked == other._asked
+
+    @override
+    def __hash__(self) -> int:
+        return hash(self._asked)
 
     @property
     def failure(self) -> BaseException | None:
@@ -121,12 +134,16 @@ class Meeting(Rendezvous):
             straight: they keep to a straight line.
             max_deviation: the line is refused if they would leave it by more, in axis units.
         """
-        super().__init__(names)
+        super().__init__(names, straight, max_deviation)
         self.deviation: float | None = None
         self._network = network
         self._straight = straight
         self._max_deviation = max_deviation
         self._members: dict[str, GroupMember] = {}
+
+    def reply(self, replies: tuple[CommandReply, ...]) -> MoveTogetherReply:
+        """Return the reply to the command whose members were answered so."""
+        return MoveTogetherReply(replies=replies, deviation=self.deviation)
 
     async def join(self, name: str, member: "GroupMember") -> None:
         """Wait for the others; return once the drives have started.
@@ -182,7 +199,7 @@ class GroupMember(Procedure):
         Raises:
             LdcndError: as `move_absolute`, or because another member could not.
         """
-        meeting, motion = self._request.meeting, self.motion
+        meeting, motion = self._request.rendezvous, self.motion
         try:
             view = motion.tracker.view()
             guards.check_may_move(view)

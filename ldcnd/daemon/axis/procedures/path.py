@@ -52,19 +52,19 @@ class PathShareRequest(MoveAbsolute):
     """One member's share of a path; made by the daemon, never read from the network."""
 
     via: tuple[float, ...] = ()
-    _path: "SharedPath"
+    _rendezvous: "SharedPath"
 
     @classmethod
     def of(cls, move: MoveAbsolute, via: tuple[float, ...], path: "SharedPath") -> "PathShareRequest":
         """Return the share of an axis."""
         request = cls(**move.model_dump(), via=via)
-        request._path = path
+        request._rendezvous = path
         return request
 
     @property
-    def path(self) -> "SharedPath":
+    def rendezvous(self) -> "SharedPath":
         """The path with its other members."""
-        return self._path
+        return self._rendezvous
 
 
 @dataclass(slots=True)
@@ -95,7 +95,7 @@ class SharedPath(Rendezvous):
     def __init__(
         self, network: Network, bus: Bus, names: frozenset[str], speed: float | None, max_deviation: float | None
     ) -> None:
-        super().__init__(names)
+        super().__init__(names, speed, max_deviation)
         self.plan: Walk | None = None
         self.broken = ""
         self.begun_s = 0.0
@@ -262,7 +262,7 @@ class PathMember(Procedure):
         self.motion = motion
         self.plan: MotionPlan
         self._request = request
-        self._path = request.path
+        self._path = request.rendezvous
         self._corners: tuple[float, ...] = ()
         self._here = 0
         self._announced = False
