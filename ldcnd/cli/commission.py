@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from ldcnd import durable
-from ldcnd.cli.connection import Target
+from ldcnd.cli.connection import AxisName, Target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, show_lines
 from ldcnd.cli.terminal_person import TerminalPerson
@@ -26,7 +26,7 @@ from ldcnd.version import version
 
 
 @click.command()
-@click.argument("axis")
+@click.argument("axis", type=AxisName("login"))
 @click.option(
     "--config",
     type=click.Path(path_type=Path, dir_okay=False),

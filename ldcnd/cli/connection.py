@@ -46,13 +46,20 @@ def of_options(model: type[ModelT], **values: object) -> ModelT:
 
 
 class AxisName(click.types.StringParamType):
-    """The name of an axis; the shell completes it with those of the daemon that the command line names."""
+    """The name of an axis; the shell completes it with those of the daemon that the command line names.
+
+    Args:
+        session_option: the option of the command that names a Zenoh configuration file.
+    """
+
+    def __init__(self, session_option: str = "config") -> None:
+        self.session_option = session_option
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002
         """Return the axes that begin so; none when no daemon answers in time."""
-        given = {name: ctx.params.get(name) for name in ("connect", "listen", "config", "rig")}
+        given = {name: ctx.params.get(name) for name in ("connect", "listen", self.session_option, "rig")}
         connect = given["connect"] or tuple(filter(None, [os.environ.get("LDCND_CONNECT")]))
-        target = Target(connect, given["listen"] or (), given["config"], given["rig"], as_json=False)
+        target = Target(connect, given["listen"] or (), given[self.session_option], given["rig"], as_json=False)
 
         async def names(client: RigClient) -> list[str]:
             async with asyncio.timeout(COMPLETION_S):

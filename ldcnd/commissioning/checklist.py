@@ -15,6 +15,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import seen
 from ldcnd.commissioning import record as records
 from ldcnd.commissioning.first_settings import FirstSettings
+from ldcnd.commissioning.holding import HoldingOutput
 from ldcnd.commissioning.homing import HomeRepeatability
 from ldcnd.commissioning.limit_switches import LimitSwitches
 from ldcnd.commissioning.motor import MotorDirection
@@ -37,6 +38,7 @@ STEPS: dict[str, Step] = {
         Load(),
         FirstSettings(),
         MotorDirection(),
+        HoldingOutput(),
         Scale(),
         LimitSwitches(),
         HomeRepeatability(),
@@ -229,7 +231,7 @@ class Checklist:
         infos = {info.axis: info for info in await self._rig.describe()}
         if self._axis not in infos:
             raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
-        return Site(self._rig, infos[self._axis], config, self._person)
+        return Site(self._rig, infos[self._axis], config, self._person, self.record)
 
     def _kept(self, step: Step, site: Site, result: Result) -> StepRecord:
         at = self._now().isoformat(timespec="seconds")

@@ -1,8 +1,10 @@
 """Limit switches and their polarity: a person presses each, and the inputs are watched."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Literal
 
+from pydantic import ValidationError
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
@@ -14,7 +16,9 @@ from ldcnd.model.samples import InputsSample, TelemetryItem
 PRESS_S = 60.0
 """Longest time in which a switch is pressed, seconds."""
 SIDES = ("reverse", "forward")
-LEVELS = {True: "high", False: "low"}
+LEVELS: Mapping[bool, Literal["high", "low"]] = {True: "high", False: "low"}
+STOPS = Proposal(table="", key="limit_switches", value="stop")
+"""The drive itself stops a motion that runs onto a switch, also without a host."""
 Levels = tuple[bool | None, bool | None]
 
 
@@ -27,7 +31,7 @@ class LimitSwitches(Step):
         "You press each limit switch by hand; the inputs are watched. From that come level and order of the switches."
     )
     moves = False
-    depends = ("direction", "home.switch_active")
+    depends = ("direction", "home.switch_active", "limit_switches")
 
     @override
     def obstacle(self, site: Site) -> str:
@@ -101,11 +105,28 @@ def _judged(site: Site, idle: Levels, pressed: list[int]) -> Result:
     if idle[0] != idle[1]:
         text = "one switch opens and the other closes when pressed: wire both alike"
         return Result(state=StepState.FAILED, text=text, figures=figures)
-    active = LEVELS[not idle[0]]
+    active: Literal["high", "low"] = LEVELS[not idle[0]]
     result = done(f"both inputs are {active} when their switch is pressed").model_copy(update={"figures": figures})
-    if active == site.config.switch_active:
-        return result
-    if site.config.home is None:
-        text = f'{result.text}: write `switch_active = "{active}"` into `home` when it gets one'
-        return result.model_copy(update={"text": text})
-    return result.model_copy(update={"proposals": (Proposal(table="home", key="switch_active", value=active),)})
+    proposals: list[Proposal] = []
+    text = result.text
+    if active != site.config.switch_active and site.config.home is None:
+        text += f': write `switch_active = "{active}"` into `home` when it gets one'
+    else:
+        if active != site.config.switch_active:
+            proposals.append(Proposal(table="home", key="switch_active", value=active))
+        if site.config.limit_switches != STOPS.value and _can_stop(site, active):
+            text += "; the drive can stop on them by itself"
+            proposals.append(STOPS)
+    return result.model_copy(update={"text": text, "proposals": tuple(proposals)})
+
+
+def _can_stop(site: Site, active: str) -> bool:
+    """Return whether the configuration may say that the drive stops on its switches."""
+    document = site.config.model_dump(mode="json") | {STOPS.key: STOPS.value}
+    if document["home"]:
+        document["home"]["switch_active"] = active
+    try:
+        type(site.config).model_validate(document)
+    except ValidationError:
+        return False
+    return True

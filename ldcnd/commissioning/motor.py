@@ -91,7 +91,7 @@ class MotorDirection(Step):
     async def run(self, site: Site, axis: Axis) -> Result:
         el = error_limit(site)
         points: list[tuple[float, float]] = []
-        async with _lent_gains(site, axis) as old:
+        async with lent_gains(site, axis) as old:
             for output in (each for each in OUTPUTS if each <= old["ol"]):
                 moved = await self._try(site, axis, output, el)
                 points.append((output, moved))
@@ -127,7 +127,7 @@ class MotorDirection(Step):
 
 
 @asynccontextmanager
-async def _lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
+async def lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
     """Open the loop, yield the gains that the drive has, and put them back at the end, whatever ends the context.
 
     The loop is open afterwards. Where control was lost meanwhile they stay kept: the checklist puts them back.

@@ -5,6 +5,7 @@ from typing_extensions import override
 from ldcnd.client.axis import Axis
 from ldcnd.commissioning.record import Figure, Result, StepState
 from ldcnd.commissioning.step import Site, Step, done
+from ldcnd.config.axis import AxisConfig, LossPolicy
 from ldcnd.model.commands import Verb
 
 LOADS = {
@@ -17,12 +18,20 @@ SHOWN = ("kp", "kd", "ki", "il", "ol", "el")
 POWERING_OFF = ("bus", "client", "daemon")
 
 
+def powered_off(config: AxisConfig) -> str:
+    """Return a remark for an axis that falls without power, where its configuration powers it off; empty otherwise."""
+    losses = [name for name in POWERING_OFF if getattr(config.loss, name) is LossPolicy.POWER_OFF]
+    return f"; `loss` powers it off when {' and '.join(losses)} is lost: it falls then" if losses else ""
+
+
 class Load(Step):
     """Asks for a hanging load and a brake."""
 
     name = "load"
     title = "Brake or hanging load"
-    about = "You say whether something falls when the motor has no power, and whether a brake holds it."
+    about = (
+        "You say whether something falls when the motor has no power, and whether a brake holds it. `hold` measures."
+    )
     moves = False
     depends = ("loss.client", "loss.bus", "loss.daemon")
 
@@ -39,9 +48,8 @@ class Load(Step):
             "brake": "nothing falls, and a brake holds the axis: release it before it moves",
             "both": "a brake holds the load: see that it closes before the loop opens, and release it before it moves",
         }[answer]
-        falling = [name for name in POWERING_OFF if getattr(site.config.loss, name).value == "power_off"]
-        if answer in ("hangs", "both") and falling:
-            text += f"; `loss` powers it off when {' and '.join(falling)} is lost: it falls then"
+        if answer in ("hangs", "both"):
+            text += powered_off(site.config)
         return done(text).model_copy(update={"figures": tuple(figures)})
 
 

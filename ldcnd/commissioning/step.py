@@ -10,7 +10,7 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import REST_S, at_rest
-from ldcnd.commissioning.record import Result, StepState
+from ldcnd.commissioning.record import Record, Result, StepState
 from ldcnd.config.axis import AxisConfig
 from ldcnd.errors import LdcndError, Remedy, StopLatched, WrongState, step
 from ldcnd.messaging.codec import rebuild_error
@@ -31,12 +31,14 @@ class Site:
         info: the axis, as the daemon describes it.
         config: the axis, as the file has it.
         person: answers, and allows motion.
+        record: what is known of the axis so far.
     """
 
     rig: Rig
     info: AxisInfo
     config: AxisConfig
     person: Person
+    record: Record
 
     @property
     def counts_per_unit(self) -> float:

@@ -68,6 +68,7 @@ def test_all_steps_are_gone_through_and_the_change_is_shown_and_written(rig, con
         [
             *("y", "hangs", "secured by a strap"),  # load
             "y",  # motor
+            "y",  # hold
             *("y", "2", "4.0", "n"),  # scale: twice as far, not written
             *("s", "has none"),  # limits
             *("y", "2"),  # home
@@ -89,6 +90,7 @@ def test_all_steps_are_gone_through_and_the_change_is_shown_and_written(rig, con
         "load": "done",
         "settings": "not_needed",
         "motor": "done",
+        "hold": "done",
         "scale": "done",
         "limits": "skipped",
         "home": "done",

@@ -4,7 +4,7 @@ import asyncio
 import functools
 import re
 import shutil
-from dataclasses import fields
+from dataclasses import fields, replace
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -13,13 +13,16 @@ from ldcnd.client.kept_gains import KeptGains, keep
 from ldcnd.client.rig import Rig
 from ldcnd.commissioning.checklist import STEPS, Checklist
 from ldcnd.commissioning.first_settings import SOFT_GAINS
+from ldcnd.commissioning.limit_switches import _judged
 from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS
 from ldcnd.commissioning.record import Result, StepState
 from ldcnd.commissioning.report import html_of
 from ldcnd.config.rig import load_config
 from ldcnd.errors import LeaseExpired, StopLatched, WrongState
 from ldcnd.person import Left
-from tests.support.commissioning import AXIS, GAINS, ScriptedPerson, commissioning_rig, rig_text
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.tuning.ldcn.plant import Plant
+from tests.support.commissioning import AXIS, GAINS, PLANT, ScriptedPerson, commissioning_rig, rig_text
 from tests.support.process import ROOT
 from tests.support.rig import running_rig
 from tests.support.simulated_plants import drawn_plants
@@ -199,6 +202,95 @@ async def test_gains_that_another_program_has_lent_are_never_taken_for_those_of_
         assert checklist.gains_to_put_back is None  # the end of a step puts them back, whoever has lent others
 
 
+def in_pwm(motor):
+    """Return friction and load of a machine in PWM steps; a load that pulls forward is held by an output below 0."""
+    plant = Plant.of(motor)
+    return plant.friction_pwm, -plant.load_pwm
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+async def test_the_output_at_rest_tells_friction_and_load(direction, tmp_path):
+    nm = PLANT.torque_nm_per_a * PLANT.supply_v / PLANT.resistance_ohm / 255
+    text = rig_text(direction=direction)
+    async with commissioning_rig(tmp_path, text=text, friction_nm=6 * nm, load_nm=-3.2 * nm) as rig:
+        checklist = await rig.checklist()
+        preview = await checklist.preview("hold")
+        kept = await checklist.run("hold")
+
+        shown = figures(kept)
+        sign = 1 if direction == "forward" else -1
+        assert kept.result.state is StepState.DONE
+        assert shown["output that holds the load, to half a step"] == pytest.approx(sign * 3.2, abs=0.5)
+        assert shown["friction, to half a step"] == pytest.approx(6.0, abs=0.5)
+        assert f"pulls it {'back' if sign > 0 else 'forward'}" in kept.result.text
+        assert "holds it without power" in kept.result.text
+        assert any("by 300 counts (0.3 mm)" in line for line in preview)
+        assert abs(rig.drive.shaft.position_counts) <= CAUGHT * MOST_EL_COUNTS
+        assert await rig.registers() == GAINS
+        assert checklist.gains_to_put_back is None
+        assert not (await rig.running.client.state(AXIS)).enabled
+
+
+async def test_a_load_that_friction_does_not_hold_contradicts_the_person(tmp_path):
+    nm = PLANT.torque_nm_per_a * PLANT.supply_v / PLANT.resistance_ohm / 255
+    script = {"what falls": "none", "remark": ""}
+    text = rig_text().replace("[[sim]]", '[bus.axis.loss]\nclient = "power_off"\n\n[[sim]]')
+    chain = build_chain(
+        ChainSpec((ModuleSpec("picservo-sc", replace(PLANT, friction_nm=2.5 * nm, load_nm=-5.4 * nm)),))
+    )
+    chain.modules[0].shaft.stalled = True
+    async with commissioning_rig(tmp_path, script, text=text, chain=chain) as rig:
+        checklist = await rig.checklist()
+        await checklist.run("load")
+        brake = asyncio.create_task(braked_without_power(rig))
+        kept = await checklist.run("hold")
+        brake.cancel()
+
+        assert figures(kept)["output that holds the load, to half a step"] == pytest.approx(5.4, abs=0.6)
+        assert "it falls without power, unless a brake holds it" in kept.result.text
+        assert "`loss` powers it off when client is lost" in kept.result.text
+        assert "run the step load again" in kept.result.text
+
+
+async def braked_without_power(rig):
+    """Let a brake hold the axis while its loop is open."""
+    while True:
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+        rig.drive.shaft.stalled = not rig.drive.loop.servo_on
+        await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(60, marks=pytest.mark.soak)])
+async def test_friction_and_load_of_drawn_machines_are_measured(count, tmp_path):
+    hanging = [drawn for drawn in drawn_plants(SEED, 5 * count) if drawn.motor.load_nm][:count]
+    off = []
+    for drawn in hanging:
+        machine = {each.name: getattr(drawn.motor, each.name) for each in fields(drawn.motor)}
+        folder = tmp_path / str(drawn.number)
+        folder.mkdir()
+        async with commissioning_rig(folder, **machine) as rig:
+            kept = await (await rig.checklist()).run("hold")
+            far = abs(rig.drive.shaft.position_counts)
+        friction, load = in_pwm(drawn.motor)
+        shown = figures(kept)
+        print(drawn.number, f"friction {friction:.2f} load {load:.2f}", shown, kept.result.text, far)
+        assert kept.result.state is StepState.DONE, drawn.number
+        off.append(shown["friction, to half a step"] - friction)
+        off.append(shown["output that holds the load, to half a step"] - load)
+
+    assert max(map(abs, off)) < 1.0
+
+
+async def test_an_axis_that_a_brake_holds_is_said_not_to_follow(tmp_path):
+    async with commissioning_rig(tmp_path) as rig:
+        rig.drive.shaft.stalled = True
+        kept = await (await rig.checklist()).run("hold")
+
+        assert kept.result.state is StepState.FAILED
+        assert "look for a closed brake" in kept.result.text
+        assert await rig.registers() == GAINS
+
+
 async def test_a_wrong_scale_and_a_reversed_encoder_are_found_and_written(tmp_path):
     script = {"how far shall": "4", "how far did": "-8"}  # half the counts a mm, and backwards
     async with commissioning_rig(tmp_path, script) as rig:
@@ -259,10 +351,22 @@ async def test_limit_switches_are_watched_and_nothing_is_sent_that_moves(tmp_pat
         kept = await checklist.run("limits")
         await pressed
 
-        assert proposed(kept) == {"home.switch_active": "high"}
+        assert proposed(kept) == {"home.switch_active": "high", "limit_switches": "stop"}
         checklist.write(checklist.change("limits"))
         assert load_config(rig.config).bus[0].axis[0].switch_active == "high"
+        assert load_config(rig.config).bus[0].axis[0].limit_switches == "stop"
         assert not await checklist.refresh()
+
+
+async def test_a_level_that_the_configuration_cannot_say_yet_makes_no_drive_stop_on_its_switches(tmp_path):
+    text = re.sub("home = .*\n", "", rig_text())
+    async with commissioning_rig(tmp_path, {"has the axis": "y"}, text=text) as rig:
+        site = await (await rig.checklist())._site()
+        found = _judged(site, (True, True), [0, 1])
+
+        assert found.state is StepState.DONE
+        assert found.proposals == ()
+        assert 'write `switch_active = "low"` into `home`' in found.text
 
 
 async def test_swapped_switches_are_found(tmp_path):
@@ -336,6 +440,7 @@ async def test_leaving_in_the_middle_and_resuming(tmp_path):
         checklist = await rig.checklist()
         await checklist.run("load")
         await checklist.settle("motor", Result(state=StepState.SKIPPED, text="seen to be right"))
+        await checklist.settle("hold", Result(state=StepState.SKIPPED, text="a spindle"))
         with pytest.raises(Left):
             await checklist.run("scale")
         again = await rig.checklist()

@@ -17,9 +17,10 @@ def test_axes_of_the_daemon_are_completed(monkeypatch: pytest.MonkeyPatch) -> No
         axes = completed("axis", "move")
         begun = completed("axis", "gains", incomplete="x")
         several = completed("reset", "x", incomplete="y")
+        commissioned = completed("commission", "--config", "rig.toml", incomplete="z")
 
     assert sorted(axes) == ["c", "x", "y", "z"]
-    assert (begun, several) == (["x"], ["y"])
+    assert (begun, several, commissioned) == (["x"], ["y"], ["z"])
 
 
 def test_commands_verbs_and_codes_are_completed() -> None:

@@ -19,7 +19,7 @@ from ldcnd.tuning.ldcn.design import (
     stiff_gains,
     within_authority,
 )
-from ldcnd.tuning.ldcn.excitation import PULSE_COUNTS, Bounds, Excitation, Record, Shown
+from ldcnd.tuning.ldcn.excitation import PULSE_TICKS, Bounds, Excitation, Record, Shown
 from ldcnd.tuning.ldcn.identify import Identified, identify
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.response import Figures, Move, Start, figures, simulate
@@ -186,7 +186,7 @@ def test_pulses_end_in_the_drive_itself():
     with suppress(DriveFault):
         while True:
             run = simulate(PIC_SERVO_V4, blind, trial.gains, trial.move, 0.1)
-            assert 0 < sum(abs(run.pwm)) <= PULSE_COUNTS * trial.gains.ol
+            assert 0 < sum(abs(run.pwm)) <= PULSE_TICKS * trial.gains.ol
             assert not run.pwm[-1]
             forward.append(max(sum(run.pwm), 0))
             trial = pulses.send(nothing)

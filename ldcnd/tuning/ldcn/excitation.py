@@ -24,8 +24,10 @@ from ldcnd.tuning.ldcn.response import Move, Start
 
 LEAST_WITHIN_COUNTS = 200
 """Within less than this, moves are too short to tell of an axis, counts."""
-PULSE_COUNTS = 10
-"""Distance of the command of a pulse, counts, one a servo tick at most: also the longest output, in ticks."""
+PULSE_TICKS = 10
+"""Servo ticks in which the command of a pulse moves: also for how long it gives output."""
+FASTEST_PULSE_SHARE = 1 / 600
+"""Share of the distance that the command of a pulse moves in a tick at most."""
 MOST_PULSE_LEVEL = 100
 MOST_IMPULSE = 1000.0
 """Most that a pulse may be: PWM steps times servo ticks."""
@@ -49,6 +51,10 @@ SOFT_SHARE = 0.6
 FRACTION_OF_GAIN = 256
 """The drive divides what its gains make by this."""
 SOFT_S = 0.6
+MOST_SOFT_S = 2.4
+"""A soft move lasts `SOFT_S`; where the axis is not at rest by then, it is made again with twice the time, seconds."""
+STILL_S = 0.025
+"""A record whose last counts are the same for so long has come to rest, seconds."""
 SOFT_DERIVATIVE_TICKS = 8
 STIFF_S = 0.3
 BOTH_WAYS = 2
@@ -126,6 +132,16 @@ class Record:
     times_s: tuple[float, ...]
     positions: tuple[int, ...]
 
+    @property
+    def ends_at_rest(self) -> bool:
+        """Whether the axis had come to rest by the end of the trace."""
+        last = self.positions[-1]
+        return all(
+            at == last
+            for time_s, at in zip(self.times_s, self.positions, strict=True)
+            if time_s >= self.times_s[-1] - STILL_S
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Shown:
@@ -189,22 +205,42 @@ class Excitation:
         full_counts = profile.encoder_counts_per_s * profile.servo_cycle_s / FULL_PWM
         return min(self._bounds.within_counts / full_counts / ALL_PULSES, MOST_IMPULSE)
 
+    @property
+    def pulse_counts(self) -> int:
+        """By how much the command of a pulse moves in a servo tick, counts; it reaches that within a pulse.
+
+        The more, the less a single count of the axis changes the output: with one count a tick, the loop of a light
+        motor with a fine encoder rings before friction gives way.
+        """
+        bounds, cycle_s = self._bounds, self._profile.servo_cycle_s
+        return max(
+            1,
+            int(
+                min(
+                    FASTEST_PULSE_SHARE * bounds.within_counts,
+                    bounds.velocity_counts_per_s * cycle_s,
+                    bounds.acceleration_counts_per_s2 * cycle_s**2 * PULSE_TICKS,
+                )
+            ),
+        )
+
     def pulses(self) -> Trials:
         """Find the output at which the axis gives way, and whether its encoder then counts the motor's way.
 
         Raises:
             DriveFault: it counts the other way, or not at all.
         """
-        most = min(max(int(self.most_impulse / PULSE_COUNTS), 1), MOST_PULSE_LEVEL)
+        most = min(max(int(self.most_impulse / PULSE_TICKS), 1), MOST_PULSE_LEVEL)
         margin = max(PULSE_MARGIN_COUNTS, int(PULSE_MARGIN_SHARE * self._bounds.within_counts))
-        limit = min(PULSE_COUNTS + margin, MOST_ERROR_LIMIT)
-        cycle_s = self._profile.servo_cycle_s
+        counts, cycle_s = self.pulse_counts, self._profile.servo_cycle_s
+        limit = min(PULSE_TICKS * counts + margin, MOST_ERROR_LIMIT)
         silent = [1, -1]
         for halvings in reversed(range(most.bit_length())):
             self.level = most >> halvings
             for direction in tuple(silent):  # a load may make one of them easier
-                gains = Gains(kp=0, kd=256 * self.level, ki=0, il=0, ol=self.level, cl=0, el=limit, sr=1)
-                move = self._bounds.move(direction * PULSE_COUNTS, 1 / cycle_s, 1 / cycle_s**2)
+                kd = math.ceil(FRACTION_OF_GAIN * self.level / counts)
+                gains = Gains(kp=0, kd=kd, ki=0, il=0, ol=self.level, cl=0, el=limit, sr=1)
+                move = self._bounds.move(direction * PULSE_TICKS * counts, counts / cycle_s, counts / cycle_s**2)
                 shown = yield self._trial(Purpose.PULSE, gains, move, PULSE_S)
                 gone = self._account(shown) * direction
                 if gone <= -SEEN_COUNTS:
@@ -219,7 +255,7 @@ class Excitation:
             if not silent:
                 return ()
         raise DriveFault(
-            f"the encoder counted nothing at {most} of {FULL_PWM} PWM steps, {PULSE_COUNTS} servo ticks long",
+            f"the encoder counted nothing at {most} of {FULL_PWM} PWM steps, {PULSE_TICKS} servo ticks long",
             value=most,
             remedy="check the encoder, the motor's leads, its supply and the brake; more output would take a motor"
             " without an encoder farther than this tuning may go, so allow more distance if all of that is right",
@@ -232,7 +268,7 @@ class Excitation:
             DriveFault: it does not, or the drive gave up.
         """
         reach = min(self._bounds.within_counts // 4, MOST_ERROR_LIMIT * 3 // 4)
-        level = max(self.level * FIRST_SOFT_SHARE, LEAST_SOFT_LEVEL)
+        level, lasts_s = max(self.level * FIRST_SOFT_SHARE, LEAST_SOFT_LEVEL), SOFT_S
         while level <= MOST_SOFT_LEVEL:
             kp = max(round(256 * level / reach), 1)
             gains = Gains(
@@ -246,19 +282,26 @@ class Excitation:
                 sr=1,
             )
             records: list[Record] = []
+            rests = True
             for distance in self._there_and_back(reach):
                 move = self._bounds.move(distance, 100.0 * reach, 100_000.0 * reach)
-                shown = yield self._trial(Purpose.SOFT, gains, move, SOFT_S)
+                shown = yield self._trial(Purpose.SOFT, gains, move, lasts_s)
                 self._account(shown)
                 if shown.tripped:
                     raise _gave_up("a soft move")
+                rests = shown.record.ends_at_rest
+                if not rests:
+                    break  # only the way in which it comes to rest distinguishes friction from inertia
                 left = reach - abs(shown.rest_counts)
                 if left > (1 - SOFT_SHARE) * reach or kp * left >= FRACTION_OF_GAIN * gains.ol:
                     break  # at its limit all the way, the output tells only by how much it exceeds friction
                 records.append(shown.record)
             if len(records) == BOTH_WAYS:
                 return tuple(records)
-            level *= SOFT_STEP
+            if not rests and lasts_s < MOST_SOFT_S:
+                lasts_s *= 2
+            else:
+                level *= SOFT_STEP
         raise DriveFault(
             f"the axis does not follow with {MOST_SOFT_LEVEL} of {FULL_PWM} PWM steps",
             value=MOST_SOFT_LEVEL,

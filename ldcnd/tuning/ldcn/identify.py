@@ -34,6 +34,11 @@ GOOD_SHARE = 0.003
 """A fit that leaves no more than this share of the distance, or `GOOD_COUNTS`, is not begun again elsewhere."""
 STARTS = ((1.0, 1.0, 1.0), (0.6, 1.0, 0.5), (1.6, 1.0, 1.0), (1.0, 4.0, 0.3))
 """Factors of acceleration, damping and friction where fits begin."""
+BEGIN_SHARE = 0.05
+"""The regression begins where the speed is this share of the highest."""
+LOSSES = (1, 2)
+PLANT_COLUMNS = 4
+"""Columns of the regression: acceleration, damping, friction, load."""
 MOST_CORRELATION = 0.95
 PER_SAMPLE_COUNTS = 0.3
 """Standard deviation of a position that is a whole number of counts."""
@@ -107,10 +112,7 @@ def _regression(profile: Profile, records: Sequence[Record]) -> tuple[Plant, lis
             for offset in options:
                 trial = [*chosen[:index], offset, *chosen[index + 1 :]]
                 rows = [_rows(profile, record, begun) for record, begun in zip(records, trial, strict=True)]
-                matrix = np.vstack([row[0] for row in rows])
-                value = np.concatenate([row[1] for row in rows])
-                solution, *_ = np.linalg.lstsq(matrix, value, rcond=None)
-                left = float(np.sum((matrix @ solution - value) ** 2))
+                solution, left = _solved(rows)
                 if solution[0] > 0 and (best is None or left < best[0]):
                     best = left, trial, solution
             if best:
@@ -121,10 +123,33 @@ def _regression(profile: Profile, records: Sequence[Record]) -> tuple[Plant, lis
     plant = Plant(
         float(acceleration),
         max(float(damping), 1.0),
-        max(float(friction / acceleration), 0.0),
+        float(friction / acceleration),
         float(load / acceleration),
     )
     return plant, best[1]
+
+
+def _solved(rows: Sequence[tuple[Floats, Floats, Floats]]) -> tuple[Floats, float]:
+    """Return acceleration, damping, friction and load of least squares, and what is left of them.
+
+    The speed with which each record begins is found, too: a derivative of its first counts would be wrong by more than
+    friction does. Damping and friction below 0 explain noise, so they are left out then.
+    """
+    values = np.concatenate([value for _, value, _ in rows])
+    begins = np.zeros((len(values), len(rows)))
+    first = 0
+    for index, (_, value, elapsed) in enumerate(rows):
+        begins[first : first + len(value), index] = elapsed
+        first += len(value)
+    matrix = np.column_stack([np.vstack([columns for columns, _, _ in rows]), begins])
+    kept = list(range(matrix.shape[1]))
+    while True:
+        solution = np.zeros(matrix.shape[1])
+        solution[kept] = np.linalg.lstsq(matrix[:, kept], values, rcond=None)[0]
+        below = [index for index in LOSSES if solution[index] < 0]
+        if not below:
+            return solution[:PLANT_COLUMNS], float(np.sum((matrix @ solution - values) ** 2))
+        kept.remove(below[0])
 
 
 def _offsets(record: Record) -> list[float]:
@@ -134,8 +159,11 @@ def _offsets(record: Record) -> list[float]:
     return [seen_s - n * LATE_STEP_S for n in range(int(MOST_LATE_S / LATE_STEP_S))]
 
 
-def _rows(profile: Profile, record: Record, begun_s: float) -> tuple[Floats, Floats]:
-    """Return what acceleration, damping, friction and load have added to the position at each sample, and it."""
+def _rows(profile: Profile, record: Record, begun_s: float) -> tuple[Floats, Floats, Floats]:
+    """Return what acceleration, damping, friction and load add to the position until each instant, it, and these.
+
+    They are of the way from the first visible motion to the farthest place: there the speed has one sign.
+    """
     cycle_s, gains, move = profile.servo_cycle_s, record.gains, record.move
     times = np.arange(begun_s, record.times_s[-1], cycle_s)
     position = np.interp(times, record.times_s, record.positions)
@@ -149,24 +177,17 @@ def _rows(profile: Profile, record: Record, begun_s: float) -> tuple[Floats, Flo
     smooth = np.convolve(np.pad(position, 4, mode="edge"), np.full(9, 1 / 9), mode="valid")
     velocity = np.gradient(smooth, cycle_s)
     top = float(np.max(np.abs(velocity)))
-    moving = np.abs(velocity) > 0.05 * top
-    begin = int(np.argmax(moving))
-    end = begin + int(np.argmax(np.abs(velocity[begin:]) < 0.02 * top)) if np.any(
-        np.abs(velocity[begin:]) < 0.02 * top
-    ) else len(times)  # fmt: skip
-    part = slice(begin, max(end, begin + FEWEST_SAMPLES))
+    begin = int(np.argmax(np.abs(velocity) > BEGIN_SHARE * top))
+    force = float(np.sign(move.distance_counts))
+    part = slice(begin, max(int(np.argmax(position * force)), begin + FEWEST_SAMPLES))
 
     def twice(what: Floats) -> Floats:
         return np.asarray(np.cumsum(np.cumsum(what)) * cycle_s**2, dtype=np.float64)
 
-    start, force = position[part][0], np.sign(velocity[part])
-    columns = (
-        twice(output[part]),
-        -np.cumsum(position[part] - start) * cycle_s,
-        -twice(force),
-        twice(np.ones_like(force)),
-    )
-    return np.column_stack(columns), position[part] - start - (velocity[part][0] * (times[part] - times[part][0]))
+    way = position[part] - position[part][0]
+    ones = np.ones_like(way)
+    columns = (twice(output[part]), -np.cumsum(way) * cycle_s, -force * twice(ones), twice(ones))
+    return np.column_stack(columns), way, times[part] - times[part][0]
 
 
 def _command(times: Floats, move: Move) -> Floats:

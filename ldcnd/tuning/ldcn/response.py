@@ -57,7 +57,9 @@ class Response:
         positions: encoder positions.
         pwm: outputs, -255 to 255.
         tripped: the following error exceeded EL, and the drive gave up.
-        shaft_counts: the lowest, the highest and the last place of the shaft, also where the encoder does not show it.
+        shaft_counts: the lowest, the highest and the last place of the shaft, also where the encoder does not show it,
+            and while it coasted.
+        rest_counts: the encoder's count in the end, after coasting.
     """
 
     times_s: Floats
@@ -66,10 +68,17 @@ class Response:
     pwm: Floats
     tripped: bool = False
     shaft_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rest_counts: int = 0
 
 
 def simulate(
-    profile: Profile, plant: Plant | MotorPlant, gains: Gains, move: Move, duration_s: float, start: Start | None = None
+    profile: Profile,
+    plant: Plant | MotorPlant,
+    gains: Gains,
+    move: Move,
+    duration_s: float,
+    start: Start | None = None,
+    coasting_s: float = 0.0,
 ) -> Response:
     """Run one move of a drive on a plant.
 
@@ -80,6 +89,7 @@ def simulate(
         move: the commanded move.
         duration_s: from the start of the move.
         start: how the axis stands before; settled on its command position when left out.
+        coasting_s: for so long it then coasts with the amplifier off.
     """
     start = start or Start()
     motor = plant.motor() if isinstance(plant, Plant) else plant
@@ -107,13 +117,20 @@ def simulate(
         pwm[cycle] = loop.pwm
         if motor.encoder_disconnected:
             unseen.append(shaft.position_counts)
+    tripped, places = loop.faulted, unseen or list(positions)
+    loop.open()
+    stage.enable(on=False)
+    for _ in range(round(coasting_s / profile.servo_cycle_s)):
+        loop.run(1)
+        places.append(shaft.position_counts if motor.encoder_disconnected else loop.position - origin)
     return Response(
         np.asarray(np.arange(1, cycles + 1) * profile.servo_cycle_s, dtype=np.float64),
         np.array(commanded, dtype=np.float64),
         np.array(positions, dtype=np.float64),
         np.array(pwm, dtype=np.float64),
-        tripped=loop.faulted,
-        shaft_counts=_range(unseen or positions),
+        tripped=tripped,
+        shaft_counts=_range(places),
+        rest_counts=loop.position - origin,
     )
 
 
