@@ -25,6 +25,7 @@ from ldcnd.messaging.session import (
     OnRead,
     OnSample,
     OnToken,
+    PublishValue,
     Qos,
     Query,
     Sample,
@@ -144,13 +145,18 @@ class MemorySession(Session):
     ) -> None:
         """Offer the sample to every subscription that matches; quality of service makes no difference here."""
         del qos, attachment
-        if self._closed:
-            raise SessionError("the session is closed")
-        if self._broker.subscriptions or self._overhear:
-            sample = Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns)
-            if self._overhear:
-                self._overhear(sample)
-            self._offer(sample)
+        self._publish(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+
+    def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
+        """Return what publishes the values of one key."""
+        del qos
+        broker = self._broker
+
+        def publish(payload: bytes, measured_at_ns: int) -> None:
+            if self._closed or broker.subscriptions or self._overhear:
+                self._publish(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+
+        return publish
 
     def delete(self, key: str) -> None:
         """Offer the deletion to every subscription that matches."""
@@ -251,6 +257,12 @@ class MemorySession(Session):
         self._closed = True
         for declaration in tuple(self._declarations):
             await declaration.close()
+
+    def _publish(self, sample: Sample) -> None:
+        self._must_be_open()
+        if self._overhear:
+            self._overhear(sample)
+        self._offer(sample)
 
     def _offer(self, sample: Sample) -> None:
         self._must_be_open()

@@ -197,6 +197,8 @@ OnRead = Callable[[Query], Iterator[None]]
 """Answers a query in steps: each makes at most one payload, and between two of them the loop does other work."""
 OnSample = Callable[[Sample], None]
 OnToken = Callable[[str, bool], None]
+PublishValue = Callable[[bytes, int], None]
+"""Publishes a payload, true at that instant, UTC in ns since 1970."""
 """Learns that the token of a key has appeared (True) or vanished (False)."""
 
 
@@ -259,6 +261,16 @@ class Session(ABC):
             qos: how it travels; one for all values of a key keeps them in order.
             measured_at_ns: when the value was true, UTC in ns since 1970; the time of sending when missing.
             attachment: what accompanies it, for other systems that need that.
+        """
+
+    @abstractmethod
+    def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
+        """Return what publishes the values of one key without waiting, for keys that get many.
+
+        Args:
+            key: a concrete key.
+            encoding: of every payload.
+            qos: as of `publish`.
         """
 
     @abstractmethod

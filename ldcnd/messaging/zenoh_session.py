@@ -37,6 +37,7 @@ from ldcnd.messaging.session import (
     OnRead,
     OnSample,
     OnToken,
+    PublishValue,
     Qos,
     Query,
     Session,
@@ -113,6 +114,7 @@ class _Outlet:
     """The way out of one key; its publisher is declared in the background after the first sample."""
 
     qos: Qos
+    encoding: str | None = None
     publisher: zenoh.Publisher | None = None
 
 
@@ -164,6 +166,27 @@ class ZenohSession(Session):
                 )
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot publish: {error}") from error
+
+    def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
+        """Return what publishes the values of one key; one call for each, as five belong to every poll."""
+        outlet = _Outlet(qos, encoding)
+        stamps, session, travel = self._stamps, self._session, TRAVEL[qos]
+
+        def publish(payload: bytes, measured_at_ns: int) -> None:
+            if self._closed:
+                raise SessionError("the session is closed")
+            timestamp = stamps.latest if measured_at_ns == stamps.at_ns else stamps.of(measured_at_ns)
+            try:
+                if outlet.publisher is not None:
+                    outlet.publisher.put(payload, timestamp=timestamp)
+                    return
+                session.put(key, payload, encoding=encoding, timestamp=timestamp, **travel)
+            except zenoh.ZError as error:
+                raise SessionError(f"{key}: cannot publish: {error}") from error
+            if key not in self._outlets:
+                self._declare_outlet(key, outlet)
+
+        return publish
 
     def delete(self, key: str) -> None:
         """Say that a key has no value any more, in order with its values."""
@@ -370,11 +393,16 @@ class ZenohSession(Session):
         return login if login is None else printable(login)
 
     def _new_outlet(self, key: str, qos: Qos) -> _Outlet:
-        outlet = self._outlets[key] = _Outlet(qos)
+        return self._declare_outlet(key, _Outlet(qos))
+
+    def _declare_outlet(self, key: str, outlet: _Outlet) -> _Outlet:
+        self._outlets[key] = outlet
 
         def declare() -> None:
             try:
-                outlet.publisher = self._session.declare_publisher(key, **TRAVEL[qos])
+                outlet.publisher = self._session.declare_publisher(
+                    key, encoding=outlet.encoding, **TRAVEL[outlet.qos]
+                )
             except zenoh.ZError as error:
                 log.debug("publisher not declared", key=key, reason=str(error))
 

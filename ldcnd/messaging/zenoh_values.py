@@ -68,18 +68,20 @@ class Stamps:
 
     Attributes:
         stamp_id: of the session.
+        at_ns: instant of the latest one.
+        latest: the latest one.
     """
 
     def __init__(self, stamp_id: zenoh.TimestampId) -> None:
         self.stamp_id = stamp_id
-        self._at_ns: int | None = None
-        self._latest: zenoh.Timestamp | None = None
+        self.at_ns: int | None = None
+        self.latest: zenoh.Timestamp | None = None
 
     def of(self, at_ns: int | None) -> zenoh.Timestamp | None:
         """See `to_stamp`."""
-        if at_ns != self._at_ns:
-            self._at_ns, self._latest = at_ns, to_stamp(at_ns, self.stamp_id)
-        return self._latest
+        if at_ns != self.at_ns:
+            self.at_ns, self.latest = at_ns, to_stamp(at_ns, self.stamp_id)
+        return self.latest
 
 
 def _stamped_ns(timestamp: zenoh.Timestamp | None) -> int | None:

@@ -30,7 +30,16 @@ SECONDS = 8.0
 ROUND_S = 0.02
 SETTLED_S = 1.5
 EPOCH_NS = 1_700_000_000_000_000_000
-FIELDS = {"value": 12.345678, "unit": "mm", "turns": None, "counts": 123_456, "following_error": 0.001}
+FIELDS = {
+    "t_error_ns": 250_000,
+    "seq": 0,
+    "quality": Quality.GOOD,
+    "value": 12.345678,
+    "unit": "mm",
+    "turns": None,
+    "counts": 123_456,
+    "following_error": 0.001,
+}
 RECORDING = """
 import asyncio, sys, threading, time
 from pathlib import Path
@@ -92,7 +101,7 @@ async def cost(seconds: float = SECONDS, rate_hz: int = RATE_HZ) -> Cost:
             begun_s, number = loop.time(), 0
             while (passed_s := loop.time() - begun_s) < seconds:
                 while number < rate_hz * passed_s:
-                    topics[number % AXES].publish(EPOCH_NS + number, 250_000, Quality.GOOD, **FIELDS)
+                    topics[number % AXES].publish({"t": EPOCH_NS + number, **FIELDS})
                     number += 1
                 await asyncio.sleep(ROUND_S)
             await asyncio.sleep(SETTLED_S)

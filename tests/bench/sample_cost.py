@@ -77,14 +77,17 @@ def rows(samples: int = SAMPLES) -> list[Row]:
 def publish_position(topic: Topic, number: int) -> None:
     """Publish what a poll reads, as the daemon does."""
     topic.publish(
-        1_700_000_000_000_000_000 + number,
-        250_000,
-        Quality.GOOD,
-        value=12.345678,
-        unit="mm",
-        turns=None,
-        counts=123_456,
-        following_error=0.001,
+        {
+            "t": 1_700_000_000_000_000_000 + number,
+            "t_error_ns": 250_000,
+            "seq": 0,
+            "quality": Quality.GOOD,
+            "value": 12.345678,
+            "unit": "mm",
+            "turns": None,
+            "counts": 123_456,
+            "following_error": 0.001,
+        }
     )
 
 

@@ -85,29 +85,44 @@ class AxisTelemetry:
             if self._modulo is not None:
                 value, turns = self.within_turn(value)
             self._position.publish(
-                t,
-                t_error_ns,
-                quality,
-                value=value,
-                unit=self._unit,
-                turns=turns,
-                counts=counts,
-                following_error=None if lag is None else lag / counts_per_unit,
+                {
+                    "t": t,
+                    "t_error_ns": t_error_ns,
+                    "seq": 0,
+                    "quality": quality,
+                    "value": value,
+                    "unit": self._unit,
+                    "turns": turns,
+                    "counts": counts,
+                    "following_error": None if lag is None else lag / counts_per_unit,
+                }
             )
         if TelemetryItem.VELOCITY in asked:
             velocity = reading.velocity_counts_per_s
             self._velocity.publish(
-                t,
-                t_error_ns,
-                quality,
-                value=velocity / counts_per_unit,
-                unit=self._velocity_unit,
-                counts_per_s=velocity,
+                {
+                    "t": t,
+                    "t_error_ns": t_error_ns,
+                    "seq": 0,
+                    "quality": quality,
+                    "value": velocity / counts_per_unit,
+                    "unit": self._velocity_unit,
+                    "counts_per_s": velocity,
+                }
             )
         adc, full_scale = reading.adc_counts, self._adc_full_scale
         if TelemetryItem.ADC in asked and adc is not None and full_scale:
-            volts = adc / full_scale * self._adc_volts
-            self._adc.publish(t, t_error_ns, quality, counts=adc, full_scale=full_scale, volts=volts)
+            self._adc.publish(
+                {
+                    "t": t,
+                    "t_error_ns": t_error_ns,
+                    "seq": 0,
+                    "quality": quality,
+                    "counts": adc,
+                    "full_scale": full_scale,
+                    "volts": adc / full_scale * self._adc_volts,
+                }
+            )
         if self._shows_inputs:
             inputs = (
                 reading.reverse_limit,
@@ -120,14 +135,17 @@ class AxisTelemetry:
                 self._last_inputs, self._inputs_at_ns = inputs, t
                 reverse, forward, index, stop_input, amplifier_enable = inputs
                 self._inputs.publish(
-                    t,
-                    t_error_ns,
-                    quality,
-                    reverse_limit=reverse,
-                    forward_limit=forward,
-                    index=index,
-                    stop_input=stop_input,
-                    amplifier_enable=amplifier_enable,
+                    {
+                        "t": t,
+                        "t_error_ns": t_error_ns,
+                        "seq": 0,
+                        "quality": quality,
+                        "reverse_limit": reverse,
+                        "forward_limit": forward,
+                        "index": index,
+                        "stop_input": stop_input,
+                        "amplifier_enable": amplifier_enable,
+                    }
                 )
         self.state(t, t_error_ns, due=TelemetryItem.STATE in asked)
 
@@ -141,24 +159,36 @@ class AxisTelemetry:
         if due or shown != self._last_state:
             self._last_state = shown
             self._state.publish(
-                t,
-                t_error_ns,
-                quality,
-                state=state,
-                enabled=enabled,
-                referenced=referenced,
-                moving=moving,
-                link=link,
-                stop_latched=stop_latched,
-                stop_pending=stop_pending,
-                command=command and _current(command),
-                last_error=last_error,
-                speed_override=100.0 * share,
+                {
+                    "t": t,
+                    "t_error_ns": t_error_ns,
+                    "seq": 0,
+                    "quality": quality,
+                    "state": state,
+                    "enabled": enabled,
+                    "referenced": referenced,
+                    "moving": moving,
+                    "link": link,
+                    "stop_latched": stop_latched,
+                    "stop_pending": stop_pending,
+                    "command": command and _current(command),
+                    "last_error": last_error,
+                    "speed_override": 100.0 * share,
+                }
             )
         faults = (tracker.active_faults, tracker.first_fault)
         if due or faults != self._last_faults:
             self._last_faults = faults
-            self._faults.publish(t, t_error_ns, quality, active=tracker.active_faults, first=tracker.first_fault)
+            self._faults.publish(
+                {
+                    "t": t,
+                    "t_error_ns": t_error_ns,
+                    "seq": 0,
+                    "quality": quality,
+                    "active": tracker.active_faults,
+                    "first": tracker.first_fault,
+                }
+            )
 
     def monitor(self, value: MonitorValue, t: int, t_error_ns: int) -> None:
         """Publish a monitor; a counter that had to be corrected is uncertain."""
@@ -166,14 +196,17 @@ class AxisTelemetry:
         if value.resolved and quality is Quality.GOOD:
             quality = Quality.UNCERTAIN
         self._publisher.monitor(self._tracker.name, value.name).publish(
-            t,
-            t_error_ns,
-            quality,
-            value=value.value,
-            unit=value.unit,
-            title=value.title,
-            high=value.high,
-            active=value.active,
+            {
+                "t": t,
+                "t_error_ns": t_error_ns,
+                "seq": 0,
+                "quality": quality,
+                "value": value.value,
+                "unit": value.unit,
+                "title": value.title,
+                "high": value.high,
+                "active": value.active,
+            }
         )
 
     def latched(self, sample: LatchSample) -> None:

@@ -64,15 +64,18 @@ class ModuleService:
         self._misses = 0
         t, t_error_ns = self._clock.stamp(timing)
         self._topic.publish(
-            t,
-            t_error_ns,
-            Quality.GOOD,
-            levels=reading.levels,
-            outputs=reading.outputs,
-            adc=reading.adc,
-            volts=tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
-            counter=reading.counter,
-            pwm=reading.pwm,
+            {
+                "t": t,
+                "t_error_ns": t_error_ns,
+                "seq": 0,
+                "quality": Quality.GOOD,
+                "levels": reading.levels,
+                "outputs": reading.outputs,
+                "adc": reading.adc,
+                "volts": tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
+                "counter": reading.counter,
+                "pwm": reading.pwm,
+            }
         )
 
     def _lost(self) -> None:

@@ -1,13 +1,13 @@
 """Samples on their way out: numbers them, keeps the last of each, hands them to the session without waiting."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from typing_extensions import override
 
 from ldcnd.messaging.codec import Encoding, encode, encoding_name, packer
 from ldcnd.messaging.keys import EVENT, Keys
-from ldcnd.messaging.session import Qos, Session
+from ldcnd.messaging.session import PublishValue, Qos, Session
 from ldcnd.model.events import CommandEvent
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import SAMPLE_MODELS, MonitorName, MonitorSample, Quality, Sample, TelemetryItem
@@ -17,6 +17,7 @@ EVENTS = frozenset({TelemetryItem.INPUTS, TelemetryItem.LATCH, TelemetryItem.FAU
 """Items that are published when they change: none may be lost on the way. The others come again soon."""
 
 
+Pack = Callable[[Mapping[str, object]], bytes]
 Values = dict[str, Any]  # of any type: they are what the fields of some model hold
 """The fields of a sample by name, in the order of its model; they are checked where they come off the wire."""
 
@@ -29,34 +30,29 @@ class Topic:
         values: what was published last; None before.
     """
 
-    __slots__ = ("_encoding", "_key", "_model", "_publisher", "_qos", "_sample", "seq", "values")
+    __slots__ = ("_model", "_pack", "_sample", "_send", "seq", "values")
 
-    def __init__(self, publisher: "Publisher", key: str, model: type[Sample], qos: Qos) -> None:
+    def __init__(self, model: type[Sample], pack: Pack, send: PublishValue) -> None:
         self.seq = 0
         self.values: Values | None = None
         self._sample: Sample | None = None
-        self._publisher = publisher
-        self._key = key
         self._model = model
-        self._encoding = encoding_name(model, publisher.encoding)
-        self._qos = qos
+        self._pack = pack
+        self._send = send
 
-    def publish(self, t: int, t_error_ns: int, quality: Quality, **fields: object) -> None:
-        """Publish a sample of `t`, UTC in ns since 1970: the fields of its own in the order of its model.
+    def publish(self, values: Values) -> None:
+        """Publish a sample: all its fields in the order of its model; its number, `seq`, is filled in.
 
         No model is built: five samples of each poll pass here.
         """
-        values = {"t": t, "t_error_ns": t_error_ns, "seq": self.seq, "quality": quality, **fields}
-        self.seq += 1
+        values["seq"] = seq = self.seq
+        self.seq = seq + 1
         self.values, self._sample = values, None
-        publisher = self._publisher
-        publisher.published += 1
-        publisher.send(self._key, publisher.pack(values), encoding=self._encoding, qos=self._qos, measured_at_ns=t)
+        self._send(self._pack(values), values["t"])
 
     def publish_sample(self, sample: Sample) -> None:
         """Publish a sample, with the next number."""
-        own = {name: value for name, value in vars(sample).items() if name not in Sample.model_fields}
-        self.publish(sample.t, sample.t_error_ns, sample.quality, **own)
+        self.publish(dict(vars(sample)))
 
     def publish_again(self, quality: Quality) -> None:
         """Publish the last sample with the quality of now; it keeps the instant at which it was true."""
@@ -109,22 +105,23 @@ class Publisher:
 
     Attributes:
         last: the newest sample of each key.
-        published: samples and events handed to the network since the start.
         session: the network.
         encoding: of payloads.
-        send: hands a payload to the network.
-        pack: encodes the fields of a sample.
     """
 
     def __init__(self, session: Session, keys: Keys, encoding: Encoding) -> None:
-        self.published = 0
         self.session = session
         self.encoding = encoding
-        self.send = session.publish
-        self.pack = packer(encoding)
+        self._events = 0
+        self._pack = packer(encoding)
         self._keys = keys
         self._topics: dict[str, Topic] = {}
         self.last = LastSamples(self._topics)
+
+    @property
+    def published(self) -> int:
+        """Samples and events handed to the network since the start."""
+        return self._events + sum(topic.seq for topic in self._topics.values())
 
     def item(self, axis: str, item: TelemetryItem) -> Topic:
         """Return the topic of one item of an axis."""
@@ -137,7 +134,7 @@ class Publisher:
 
     def publish_event(self, event: CommandEvent) -> None:
         """Publish an event; events are history, not values, so no last one is kept here."""
-        self.published += 1
+        self._events += 1
         payload, encoding = encode(event, self.encoding)
         self.session.publish(
             self._keys.telemetry(event.axis, EVENT), payload, encoding=encoding, qos=Qos.EVENT, measured_at_ns=event.t
@@ -180,5 +177,6 @@ class Publisher:
     def _topic(self, key: str, model: type[Sample], qos: Qos) -> Topic:
         topic = self._topics.get(key)
         if topic is None:
-            topic = self._topics[key] = Topic(self, key, model, qos)
+            send = self.session.publisher(key, encoding=encoding_name(model, self.encoding), qos=qos)
+            topic = self._topics[key] = Topic(model, self._pack, send)
         return topic

@@ -1,0 +1,160 @@
+"""How soon a daemon publishes, and how large its process is and stays, with 4 and with 31 axes at their default rates.
+
+Run as `python -m tests.bench.process_size --minutes 60 --log FILE`. The drives are simulated in the daemon's own process,
+which makes it larger, and one remote client takes all samples. What stays is what a least-squares line through the second
+half of the minutes says: the first five fill the flight recorder.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zenoh
+
+from tests.bench.processes import ROOT, free_endpoint
+from tests.bench.report import Row, table
+
+AXES = (4, 31)
+MOST_MB = {4: 75.0, 31: 95.0}
+MOST_GROWTH_MB_PER_HOUR = 1.0
+FIRST_SAMPLE_S = 1.0
+STARTS = 5
+PATIENCE_S = 60.0
+KEY = "ldcn/size/tele/**"
+
+
+def rig_text(axes: int) -> str:
+    """Return the configuration of a rig with one simulated line of so many drives, at the default rates."""
+    text = 'rig = "size"\n[[bus]]\nname = "line0"\nport = "sim:line0"\nbaud = 115200\nmargin_ms = 50\noverload = "skip"\n'
+    for number in range(1, axes + 1):
+        text += (
+            f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\nvelocity = 1\nacceleration = 1\n'
+        )
+    modules = ", ".join(['{ model = "ls-182ap" }'] * axes)
+    return f'{text}[[sim]]\nname = "line0"\nmodule = [{modules}]\n'
+
+
+@dataclass
+class Watched:
+    """A daemon, what a client has of it, and its size at each minute.
+
+    Attributes:
+        first_s: from the start of its process to its first sample in the client.
+        sizes_mb: resident size.
+    """
+
+    axes: int
+    running: subprocess.Popen
+    first: threading.Event
+    first_s: float = 0.0
+    received: int = 0
+    sizes_mb: list[float] = field(default_factory=list)
+
+    def look(self) -> None:
+        """Note its resident size."""
+        pages = int(Path(f"/proc/{self.running.pid}/statm").read_text().split()[1])
+        self.sizes_mb.append(pages * os.sysconf("SC_PAGE_SIZE") / 1e6)
+
+    @property
+    def growth_mb_per_hour(self) -> float:
+        """By how much it grows, in the second half of the minutes."""
+        later = self.sizes_mb[len(self.sizes_mb) // 2 :]
+        if len(later) < 2:
+            return 0.0
+        return statistics.linear_regression(range(len(later)), later).slope * 60
+
+
+@contextmanager
+def watched(axes: int, folder: Path) -> Iterator[Watched]:
+    """Run a daemon that connects to a client that waits for it."""
+    endpoint = free_endpoint()
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    path = folder / f"{axes}.toml"
+    path.write_text(rig_text(axes))
+    own = free_endpoint()
+    command = (sys.executable, "-m", "ldcnd", "run", "--log-level", "error", "--config", str(path))
+    with zenoh.open(config) as session:
+        found: list[Watched] = []
+        first = threading.Event()
+        began_s = 0.0
+
+        def take(_sample: zenoh.Sample) -> None:
+            if not first.is_set():
+                found[0].first_s = time.monotonic() - began_s
+                first.set()
+            found[0].received += 1
+
+        subscriber = session.declare_subscriber(KEY, take)
+        began_s = time.monotonic()
+        with subprocess.Popen((*command, "--listen", own, "--connect", endpoint), cwd=ROOT) as running:  # noqa: S603
+            found.append(Watched(axes, running, first))
+            try:
+                if not first.wait(PATIENCE_S):
+                    raise RuntimeError(f"no sample of {axes} axes within {PATIENCE_S:g} s")
+                yield found[0]
+            finally:
+                running.terminate()
+                del subscriber
+
+
+def first_sample_rows(folder: Path) -> list[Row]:
+    """Start a daemon of four axes a few times."""
+    taken = []
+    for _ in range(STARTS):
+        with watched(4, folder) as daemon:
+            taken.append(daemon.first_s)
+    return [
+        Row(f"first sample of a daemon with 4 axes, best of {STARTS} starts", min(taken), "s", FIRST_SAMPLE_S, at_most=True),
+        Row(f"first sample of a daemon with 4 axes, median of {STARTS}", statistics.median(taken), "s"),
+    ]
+
+
+def size_rows(folder: Path, minutes: int, log: Path | None) -> list[Row]:
+    """Watch both sizes side by side."""
+    with ExitStack() as stack:
+        daemons = [stack.enter_context(watched(axes, folder)) for axes in AXES]
+        for minute in range(minutes):
+            time.sleep(60)
+            for daemon in daemons:
+                daemon.look()
+            if log:
+                with log.open("a") as stream:
+                    sizes = " ".join(f"{daemon.sizes_mb[-1]:.2f} MB ({daemon.received})" for daemon in daemons)
+                    stream.write(f"{minute + 1} {sizes}\n")
+        rows = []
+        for daemon in daemons:
+            what = f"{daemon.axes} axes, {minutes} minutes"
+            growth = daemon.growth_mb_per_hour
+            rows += [
+                Row(f"{what}: resident size", daemon.sizes_mb[-1], "MB", MOST_MB[daemon.axes], at_most=True),
+                Row(f"{what}: growth in the second half", growth, "MB/h", MOST_GROWTH_MB_PER_HOUR, at_most=True),
+            ]
+        return rows
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=int, default=0, help="how long the sizes are watched; none if 0")
+    parser.add_argument("--log", type=Path, help="append the sizes of each minute here")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        rows = first_sample_rows(Path(name))
+        print(table(rows), flush=True)
+        if options.minutes:
+            print(table(size_rows(Path(name), options.minutes, options.log)))
+
+
+if __name__ == "__main__":
+    main()
