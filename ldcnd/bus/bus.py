@@ -368,7 +368,7 @@ class Bus(Users):
         while job and not job.may_go():
             job = self._queue.take_job(now_s)
         if job is None:
-            poller = self._queue.polls.take_due(now_s)
+            poller = self._queue.polls.take(now_s)
             if poller is None:
                 return None
             wanted_at_s = poller.due_at_s

@@ -42,7 +42,8 @@ class PollRank:
         self._choose = choose
         self._turn = 0
         self._late: list[tuple[int, float, Poller[Any]]] = []  # since which turn, and since when it is due
-        self.due: list[tuple[float, float, int, Poller[Any]]] = []  # those that were not late yet
+        # those that were not late yet: deadline, since when due, serial number: equal ones go in the order of these
+        self.due: list[tuple[float, float, int, Poller[Any]]] = []
 
     def __bool__(self) -> bool:
         return bool(self.due or self._late)
@@ -60,10 +61,6 @@ class PollRank:
     def is_late(self, now_s: float) -> bool:
         """Tell whether the deadline of one has passed."""
         return bool(self._late) or self.deadline_s <= now_s
-
-    def add(self, poller: Poller[Any], at_s: float, serial: int) -> None:
-        """Take a poll that has become due at `at_s`; equal ones go in the order of their serial numbers."""
-        heapq.heappush(self.due, (poller.deadline_at_s, at_s, serial, poller))
 
     def remove(self, poller: Poller[Any]) -> None:
         """Remove a poll; unknown ones are ignored."""
@@ -145,7 +142,7 @@ class PollQueue:
             self.unschedule(poller)
         if poller.priority is not NORMAL:
             self._only = None
-        serial = self._turns[poller] = next(self._serial)
+        self._turns[poller] = serial = next(self._serial)
         heapq.heappush(self._later, (at_s, serial, poller))
 
     def unschedule(self, poller: Poller[Any]) -> None:
@@ -172,7 +169,8 @@ class PollQueue:
         """Tell whether there is a poll to run."""
         if self._ahead:
             return True
-        self._rank_due(now_s)
+        if self._later and self._later[0][0] <= now_s:
+            self._rank_due(now_s)
         if self._due:
             return True
         self._behind = False
@@ -182,20 +180,18 @@ class PollQueue:
         """Choose among the polls due at about `at_s`; None when none is due, or one is chosen already."""
         if self._ahead or not self.is_due(at_s):
             return None
-        self._ahead = self._take(at_s)
-        return self._ahead
+        self._ahead = ahead = self._take(at_s)
+        return ahead
 
-    def take_due(self, now_s: float) -> Poller[Any] | None:
+    def take(self, now_s: float) -> Poller[Any] | None:
         """Remove and return the poller whose turn it is, or None when none is due."""
-        return self.take(now_s) if self._ahead or self.is_due(now_s) else None
-
-    def take(self, now_s: float) -> Poller[Any]:
-        """Remove and return the poller whose turn it is; one is due."""
         ahead = self._ahead
-        if ahead and not self._is_overtaken(ahead, now_s):
-            self._ahead = None
-            return ahead
-        return self._take(now_s)
+        if ahead is None:
+            return self._take(now_s) if self.is_due(now_s) else None
+        if self._is_overtaken(ahead, now_s):
+            return self._take(now_s)
+        self._ahead = None
+        return ahead
 
     def _is_overtaken(self, ahead: Poller[Any], now_s: float) -> bool:
         if self._later and self._later[0][0] <= now_s:
@@ -207,12 +203,14 @@ class PollQueue:
         return any(rank.deadline_s < ahead.deadline_at_s for rank in self._ranks)
 
     def _rank_due(self, now_s: float) -> None:
-        while self._later and self._later[0][0] <= now_s:
-            at_s, serial, poller = heapq.heappop(self._later)
-            if self._turns.get(poller) == serial:
-                del self._turns[poller]
+        later, turns = self._later, self._turns
+        while later and later[0][0] <= now_s:
+            at_s, serial, poller = heapq.heappop(later)
+            if turns.get(poller) == serial:
+                del turns[poller]
                 self._due.add(poller)
-                self._ranks[poller.priority].add(poller, at_s, serial)
+                rank = self._ranks[poller.priority]
+                heapq.heappush(rank.due, (poller.deadline_at_s, at_s, serial, poller))
 
     def _take(self, now_s: float) -> Poller[Any]:
         rank = self._next_rank(now_s) if self._only is None else self._only

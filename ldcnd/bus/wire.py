@@ -33,9 +33,11 @@ class LatencyHistogram:
 
     def add(self, duration_s: float) -> None:
         """Count one duration, in seconds, not negative."""
-        self.counts[min(BUCKETS - 1, int(duration_s * 15625).bit_length())] += 1
+        bucket = int(duration_s * 15625).bit_length()
+        self.counts[bucket if bucket < BUCKETS else -1] += 1
         self.total_s += duration_s
-        self.longest_s = max(self.longest_s, duration_s)
+        if duration_s > self.longest_s:
+            self.longest_s = duration_s
 
     def quantile_s(self, fraction: float) -> float:
         """Return an upper bound for the given quantile (0 to 1) in seconds; 0 when nothing was counted."""

@@ -69,9 +69,9 @@ def _rehearse(
     now_s = 0.0
     learning = LEARNING * len(drives)
     for number in range(learning + max(FEWEST, COUNTED * len(drives))):
-        while not queue.is_due(now_s):
+        while (due := queue.take(now_s)) is None:
             now_s = queue.next_due_s()
-        poller = pollers[queue.take(now_s).node]
+        poller = pollers[due.node]
         poller.next_exchange(now_s)
         queue.schedule(poller, poller.due_at_s)
         timing = poller.answer(now_s)

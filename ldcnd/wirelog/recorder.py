@@ -103,25 +103,32 @@ class WireLog:
         kept_s: records older than this are dropped, in seconds.
         kept_bytes: the oldest are dropped sooner when all take more memory than this.
 
-    Attributes:
-        added: how many records there were in all, those dropped since included.
     """
 
     def __init__(self, kept_s: float = KEPT_S, kept_bytes: int = KEPT_BYTES) -> None:
-        self.added = 0
+        self._dropped = 0
         self._kept_s = kept_s
         self._room_bytes = kept_bytes
         self._ring: deque[WireEntry] = deque()
 
     def add(self, at_s: float, event: WireEvent, data: bytes = b"", note: str = "") -> None:
         """Append one event and drop what is too old or too much; the new one always stays."""
-        self.added += 1
         ring = self._ring
         ring.append((at_s, event, data, note))
         self._room_bytes -= RECORD_BYTES + len(data)
-        too_old_s = at_s - self._kept_s
+        if self._room_bytes < 0 or ring[0][0] < at_s - self._kept_s:
+            self._drop(at_s - self._kept_s)
+
+    def _drop(self, too_old_s: float) -> None:
+        ring = self._ring
         while ring[0][0] < too_old_s or (self._room_bytes < 0 and len(ring) > 1):
             self._room_bytes += RECORD_BYTES + len(ring.popleft()[2])
+            self._dropped += 1
+
+    @property
+    def added(self) -> int:
+        """How many records there were in all, those dropped since included."""
+        return self._dropped + len(self._ring)
 
     def records(self) -> list[WireRecord]:
         """Return the records, oldest first."""

@@ -28,7 +28,7 @@ MOST_MB = {4: 75.0, 31: 95.0}
 MOST_GROWTH_MB_PER_HOUR = 1.0
 FIRST_SAMPLE_S = 1.0
 STARTS = 5
-PATIENCE_S = 60.0
+PATIENCE_S = 600.0
 KEY = "ldcn/size/tele/**"
 
 
@@ -146,14 +146,12 @@ def size_rows(folder: Path, minutes: int, log: Path | None) -> list[Row]:
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=int, default=0, help="how long the sizes are watched; none if 0")
+    parser.add_argument("--minutes", type=int, default=0, help="watch the sizes for so long; otherwise the starts")
     parser.add_argument("--log", type=Path, help="append the sizes of each minute here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        rows = first_sample_rows(Path(name))
-        print(table(rows), flush=True)
-        if options.minutes:
-            print(table(size_rows(Path(name), options.minutes, options.log)))
+        rows = size_rows(Path(name), options.minutes, options.log) if options.minutes else first_sample_rows(Path(name))
+        print(table(rows))
 
 
 if __name__ == "__main__":

@@ -10,4 +10,4 @@ JobT = TypeVar("JobT", bound=Queueable)
 
 def take(queue: ExchangeQueue[JobT], now_s: float) -> JobT | Poller[Any] | None:
     """Remove and return what goes on the wire now, or None when nothing is due."""
-    return queue.take_job(now_s) or queue.polls.take_due(now_s)
+    return queue.take_job(now_s) or queue.polls.take(now_s)
