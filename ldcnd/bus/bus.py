@@ -7,12 +7,12 @@ from typing_extensions import override
 
 from ldcnd.bus.line import Line, Phase, Users
 from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import ExchangeQueue, Lane, PhaseOrder
+from ldcnd.bus.queue import POLL, ExchangeQueue, Lane, PhaseOrder
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.transaction import Job, PollTransaction, StopProbe, Transaction
+from ldcnd.bus.transaction import Job, StopProbe, Transaction
 from ldcnd.bus.wire import BusStatistics
-from ldcnd.errors import BusDown, LdcndError, NotSupported, TransportLost
+from ldcnd.errors import BadReply, BusDown, BusError, LdcndError, NotSupported, PacketRejected, TransportLost
 from ldcnd.exchange import Exchange, Timing, condition_in_force
 from ldcnd.log import get_logger
 from ldcnd.transport.adapter import LineErrors
@@ -75,6 +75,42 @@ class MuteNodes:
         """Clear all misses: the line was opened."""
         self.misses.clear()
         self._backed_off.clear()
+
+
+class PollTransaction(Transaction):
+    """A poll; it is never sent again, because the next poll comes soon enough."""
+
+    __slots__ = ("order", "poller")
+
+    def __init__(
+        self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float, order: PhaseOrder | None = None
+    ) -> None:
+        self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
+        self.then_baud = self.at_baud = None
+        self.slow_to_deliver = poller.slow_to_deliver
+        self.poller = poller
+        self.order = order
+
+    @override
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        if self.order and reply:
+            self.order.observe(self.exchange.node, timing)
+        try:
+            value = self.exchange.decode(reply)
+        except BadReply as error:
+            self.poller.missed(error)
+            return
+        self.poller.deliver(value, timing)
+
+    @override
+    def lost(self, error: BusError) -> bool:
+        self.poller.missed(error)
+        return False
+
+    @override
+    def rejected(self) -> bool:
+        self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
+        return False
 
 
 ReplyT = TypeVar("ReplyT")

@@ -18,7 +18,7 @@ from ldcnd.bus.queue import POLL
 from ldcnd.bus.resync import Probe, Quarantine, Resync
 from ldcnd.bus.settings import LINGER_S, BusSettings
 from ldcnd.bus.transaction import AT_ONCE, LANES, Transaction
-from ldcnd.bus.wire import NEVER_S, BusStatistics, Pieces, Watchdog, Whole, Wire
+from ldcnd.bus.wire import CLOCK_TOLERANCE, NEVER_S, BusStatistics, Pieces, Watchdog, Whole, Wire
 from ldcnd.errors import BadReply, BusError, ReplyTimeout, TransportLost
 from ldcnd.exchange import ReplyVerdict, Timing
 from ldcnd.transport.transport import Receiver, Transport
@@ -256,32 +256,29 @@ class Line(Receiver):
 
     def _complete_plain(self, transaction: Transaction, reply: bytes, arrived: bytes, now_s: float) -> None:
         """Write the next request before anything else: until then the wire is idle, afterwards there is time."""
-        sent_at_s, failure = self._sent_at_s, ""
-        following = self._users.take(now_s)
-        if following and not following.at_baud:
+        sent_at_s, failure, users = self._sent_at_s, "", self._users
+        following = users.take(now_s)
+        if following is not None and not following.at_baud:
             failure = self._put(following, self._loop.time())
-            if transaction.slow_to_deliver:
+            if transaction.slow_to_deliver and self._transport.pushes:
                 self._transport.push()
         else:
             self._transaction, self.phase = None, Phase.IDLE
         self._statistics.bytes_in += len(arrived)
         self._log.add(now_s, WireEvent.RECEIVED, arrived)
         timing = self.wire.replied(transaction, reply, sent_at_s, now_s)
-        self._users.answered(transaction)
+        users.answered(transaction)
         if following is None:
             self._next(AT_ONCE)
         elif following.at_baud:
             self._send(following, now_s, AT_ONCE[following.lane])
         else:
-            self._attend(following, AT_ONCE[following.lane], failure, early=int(transaction.slow_to_deliver))
+            self._attend(following, AT_ONCE[following.lane], failure, early=transaction.slow_to_deliver)
         transaction.completed(reply, timing)
-        if (
-            self._transaction and self._missing and transaction.lane is POLL
-        ):  # callers that wait for a reply get it first
+        if self._missing and transaction.lane is POLL and (following := self._transaction):
+            # callers that wait for a reply got it first
             byte_s = self.wire.byte_s
-            self._users.prepare_next(
-                self._transaction, self._sent_at_s + len(self._transaction.exchange.request) * byte_s, byte_s
-            )
+            users.prepare_next(following, self._sent_at_s + len(following.exchange.request) * byte_s, byte_s)
 
     def _complete(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
@@ -426,30 +423,32 @@ class Line(Receiver):
             return error.message
         return ""
 
-    def _attend(self, transaction: Transaction, remark: str, failure: str, *, early: int = 0) -> None:
+    def _attend(self, transaction: Transaction, remark: str, failure: str, *, early: bool = False) -> None:
         """Note a request that has just been written, and prepare for its reply.
 
-        When processing takes long, the line is woken `early` bytes before the end, so that caches are warm.
+        When processing takes long, the line is woken one byte `early`, so that caches are warm.
         """
-        exchange, settings, wire, now_s = transaction.exchange, self._settings, self.wire, self._sent_at_s
-        request_s, reply_s = len(exchange.request) * wire.byte_s, exchange.reply_bytes * wire.byte_s
-        self._whole_from_s = self._pieces.begin(
-            now_s if settings.paced else -NEVER_S, request_s, wire.byte_s, exchange.reply_bytes
-        )
+        exchange, settings, wire, statistics = transaction.exchange, self._settings, self.wire, self._statistics
+        request, expected, byte_s, sent_at_s = exchange.request, exchange.reply_bytes, wire.byte_s, self._sent_at_s
+        request_s = len(request) * byte_s
+        earliest_s = sent_at_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
+        self._pieces.begin(earliest_s, CLOCK_TOLERANCE * byte_s)
+        self._whole_from_s = earliest_s + CLOCK_TOLERANCE * byte_s * expected
         # a whole intact reply is all that it takes to go on to the next transaction
         goes_on = exchange.repeatable and not (
             exchange.total_bytes or transaction.then_baud or transaction.at_baud or transaction.proves
         )
-        plain = exchange.reply_bytes and goes_on and self._quarantine.in_step and not settings.echo
-        self._missing = exchange.reply_bytes if plain else NOT_PLAIN
-        self._transport.expect(max(ANY, self._missing - early))
-        answer_s = reply_s + settings.margin_s + self._transport.lag_s if exchange.reply_bytes else 0.0
-        self._watchdog.set(now_s + request_s + exchange.response_s + answer_s)
-        self._statistics.exchanges += 1
-        self._statistics.bytes_out += len(exchange.request)
-        self._log.add(now_s, WireEvent.SENT, exchange.request, remark)
+        self._missing = missing = expected if goes_on and self._quarantine.in_step and not settings.echo else NOT_PLAIN
+        self._transport.expect(missing - early if missing > early else ANY)
+        over_s = sent_at_s + request_s + exchange.response_s
+        if expected:
+            over_s += expected * byte_s + settings.margin_s + self._transport.lag_s
+        self._watchdog.set(over_s)
+        statistics.exchanges += 1
+        statistics.bytes_out += len(request)
+        self._log.add(sent_at_s, WireEvent.SENT, request, remark)
         if wire.echo is not None:
-            wire.echo.sent(exchange.request)
+            wire.echo.sent(request)
         self._users.sent(transaction)
         if failure:
             self.transport_lost(failure)

@@ -6,8 +6,7 @@ from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import POLL, Lane, PhaseOrder
+from ldcnd.bus.queue import Lane
 from ldcnd.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.exchange import Condition, Exchange, Timing
 from ldcnd.wirelog.recorder import AT_ONCE_REMARK
@@ -53,42 +52,6 @@ class Transaction(ABC):
     @abstractmethod
     def rejected(self) -> bool:
         """Note that the node did not execute the packet; return whether to send it again."""
-
-
-class PollTransaction(Transaction):
-    """A poll; it is never sent again, because the next poll comes soon enough."""
-
-    __slots__ = ("order", "poller")
-
-    def __init__(
-        self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float, order: PhaseOrder | None = None
-    ) -> None:
-        self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
-        self.then_baud = self.at_baud = None
-        self.slow_to_deliver = poller.slow_to_deliver
-        self.poller = poller
-        self.order = order
-
-    @override
-    def completed(self, reply: bytes, timing: Timing) -> None:
-        if self.order and reply:
-            self.order.observe(self.exchange.node, timing)
-        try:
-            value = self.exchange.decode(reply)
-        except BadReply as error:
-            self.poller.missed(error)
-            return
-        self.poller.deliver(value, timing)
-
-    @override
-    def lost(self, error: BusError) -> bool:
-        self.poller.missed(error)
-        return False
-
-    @override
-    def rejected(self) -> bool:
-        self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
-        return False
 
 
 class Job(Transaction):

@@ -36,8 +36,7 @@ class LatencyHistogram:
         bucket = int(duration_s * 15625).bit_length()
         self.counts[bucket if bucket < BUCKETS else -1] += 1
         self.total_s += duration_s
-        if duration_s > self.longest_s:
-            self.longest_s = duration_s
+        self.longest_s = max(self.longest_s, duration_s)
 
     def quantile_s(self, fraction: float) -> float:
         """Return an upper bound for the given quantile (0 to 1) in seconds; 0 when nothing was counted."""
@@ -145,18 +144,15 @@ class Pieces:
         self.early = False
         self._over_s = self._byte_s = 0.0
 
-    def begin(self, sent_at_s: float, request_s: float, byte_s: float, reply_bytes: int) -> float:
-        """Discard held bytes; wait for the reply to a request; return the earliest instant of the whole reply.
+    def begin(self, over_s: float, byte_s: float) -> None:
+        """Discard held bytes; wait for the reply to a request.
 
         Args:
-            sent_at_s: when the request was written; minus infinity on a line where nothing can come too early.
-            request_s: how long it takes on the wire.
-            byte_s: how long each byte of the reply takes.
-            reply_bytes: length of the reply.
+            over_s: the earliest end of the request; minus infinity where nothing can be too early.
+            byte_s: how long each byte of the reply takes at least.
         """
         self.held, self.early = b"", False
-        self._over_s, self._byte_s = sent_at_s + CLOCK_TOLERANCE * request_s, CLOCK_TOLERANCE * byte_s
-        return self._over_s + reply_bytes * self._byte_s
+        self._over_s, self._byte_s = over_s, byte_s
 
     def earliest_s(self, count: int) -> float:
         """Return the earliest instant at which so many bytes can have come behind the request."""
@@ -304,13 +300,13 @@ class Wire:
 
     def replied(self, transaction: Transaction, reply: bytes, sent_at_s: float, now_s: float) -> Timing:
         """Count an intact reply; return when it was true."""
-        statistics = self._statistics
-        request_s, reply_s = len(transaction.exchange.request) * self.byte_s, len(reply) * self.byte_s
-        sent_s = sent_at_s + request_s
+        statistics, byte_s = self._statistics, self.byte_s
+        request_s, reply_s = len(transaction.exchange.request) * byte_s, len(reply) * byte_s
+        over_s, begun_s, late_s = sent_at_s + request_s, now_s - reply_s, now_s - transaction.wanted_at_s
         statistics.replies += 1
         statistics.wire_busy_s += request_s + reply_s
-        statistics.latency[transaction.lane].add(max(0.0, now_s - transaction.wanted_at_s))
-        return Timing(sent_at_s, sent_s, max(now_s - reply_s, sent_s), now_s)
+        statistics.latency[transaction.lane].add(max(0.0, late_s))
+        return Timing(sent_at_s, over_s, max(over_s, begun_s), now_s)
 
     def silent(self, transaction: Transaction, sent_at_s: float, now_s: float) -> Timing:
         """Count a request that draws no reply; return when it took effect."""

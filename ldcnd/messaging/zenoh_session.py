@@ -400,9 +400,7 @@ class ZenohSession(Session):
 
         def declare() -> None:
             try:
-                outlet.publisher = self._session.declare_publisher(
-                    key, encoding=outlet.encoding, **TRAVEL[outlet.qos]
-                )
+                outlet.publisher = self._session.declare_publisher(key, encoding=outlet.encoding, **TRAVEL[outlet.qos])
             except zenoh.ZError as error:
                 log.debug("publisher not declared", key=key, reason=str(error))
 

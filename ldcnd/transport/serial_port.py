@@ -184,6 +184,7 @@ class SerialPort(Transport):
         self._loop = asyncio.get_running_loop()
         major = os.major(os.fstat(self._descriptor).st_rdev)
         self._is_pseudo, self._is_usb = major in PSEUDO_TERMINALS, major in USB_TERMINALS
+        self.pushes = self._is_pseudo
         self._least_bytes = 1
         self._settings: dict[int, bytes] = {}  # the driver's settings by minimum number of bytes, at this rate
         self._set_least_bytes()
@@ -223,7 +224,8 @@ class SerialPort(Transport):
 
     @override
     def write(self, data: bytes) -> None:
-        self._require_usable()
+        if self._incoming.reason:
+            raise TransportLost(self._incoming.reason)
         try:
             written = os.write(self._descriptor, data)
         except OSError as error:
@@ -233,8 +235,7 @@ class SerialPort(Transport):
 
     def push(self) -> None:
         """See `Transport`: a worker of the kernel carries them through a pseudo-terminal, and needs a processor."""
-        if self._is_pseudo:
-            os.sched_yield()
+        os.sched_yield()
 
     def expect(self, reply_bytes: int) -> None:
         """See `Transport`; a USB adapter delivers in large pieces anyway and would need a transfer for the setting."""

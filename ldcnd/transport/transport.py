@@ -26,10 +26,12 @@ class Transport(ABC):
     Attributes:
         fixed_baud: the rate cannot be changed from here (a TCP serial server).
         lag_s: how much later than the line has it the next reply may come out of this pipe; known delays only.
+        pushes: `push` does something.
     """
 
     fixed_baud = False
     lag_s = 0.0
+    pushes = False
 
     def offers(self, baud: int) -> bool:  # noqa: ARG002 - the general answer
         """Tell whether the pipe can be set to a rate, as far as is known before it is tried."""

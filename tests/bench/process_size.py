@@ -34,11 +34,11 @@ KEY = "ldcn/size/tele/**"
 
 def rig_text(axes: int) -> str:
     """Return the configuration of a rig with one simulated line of so many drives, at the default rates."""
-    text = 'rig = "size"\n[[bus]]\nname = "line0"\nport = "sim:line0"\nbaud = 115200\nmargin_ms = 50\noverload = "skip"\n'
+    text = (
+        'rig = "size"\n[[bus]]\nname = "line0"\nport = "sim:line0"\nbaud = 115200\nmargin_ms = 50\noverload = "skip"\n'
+    )
     for number in range(1, axes + 1):
-        text += (
-            f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\nvelocity = 1\nacceleration = 1\n'
-        )
+        text += f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\nvelocity = 1\nacceleration = 1\n'
     modules = ", ".join(['{ model = "ls-182ap" }'] * axes)
     return f'{text}[[sim]]\nname = "line0"\nmodule = [{modules}]\n'
 
@@ -115,7 +115,13 @@ def first_sample_rows(folder: Path) -> list[Row]:
         with watched(4, folder) as daemon:
             taken.append(daemon.first_s)
     return [
-        Row(f"first sample of a daemon with 4 axes, best of {STARTS} starts", min(taken), "s", FIRST_SAMPLE_S, at_most=True),
+        Row(
+            f"first sample of a daemon with 4 axes, best of {STARTS} starts",
+            min(taken),
+            "s",
+            FIRST_SAMPLE_S,
+            at_most=True,
+        ),
         Row(f"first sample of a daemon with 4 axes, median of {STARTS}", statistics.median(taken), "s"),
     ]
 

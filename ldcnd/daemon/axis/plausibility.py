@@ -6,7 +6,6 @@ velocities do not lead, a velocity that the axis cannot have by now, any change 
 exchange; a false one never leaves this module.
 """
 
-from dataclasses import dataclass
 from enum import Enum
 
 from ldcnd.config.axis import AxisConfig
@@ -39,12 +38,8 @@ class Verdict(Enum):
     """It was requested several times, and each reading contradicts the others."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """A reading, and when it was true."""
-
-    reading: AxisReading
-    timing: Timing
+_Seen = tuple[AxisReading, Timing]
+"""A reading, and when it was true."""
 
 
 class PlausibilityGate:
@@ -98,15 +93,15 @@ class PlausibilityGate:
             if self._doubtful:
                 self.withheld += self._rounds
             self._sure = True
-            self._known, self._doubtful, self._rounds = _Seen(reading, timing), None, 0
+            self._known, self._doubtful, self._rounds = (reading, timing), None, 0
             return Verdict.BELIEVED
         if self._doubtful and self._follows(self._doubtful, reading, timing, None):
             self.jumped = self._sure and self._is_jump(known, reading, timing)
             self.zeroed = self._sure and self._is_zeroed(known, reading, timing)
             self._sure = True
-            self.confirmed = self._doubtful.reading, self._doubtful.timing
+            self.confirmed = self._doubtful
             return self._believe(reading, timing)
-        self._doubtful = _Seen(reading, timing)
+        self._doubtful = reading, timing
         self._rounds += 1
         self.foreign = self._is_jump(known, reading, timing)
         if self._rounds < ROUNDS:
@@ -116,7 +111,7 @@ class PlausibilityGate:
         return Verdict.LOST
 
     def _believe(self, reading: AxisReading, timing: Timing) -> Verdict:
-        self._known = _Seen(reading, timing)
+        self._known = reading, timing
         self._doubtful, self._rounds = None, 0
         return Verdict.BELIEVED
 
@@ -129,7 +124,7 @@ class PlausibilityGate:
             timing: when it was true.
             within_counts: how far apart they may be; worked out from both velocities when missing.
         """
-        before = seen.reading
+        before, seen_at = seen
         if (
             reading.enabled is not before.enabled
             or reading.profile_done is not before.profile_done
@@ -139,7 +134,7 @@ class PlausibilityGate:
             or reading.faults != before.faults
         ):
             return False
-        passed_s = timing.true_until_s - seen.timing.true_from_s
+        passed_s = timing.true_until_s - seen_at.true_from_s
         velocity, resolution = reading.velocity_counts_per_s, reading.velocity_resolution_counts_per_s
         changed = abs(velocity - before.velocity_counts_per_s)
         if changed > self._acceleration * passed_s + 2 * resolution:
@@ -150,21 +145,23 @@ class PlausibilityGate:
 
     def _led_there(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
         """Tell whether the velocities lead from the one position to the other."""
-        passed_s = timing.true_until_s - seen.timing.true_from_s
-        velocities = reading.velocity_counts_per_s + seen.reading.velocity_counts_per_s
+        before, seen_at = seen
+        passed_s = timing.true_until_s - seen_at.true_from_s
+        velocities = reading.velocity_counts_per_s + before.velocity_counts_per_s
         resolution = reading.velocity_resolution_counts_per_s
         reach = NOISE_COUNTS + 2 * resolution * passed_s + self._acceleration * passed_s * passed_s / 4
-        return abs(_way(seen.reading, reading) - velocities / 2 * passed_s) <= reach
+        return abs(_way(before, reading) - velocities / 2 * passed_s) <= reach
 
     def _is_zeroed(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
         """Tell whether the counter was reset to 0: a shaft that happens to come to rest at its 0 shows a velocity."""
-        return reading.begun_anew and not seen.reading.begun_anew and not self._led_there(seen, reading, timing)
+        return reading.begun_anew and not seen[0].begun_anew and not self._led_there(seen, reading, timing)
 
     def _is_jump(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
         """Tell whether an axis cannot have come from the one reading to the other by moving."""
         speeds = JUMP_SPEEDS if reading.enabled else OPEN_LOOP_SPEEDS
-        reach = speeds * self._speed * (timing.true_until_s - seen.timing.true_from_s) + self._following + NOISE_COUNTS
-        return abs(_way(seen.reading, reading)) > reach
+        before, seen_at = seen
+        reach = speeds * self._speed * (timing.true_until_s - seen_at.true_from_s) + self._following + NOISE_COUNTS
+        return abs(_way(before, reading)) > reach
 
 
 def agree(one: AxisReading, other: AxisReading) -> bool:

@@ -1,7 +1,6 @@
 """Poll rates of the items of one axis; due items are merged into one exchange."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 from typing_extensions import override
 
@@ -23,13 +22,8 @@ LOOK_ITEMS = frozenset({TelemetryItem.POSITION})
 """Items of a reading at a given instant between two polls."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Turn:
-    """An exchange, and when the poll and each of the slower items are due next."""
-
-    exchange: Exchange[AxisReading]
-    due_at_s: float
-    slower_due_s: dict[TelemetryItem, float]
+_Turn = tuple[Exchange[AxisReading], float, dict[TelemetryItem, float]]
+"""An exchange, and when the poll and each of the slower items are due next."""
 
 
 class AxisPoller(Poller[AxisReading]):
@@ -98,20 +92,19 @@ class AxisPoller(Poller[AxisReading]):
             exchange, self._again = self._again, None
             self._plan()
             return exchange
-        looks = self._look_s <= now_s
-        if looks:
+        if self._look_s <= now_s:
             self._look_s = NEVER_S
-        if looks and now_s < self._grid_s:
-            self._plan()
-            return self._driver.reading(LOOK_ITEMS)
-        if turn is None or turn.due_at_s <= now_s:
+            if now_s < self._grid_s:
+                self._plan()
+                return self._driver.reading(LOOK_ITEMS)
+        if turn is None or turn[1] <= now_s:
             turn = self._turn_at(now_s)
-        self._grid_s = self.due_at_s = turn.due_at_s
-        self._slower_due_s = turn.slower_due_s
-        self.deadline_at_s = turn.due_at_s + self._period_s
-        if self._look_s < self.due_at_s:
+        exchange, due_at_s, self._slower_due_s = turn
+        self._grid_s = self.due_at_s = due_at_s
+        self.deadline_at_s = due_at_s + self._period_s
+        if self._look_s < due_at_s:
             self._plan()
-        return turn.exchange
+        return exchange
 
     def _turn_at(self, now_s: float) -> _Turn:
         asked, slower_due_s = self._fastest, self._slower_due_s
@@ -122,14 +115,14 @@ class AxisPoller(Poller[AxisReading]):
                 item: next_on_grid(slower_due_s[item], self._slower_s[item], now_s) for item in due
             }
             asked = asked.union(due)
-        behind = max(0, int((now_s - self._grid_s) / self._period_s))
-        due_at_s = self._grid_s + (behind + 1) * self._period_s
-        return _Turn(self._driver.reading(asked), due_at_s, slower_due_s)
+        grid_s, period_s = self._grid_s, self._period_s
+        behind = int((now_s - grid_s) / period_s) if now_s > grid_s else 0
+        return self._driver.reading(asked), grid_s + (behind + 1) * period_s, slower_due_s
 
     def deliver(self, reply: AxisReading, timing: Timing) -> None:
         """Deliver a reading, and repeat the poll at once if the receiver requires it."""
         again = self._deliver(reply, reply.asked, timing)
-        if not again and self._again is None:
+        if not (again or self._again):
             return
         if again:
             self._again = self._driver.reading(reply.asked)

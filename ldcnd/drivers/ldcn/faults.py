@@ -291,6 +291,21 @@ _SERVO_ON, _MOTION_LOCKED, _INDEX = map(int, (AuxFlag.SERVO_ON, AuxFlag.MOTION_L
 """As numbers: arithmetic with flags costs ten times as much, and every reply needs it."""
 
 
+Levels = tuple[bool, bool, bool, bool, bool | None, bool | None, bool | None, bool | None, bool | None]
+"""Armed for homing, motion locked, servo on, profile done, reverse limit, forward limit, index, stop input, Pic_ae."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What the flags of a status packet say: worked out again only when they, or what is known, have changed."""
+
+    faults: tuple[driver.Fault, ...]
+    levels: Levels
+
+
+NOTHING_SHOWN = _Shown((), (False, False, False, False, None, None, None, None, None))
+
+
 class DriveState:
     """The record of one drive: what was sent to it, and what it has shown.
 
@@ -313,7 +328,8 @@ class DriveState:
         self._name = name
         self._profile = profile
         self._cycle_s = profile.servo_cycle_s
-        self._diagnosed: tuple[object, tuple[driver.Fault, ...]] = ((), ())  # the latest question, and the answer to it
+        self._question: object = ()  # what flags and faults were worked out from last
+        self._shown: _Shown = NOTHING_SHOWN
         self.restarted()
 
     # -- what was commanded ------------------------------------------------------------------------------------------
@@ -374,24 +390,17 @@ class DriveState:
         """
         if status.position is None or status.velocity is None or status.aux is None:
             raise BadReply(f"axis {self._name}: the status packet lacks position, velocity or aux")
-        flags, aux = int(status.flags), int(status.aux)
+        faults = self.faults(status)
+        homing, locked, enabled, done, reverse, forward, index, stop_input, pic_ae = self._shown.levels
         counter = status.position
         if self.setting_back and abs(counter) < abs(self.setting_back) / 2:
             self.offset_counts += self.setting_back
             self.setting_back = 0
         self.counts = counts = counter + self.offset_counts
-        if not flags & _HOMING:
+        if not homing:
             self.homing_armed = False
             self.guard_hit = bool(self.guard)
-        self.motion_locked = self._profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED)
-        faults = self.faults(status)
-        shows_limits = self._shows_limits(flags)
-        logosol, known = self._profile.pic_ae_diagnostics, self.known
-        powered, closed = flags & _POWER_ON, aux & _SERVO_ON
-        stop_input = None
-        if logosol and (closed or (known.pic_ae is False and powered)):
-            stop_input = not (closed or flags & _LIMIT1)
-        reverse, forward = (_LIMIT2, _LIMIT1) if self._profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
+        self.motion_locked = locked
         tick_s = self._cycle_s * (self.servo_divisor if self._profile.divisor_slows_profile else 1)
         return AxisReading(
             position_counts=counts,
@@ -399,29 +408,50 @@ class DriveState:
             velocity_counts_per_s=status.velocity / tick_s,
             velocity_resolution_counts_per_s=1.0 / tick_s,
             adc_counts=status.adc,
-            enabled=bool(aux & _SERVO_ON),
-            profile_done=bool(flags & _MOVE_DONE),
-            homing=bool(flags & _HOMING),
+            enabled=enabled,
+            profile_done=done,
+            homing=homing,
             faults=faults,
-            reverse_limit=bool(flags & reverse) if shows_limits else None,
-            forward_limit=bool(flags & forward) if shows_limits else None,
-            index=None if logosol and not powered else bool(aux & _INDEX) is self._profile.live_aux,
+            reverse_limit=reverse,
+            forward_limit=forward,
+            index=index,
             stop_input=stop_input,
-            amplifier_enable=known.pic_ae,
+            amplifier_enable=pic_ae,
             asked=asked,
             cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
             begun_anew=-BEGUN_COUNTS <= counter <= BEGUN_COUNTS,
-            altered=FOREIGN_CAPTURE if flags & _HOMING and not self.homing_armed else "",
+            altered=FOREIGN_CAPTURE if homing and not self.homing_armed else "",
         )
 
     def faults(self, status: Status) -> tuple[driver.Fault, ...]:
         """Return the drive's complaints; recomputed only when something that they depend on has changed."""
         adc = status.adc if self.known.absolute is not False else None
-        question = (status.flags, status.aux, adc, self.known, self.loop_may_open)
-        if question != self._diagnosed[0]:
-            answer = self._diagnose(status)
-            self._diagnosed = ((*question[:3], self.known, self.loop_may_open), answer)
-        return self._diagnosed[1]
+        if (status.flags, status.aux, adc, self.known, self.loop_may_open) != self._question:
+            faults = self._diagnose(status)
+            self._shown = _Shown(faults, self._levels(int(status.flags), int(status.aux or 0)))
+            self._question = (status.flags, status.aux, adc, self.known, self.loop_may_open)
+        return self._shown.faults
+
+    def _levels(self, flags: int, aux: int) -> "Levels":
+        """Return what the flags mean now that the faults are known."""
+        profile, known = self._profile, self.known
+        logosol, powered, closed = profile.pic_ae_diagnostics, flags & _POWER_ON, aux & _SERVO_ON
+        shows_limits = not logosol or (bool(known.pic_ae) and bool(powered))
+        stop_input = None
+        if logosol and (closed or (known.pic_ae is False and powered)):
+            stop_input = not (closed or flags & _LIMIT1)
+        reverse, forward = (_LIMIT2, _LIMIT1) if profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
+        return (
+            bool(flags & _HOMING),
+            profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED),
+            bool(closed),
+            bool(flags & _MOVE_DONE),
+            bool(flags & reverse) if shows_limits else None,
+            bool(flags & forward) if shows_limits else None,
+            None if logosol and not powered else bool(aux & _INDEX) is profile.live_aux,
+            stop_input,
+            known.pic_ae,
+        )
 
     def _diagnose(self, status: Status) -> tuple[driver.Fault, ...]:
         self._learn(status)
@@ -448,8 +478,3 @@ class DriveState:
             self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)
         elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
             self.known = replace(self.known, nothing_latched=True)
-
-    def _shows_limits(self, flags: int) -> bool:
-        if not self._profile.pic_ae_diagnostics:
-            return True
-        return bool(self.known.pic_ae) and bool(flags & _POWER_ON)

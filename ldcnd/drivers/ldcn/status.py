@@ -9,6 +9,9 @@ and 5.3.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntFlag
+from operator import itemgetter
+from struct import Struct
+from typing import Any
 
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.errors import BadReply
@@ -159,53 +162,51 @@ def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
 
 def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Status]:
     """Return `decode_status` for many packets of one kind."""
-    mask, expected = int(items), status_bytes(profile, items)
+    mask, expected, sign = int(items), status_bytes(profile, items), profile.velocity_sign
+    layout, pick = _layout(profile, mask)
+    unpack = layout.unpack
 
     def decode(data: bytes) -> Status:
         if len(data) != expected:
             raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
-        if sum(data[:-1]) & 0xFF != data[-1]:
+        if (sum(data) - data[-1]) & 0xFF != data[-1]:
             raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
-        return _decode_items(profile, mask, data)
+        flags, position, adc, velocity, aux, home, device_id, version, position_error, bit7 = pick(
+            (None, *unpack(data))
+        )
+        return Status(
+            _STATUS_FLAGS[flags],
+            position,
+            adc,
+            None if velocity is None else sign * velocity,
+            None if aux is None else _AUX_FLAGS[aux],
+            home,
+            device_id,
+            version,
+            position_error,
+            bit7,
+        )
 
     return decode
 
 
-def _decode_items(profile: Profile, mask: int, data: bytes) -> Status:
-    position = adc = velocity = aux = home = device_id = version = position_error = bit7 = None
-    at = 1
-    if mask & _POSITION:
-        position = int.from_bytes(data[at : at + 4], "little", signed=True)
-        at += 4
-    if mask & _ADC:
-        adc = int.from_bytes(data[at : at + profile.adc_bytes], "little")
-        at += profile.adc_bytes
-    if mask & _VELOCITY:
-        velocity = profile.velocity_sign * int.from_bytes(data[at : at + 2], "little", signed=True)
-        at += 2
-    if mask & _AUX:
-        aux = _AUX_FLAGS[data[at]]
-        at += 1
-    if mask & _HOME:
-        home = int.from_bytes(data[at : at + 4], "little", signed=True)
-        at += 4
-    if mask & _IDENTITY:
-        device_id, version = data[at], data[at + 1]
-        at += 2
-    if mask & _POSITION_ERROR and profile.position_error_bytes:
-        position_error = int.from_bytes(data[at : at + 2], "little", signed=True)
-        at += 2
-    if mask & _BIT7 and profile.bit7_bytes:
-        bit7 = data[at]
-    return Status(
-        _STATUS_FLAGS[data[0]],
-        position,
-        adc,
-        velocity,
-        aux,
-        home,
-        device_id,
-        version,
-        position_error,
-        bit7,
+def _layout(profile: Profile, mask: int) -> tuple[Struct, Callable[[tuple[Any, ...]], tuple[Any, ...]]]:
+    """Return how the bytes are read, and what picks the fields of a `Status` from None and what was read."""
+    formats = (
+        (_POSITION, "i"),
+        (_ADC, "B" if profile.adc_bytes == 1 else "H"),
+        (_VELOCITY, "h"),
+        (_AUX, "B"),
+        (_HOME, "i"),
+        (_IDENTITY, "B"),
+        (_IDENTITY, "B"),
+        (_POSITION_ERROR if profile.position_error_bytes else 0, "h"),
+        (_BIT7 if profile.bit7_bytes else 0, "B"),
     )
+    order = [1]
+    layout = "<B"
+    for bit, code in formats:
+        present = bool(mask & bit)
+        order.append(len(layout) if present else 0)
+        layout += code if present else ""
+    return Struct(f"{layout}x"), itemgetter(*order)
