@@ -1,8 +1,10 @@
 """Which clock a test runs on, and what no test may leave behind."""
 
 import asyncio
+import re
 import signal
 from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -20,6 +22,18 @@ def pytest_configure() -> None:
     """Let programs that tests start take an interrupt, also where the tests themselves run in the background."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+OF_A_MODULE = re.compile(r"^pytestmark = (?:\[\s*)?pytest\.mark\.(\w+)", re.MULTILINE)
+OF_A_FOLDER = {"browser": "system", "edges": "edges", "guest": "guest"}
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out modules and folders whose first mark is not wanted: to import them takes every worker seconds."""
+    mark = OF_A_FOLDER.get(collection_path.name)
+    if collection_path.suffix == ".py" and (found := OF_A_MODULE.search(collection_path.read_text())):
+        mark = found[1]
+    return True if mark and re.search(rf"\bnot {mark}\b", config.option.markexpr) else None
 
 
 def pytest_asyncio_loop_factories(

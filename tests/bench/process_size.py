@@ -1,8 +1,8 @@
 """How soon a daemon publishes, and how large its process is and stays, with 4 and with 31 axes at their default rates.
 
-Run as `python -m tests.bench.process_size --minutes 60 --log FILE`. The drives are simulated in the daemon's own process,
-which makes it larger, and one remote client takes all samples. What stays is what a least-squares line through the second
-half of the minutes says: the first five fill the flight recorder.
+Run as `python -m tests.bench.process_size` for the first, with `--minutes 60 --log FILE` for the second. The drives are
+simulated in the daemon's own process, which makes it larger, and one remote client takes all samples. By how much it
+grows is what a least-squares line through the second half of the minutes says: the first five fill the flight recorder.
 """
 
 import argparse
@@ -38,7 +38,8 @@ def rig_text(axes: int) -> str:
         'rig = "size"\n[[bus]]\nname = "line0"\nport = "sim:line0"\nbaud = 115200\nmargin_ms = 50\noverload = "skip"\n'
     )
     for number in range(1, axes + 1):
-        text += f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\nvelocity = 1\nacceleration = 1\n'
+        text += f'[[bus.axis]]\nname = "a{number}"\naddress = {number}\nmodel = "ls-182ap"\n'
+        text += "velocity = 1\nacceleration = 1\n"
     modules = ", ".join(['{ model = "ls-182ap" }'] * axes)
     return f'{text}[[sim]]\nname = "line0"\nmodule = [{modules}]\n'
 
@@ -114,15 +115,10 @@ def first_sample_rows(folder: Path) -> list[Row]:
     for _ in range(STARTS):
         with watched(4, folder) as daemon:
             taken.append(daemon.first_s)
+    what = "from the start of a daemon with 4 axes to its first sample"
     return [
-        Row(
-            f"first sample of a daemon with 4 axes, best of {STARTS} starts",
-            min(taken),
-            "s",
-            FIRST_SAMPLE_S,
-            at_most=True,
-        ),
-        Row(f"first sample of a daemon with 4 axes, median of {STARTS}", statistics.median(taken), "s"),
+        Row(f"{what}, best of {STARTS}", min(taken), "s", FIRST_SAMPLE_S, at_most=True),
+        Row(f"{what}, median", statistics.median(taken), "s"),
     ]
 
 

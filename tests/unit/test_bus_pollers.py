@@ -223,6 +223,7 @@ async def test_only_a_poller_with_much_to_do_has_the_next_request_leave_first(mo
         return sum(len(poller.delivered) for poller in pollers)
 
     async with running(rig):
+        monkeypatch.setattr(rig.line, "pushes", True)
         monkeypatch.setattr(rig.line, "push", lambda: pushed_with.append(delivered()))
         for poller in pollers:
             rig.bus.add_poller(poller)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import cache
 from pathlib import Path
 
 import jsonschema_rs
@@ -22,7 +23,7 @@ from ldcnd.pki.access import RULES
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
 KEYS = Keys("rig")
-DOCUMENT = asyncapi_document()
+document = cache(asyncapi_document)
 OFFICIAL = jsonschema_rs.Draft7Validator(
     json.loads((ROOT / "tests" / "vectors" / "asyncapi" / "asyncapi-3.0.0.json").read_text())
 )
@@ -124,8 +125,8 @@ def references(node: object) -> set[str]:
 
 
 def test_every_reference_of_the_asyncapi_document_leads_somewhere() -> None:
-    for reference in references(DOCUMENT):
-        node: object = DOCUMENT
+    for reference in references(document()):
+        node: object = document()
         for part in reference.removeprefix("#/").split("/"):
             assert isinstance(node, dict)
             assert part in node, reference
@@ -133,10 +134,10 @@ def test_every_reference_of_the_asyncapi_document_leads_somewhere() -> None:
 
 
 def test_the_asyncapi_document_has_the_structure_of_version_3() -> None:
-    assert DOCUMENT["asyncapi"] == "3.0.0"
-    assert set(DOCUMENT) == {"asyncapi", "info", "defaultContentType", "channels", "operations", "components"}
-    for name, operation in DOCUMENT["operations"].items():
-        channel = DOCUMENT["channels"][name]
+    assert document()["asyncapi"] == "3.0.0"
+    assert set(document()) == {"asyncapi", "info", "defaultContentType", "channels", "operations", "components"}
+    for name, operation in document()["operations"].items():
+        channel = document()["channels"][name]
         own = {f"#/channels/{name}/messages/{message}" for message in channel["messages"]}
         assert operation["channel"] == {"$ref": f"#/channels/{name}"}
         assert operation["action"] in ("send", "receive")
@@ -174,10 +175,10 @@ def test_the_official_schema_finds_what_is_wrong(path: tuple[str, ...], wrong: o
 
 
 def test_the_schemas_of_the_asyncapi_document_are_json_schemas() -> None:
-    for schema in DOCUMENT["components"]["schemas"].values():
+    for schema in document()["components"]["schemas"].values():
         assert schema.get("$schema", DRAFT) == DRAFT
         jsonschema_rs.meta.validate({"$schema": DRAFT} | schema)
-    json.dumps(DOCUMENT)
+    json.dumps(document())
 
 
 def test_the_command_line_renews_the_table_and_nothing_else(tmp_path: Path) -> None:

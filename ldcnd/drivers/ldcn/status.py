@@ -171,9 +171,8 @@ def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Sta
             raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
         if (sum(data) - data[-1]) & 0xFF != data[-1]:
             raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
-        flags, position, adc, velocity, aux, home, device_id, version, position_error, bit7 = pick(
-            (None, *unpack(data))
-        )
+        fields = pick((None, *unpack(data)))
+        flags, position, adc, velocity, aux, home, device_id, version, position_error, bit7 = fields
         return Status(
             _STATUS_FLAGS[flags],
             position,
