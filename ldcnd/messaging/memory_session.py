@@ -145,7 +145,8 @@ class MemorySession(Session):
     ) -> None:
         """Offer the sample to every subscription that matches; quality of service makes no difference here."""
         del qos, attachment
-        self._publish(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+        if self._closed or self._broker.subscriptions or self._overhear:
+            self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
 
     def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
         """Return what publishes the values of one key."""
@@ -154,7 +155,7 @@ class MemorySession(Session):
 
         def publish(payload: bytes, measured_at_ns: int) -> None:
             if self._closed or broker.subscriptions or self._overhear:
-                self._publish(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+                self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
 
         return publish
 
@@ -258,14 +259,11 @@ class MemorySession(Session):
         for declaration in tuple(self._declarations):
             await declaration.close()
 
-    def _publish(self, sample: Sample) -> None:
-        self._must_be_open()
-        if self._overhear:
-            self._overhear(sample)
-        self._offer(sample)
-
     def _offer(self, sample: Sample) -> None:
-        self._must_be_open()
+        if self._closed:
+            raise SessionError("the session is closed")
+        if self._overhear and sample.kind is SampleKind.PUT:
+            self._overhear(sample)
         for subscription in self._broker.subscriptions:
             if matches(subscription.key, sample.key):
                 subscription.samples.offer(sample)

@@ -235,7 +235,8 @@ class SerialPort(Transport):
 
     def push(self) -> None:
         """See `Transport`: a worker of the kernel carries them through a pseudo-terminal, and needs a processor."""
-        os.sched_yield()
+        if self.pushes:
+            os.sched_yield()
 
     def expect(self, reply_bytes: int) -> None:
         """See `Transport`; a USB adapter delivers in large pieces anyway and would need a transfer for the setting."""

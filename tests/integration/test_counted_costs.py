@@ -33,13 +33,13 @@ class Bound:
     bytecodes: float = 0.0
 
 
-POLL = Bound(calls=69, turns=3.4, bytecodes=3095)
+POLL = Bound(calls=60, turns=3.4, bytecodes=2490)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
-COMMAND = Bound(calls=1335, turns=77)
+COMMAND = Bound(calls=1292, turns=77)
 """A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;
 permission is asked again as the turn of each packet comes."""
-STOP = Bound(calls=245, turns=11.0)
-SAMPLE = Bound(calls=14.1, turns=2.0)
+STOP = Bound(calls=238, turns=10.5)
+SAMPLE = Bound(calls=13.1, turns=2.0)
 """From what a session delivers to what a program's loop over samples has in its hands."""
 
 

@@ -315,7 +315,7 @@ async def test_a_push_yields_the_processor_once_on_a_pseudo_terminal(port: Trans
 async def test_a_port_that_is_no_pseudo_terminal_needs_no_push(port: Transport, monkeypatch):
     yielded: list[bool] = []
     monkeypatch.setattr(os, "sched_yield", lambda: yielded.append(True))
-    port._is_pseudo = False
+    port.pushes = False
 
     port.push()
 

@@ -11,6 +11,8 @@ from types import CodeType, FrameType
 import ldcnd
 
 PACKAGE = str(Path(ldcnd.__file__).parent)
+OF_DRIVES = ("PacketReader.", "encode_status", "received_command", "_decode", "_decode_network")
+"""Codecs that only simulated drives use while a rig works."""
 
 
 @dataclass(slots=True)
@@ -31,7 +33,7 @@ class Count:
 def is_daemons(code: CodeType) -> bool:
     """Tell whether code is the daemon's own; what simulates the line is not."""
     file = code.co_filename
-    simulates = "/sim/" in file or "simulat" in file or code.co_qualname.startswith("PacketReader.")
+    simulates = "/sim/" in file or "simulat" in file or code.co_qualname.startswith(OF_DRIVES)
     return file.startswith(PACKAGE) and not simulates
 
 

@@ -413,6 +413,7 @@ async def test_stray_bytes_are_seen_on_a_line_that_has_come_to_rest():
 async def test_what_takes_long_behind_a_request_is_begun_once_the_request_is_on_its_way():
     bench = Bench()
     story: list[str] = []
+    bench.wire.pushes = True
     bench.wire.push = lambda: story.append("push")  # type: ignore[method-assign]
 
     bench.add(1)
