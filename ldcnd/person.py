@@ -74,11 +74,14 @@ class Person(ABC):
             if answer in YES + NO:
                 return answer in YES
 
+    async def ask_number(self, question: str, default: float | None) -> str:
+        """Return what is answered to the question for a number, as text."""
+        return await self.ask(question if default is None else f"{question} [{default:g}]")
+
     async def number(self, question: str, default: float | None = None) -> float:
         """Ask until the answer is a finite number; an empty one stands for the default."""
-        shown = question if default is None else f"{question} [{default:g}]"
         while True:
-            answer = await self.ask(shown)
+            answer = await self.ask_number(question, default)
             if not answer and default is not None:
                 return default
             try:

@@ -91,6 +91,14 @@ class TerminalPerson(Person):
         return (line + feed).decode(errors="replace")
 
 
+class AssentingPerson(TerminalPerson):
+    """Says yes to everything, as `--yes` has asked for."""
+
+    @override
+    async def confirm(self, question: str) -> bool:
+        return True
+
+
 async def _follow(pressed: "asyncio.Queue[str]", released: asyncio.Event) -> None:
     async for _ in repetitions(pressed, HELD):
         pass

@@ -10,24 +10,23 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
-from ldcnd.cli.output import FAILED, show_lines
+from ldcnd.cli.output import FAILED
+from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError, WrongState
+from ldcnd.person import Left
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ldcnd.client.kept_gains import KeptGains
-    from ldcnd.tuning.ldcn.plan import Plan
-    from ldcnd.tuning.ldcn.report import MoveFigures, TuningReport
-    from ldcnd.tuning.ldcn.response import Floats
-    from ldcnd.tuning.ldcn.session import Findings, Verified
-    from ldcnd.tuning.ldcn.verdict import Measured
+    from ldcnd.tuning.ldcn.guided import Tuned
 
 ROWS = 2
 """Of the picture: positions above, following errors below."""
+STYLES = {"new gains, predicted": "--", "command": ":k"}
 
 
 @click.command()
@@ -71,39 +70,40 @@ def command(
     """
     if put_back:
         kept = target.run(lambda client: _put_back(client, axis))
-        target.show(kept, f"{axis}: off, with its old gains: {_gains(kept.gains)}")
+        gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
+        target.show(kept, f"{axis}: off, with its old gains: {gains}")
         return
     _require_numpy()
-    from ldcnd.tuning.ldcn import plan as plans  # noqa: PLC0415 - needs an optional package
+    from ldcnd.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+    from ldcnd.tuning.ldcn import plan as plans  # noqa: PLC0415 - likewise
     from ldcnd.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
-    from ldcnd.tuning.ldcn import session  # noqa: PLC0415 - likewise
 
     figure = stacked_rows(ROWS)[0] if plot else None  # missing matplotlib is said before anything moves
-
-    async def planned(client: RigClient) -> "Plan":
-        await axis_of(client, axis)
-        return await plans.plan(client, axis, within)
-
-    plan = target.run(planned)
     if dry_run:
+        plan = target.run(lambda client: plans.plan(client, axis, within))
         target.show(reports.plan_reported(plan), *plan.lines, "Nothing was sent to the drive.")
         return
-    show_lines(*plan.lines, err=target.as_json)
-    if not yes:
-        click.confirm(f"Move {axis} now?", abort=True, err=True)
+
+    async def tuned(client: RigClient) -> "Tuned | None":
+        await axis_of(client, axis)
+        person = AssentingPerson(None) if yes else TerminalPerson(None)
+        try:
+            return await guided.tune(client, person, axis, within, bandwidth_hz)
+        except Left:
+            return None
+
     end_as_interrupted()
-    found = target.run(lambda client: session.measure(client, plan, bandwidth_hz, _tell))
-    if not yes:
-        show_lines(*_table(reports.reported(found)), err=target.as_json)
-        if not click.confirm(f"Load these gains into {axis} and make the test move?", err=True):
-            target.show(reports.reported(found), f"{axis}: off, with its old gains")
-            raise click.Abort
-    verified = target.run(lambda client: session.verify(client, found, _tell))
-    report = reports.reported(found, verified)
-    if plot and figure:
-        _draw(figure, found, verified)
+    outcome = target.run(tuned)
+    if outcome is None:
+        raise click.Abort
+    report = outcome.report
+    if report.after is None and report.objection is None:
+        target.show(report)
+        raise click.Abort
+    if figure and plot:
+        _draw(figure, outcome)
         save_figure(figure, plot)
-    target.show(report, *_table(report), *_ending(report))
+    target.show(report, *guided.table(report), *guided.ending(report))
     if not report.applied:
         sys.exit(FAILED)
 
@@ -116,10 +116,6 @@ def _require_numpy() -> None:
     """
     if find_spec("numpy") is None:
         raise ConfigError("tuning needs numpy; install it with: pip install 'ldcnd[tune]'")
-
-
-def _tell(line: str) -> None:
-    show_lines(line, err=True)
 
 
 async def _put_back(client: RigClient, axis: str) -> "KeptGains":
@@ -138,75 +134,17 @@ async def _put_back(client: RigClient, axis: str) -> "KeptGains":
     return kept
 
 
-def _gains(gains: dict[str, int]) -> str:
-    return ", ".join(f"{name} = {value}" for name, value in gains.items())
-
-
-def _table(report: "TuningReport") -> list[str]:
-    """Return model, gains, and predicted beside measured."""
-    plant = ", ".join(
-        f"{name.split('_')[0]} {each.value:.4g} +- {each.interval:.2g} {each.unit}"
-        for name, each in report.plant.items()
-    )
-    margins = report.margins
-    gain = "no limit" if margins.gain_db is None else f"{margins.gain_db:.0f} dB"
-    columns = {"old gains": report.before, "predicted": report.predicted, "new gains": report.after}
-    rows = [("", *columns)] + [
-        (title, *(_shown(figures, title, report.unit) for figures in columns.values()))
-        for title in ("settling", "overshoot", "following error", "error at the end")
-    ]
-    return [
-        f"model: {plant}",
-        f"old gains: {_gains(report.old_gains)}",
-        f"new gains: {_gains(report.gains)}",
-        f"bandwidth {margins.bandwidth_hz:.1f} Hz, phase margin {margins.phase_deg:.0f} degrees, gain margin {gain}",
-        f"test move of {report.distance:g} {report.unit}:",
-        *("  " + " ".join(f"{cell:>18}" for cell in row) for row in rows),
-    ]
-
-
-def _shown(figures: "MoveFigures | None", title: str, unit: str) -> str:
-    if figures is None:
-        return "-"
-    match title:
-        case "settling":
-            return f"{figures.settling_s * 1e3:.0f} ms" if figures.settled else "not settled"
-        case "overshoot":
-            return f"{figures.overshoot:.1%}"
-        case "following error":
-            return f"{figures.following_error:.4g} {unit}"
-        case _:
-            return f"{figures.error:.4g} {unit}"
-
-
-def _ending(report: "TuningReport") -> list[str]:
-    if not report.applied:
-        return [f"{report.axis}: not better: {report.objection}; it is off, with its old gains"]
-    return [
-        f"{report.axis}: off, with the new gains until the next start of the daemon; to keep them, configure:",
-        f"gains = {{ {_gains(report.gains)} }}",
-    ]
-
-
-def _draw(figure: "Figure", found: "Findings", verified: "Verified") -> None:
-    """Draw the first way of each test move: positions, and what they are behind the command."""
+def _draw(figure: "Figure", tuned: "Tuned") -> None:
+    """Draw the test moves: positions, and what they are behind the command."""
     above, below = figure.axes
-    scale = found.plan.units(1.0)
-
-    def line(move: "Measured", positions: "Floats", label: str, style: str = "-") -> None:
-        """Draw it forward, whichever way it went."""
-        forward = scale if move.commanded[-1] >= 0 else -scale
-        above.plot(move.times_s * 1e3, positions * forward, style, label=label)
-        below.plot(move.times_s * 1e3, (move.commanded - positions) * forward, style, label=label)
-
-    for move in found.before[:1]:
-        line(move, move.positions, "old gains, measured")
-    for move in verified.after[:1]:
-        line(move, move.positions, "new gains, measured")
-        line(move, move.predicted, "new gains, predicted", "--")
-        line(move, move.commanded, "command", ":k")
-    above.set_ylabel(f"position\n[{found.plan.info.unit}]")
-    below.set_ylabel(f"following error\n[{found.plan.info.unit}]")
+    for curve in tuned.curves:
+        times_ms = [each * 1e3 for each in curve.times_s]
+        style = STYLES.get(curve.label, "-")
+        above.plot(times_ms, curve.positions, style, label=curve.label)
+        below.plot(times_ms, curve.following_errors, style, label=curve.label)
+    unit = tuned.report.unit
+    above.set_ylabel(f"position\n[{unit}]")
+    below.set_ylabel(f"following error\n[{unit}]")
     below.set_xlabel("ms")
     above.legend(fontsize="small")
-    figure.suptitle(f"{found.plan.info.axis}: test move")
+    figure.suptitle(f"{tuned.report.axis}: test move")

@@ -175,8 +175,8 @@ def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, m
         with pytest.raises(WrongState, match="no gains of an unfinished tuning"):
             tune.command.main(["x", "--put-back"], standalone_mode=False)
 
-    assert "it will stay within 1 mm (1000 counts)" in unasked.out
-    assert "Move x now?" in unasked.err
+    assert "it will stay within 1 mm (1000 counts)" in unasked.err
+    assert "move x now" in unasked.err
     assert untouched == 0
     assert json.loads(dry.out.splitlines()[-1])["within_counts"] == WITHIN_COUNTS
     report = json.loads(done.out.splitlines()[-1])

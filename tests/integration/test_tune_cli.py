@@ -20,7 +20,7 @@ BEGIN_S = 90.0
 @pytest.fixture
 def state_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    return tmp_path / "ldcnd" / "tuning" / "sim@x.json"
+    return tmp_path / "ldcnd" / "gains" / "sim@x.json"
 
 
 async def tune(*arguments):

@@ -4,6 +4,7 @@ import pytest
 
 from ldcnd.cli import tune
 from ldcnd.errors import ConfigError
+from ldcnd.tuning.ldcn import guided
 from ldcnd.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
 
 PREDICTED = MoveFigures(settling_s=0.016, settled=True, overshoot=0.022, following_error=0.111, error=0.0)
@@ -31,7 +32,7 @@ def test_without_numpy_one_line_names_the_extra(monkeypatch):
 
 
 def test_predicted_stands_beside_measured():
-    lines = tune._table(REPORT)
+    lines = guided.table(REPORT)
 
     columns = [line.split() for line in lines[-5:]]
     assert columns[0] == ["old", "gains", "predicted", "new", "gains"]
@@ -42,8 +43,8 @@ def test_predicted_stands_beside_measured():
 
 
 def test_kept_gains_are_a_line_for_the_configuration_and_refused_ones_say_why():
-    kept = tune._ending(REPORT.model_copy(update={"applied": True}))
-    refused = tune._ending(REPORT.model_copy(update={"objection": "it settles in 90 ms, with the old gains in 20 ms"}))
+    kept = guided.ending(REPORT.model_copy(update={"applied": True}))
+    refused = guided.ending(REPORT.model_copy(update={"objection": "it settles in 90 ms, with the old gains in 20 ms"}))
 
     assert kept[-1] == "gains = { kp = 164, kd = 882 }"
     assert refused == ["x: not better: it settles in 90 ms, with the old gains in 20 ms; it is off, with its old gains"]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from ldcnd.model.frozen import Frozen
 from ldcnd.tuning.ldcn.plan import Plan
-from ldcnd.tuning.ldcn.response import Figures
+from ldcnd.tuning.ldcn.response import Figures, Floats
 from ldcnd.tuning.ldcn.session import Findings, Verified, registers_of
 from ldcnd.tuning.ldcn.verdict import Measured, worst
 
@@ -60,6 +60,19 @@ class LoopMargins(Frozen):
     """Phase margin."""
     gain_db: float | None
     """Gain margin; null where the phase never reaches -180 degrees."""
+
+
+class MoveCurve(Frozen):
+    """One way of a test move, drawn forward."""
+
+    label: str
+    """What it shows."""
+    times_s: tuple[float, ...]
+    """From the begin of the move, seconds."""
+    positions: tuple[float, ...]
+    """In axis units."""
+    following_errors: tuple[float, ...]
+    """What they are behind the command, in axis units."""
 
 
 class TuningReport(Frozen):
@@ -145,6 +158,28 @@ def reported(found: Findings, verified: Verified | None = None) -> TuningReport:
         after=_shown_worst(planned, verified.after) if verified else None,
         objection=verified.objection if verified else None,
         applied=verified is not None and verified.objection is None,
+    )
+
+
+def curves_of(found: Findings, verified: Verified | None = None) -> tuple[MoveCurve, ...]:
+    """Return the first way of each test move: measured with the old gains, with the new ones, predicted, commanded."""
+    drawn = [("old gains, measured", move, move.positions) for move in found.before[:1]]
+    for move in verified.after[:1] if verified else ():
+        drawn += [
+            ("new gains, measured", move, move.positions),
+            ("new gains, predicted", move, move.predicted),
+            ("command", move, move.commanded),
+        ]
+    return tuple(_curve(found.plan, label, move, positions) for label, move, positions in drawn)
+
+
+def _curve(planned: Plan, label: str, move: Measured, positions: Floats) -> MoveCurve:
+    scale = planned.units(1.0) * (1 if move.commanded[-1] >= 0 else -1)
+    return MoveCurve(
+        label=label,
+        times_s=tuple(map(float, move.times_s)),
+        positions=tuple(map(float, positions * scale)),
+        following_errors=tuple(map(float, (move.commanded - positions) * scale)),
     )
 
 
