@@ -109,6 +109,14 @@ def adapter_of(path: Path, sys_tty: Path = SYS_TTY, by_id: Path = BY_ID) -> Adap
     )
 
 
+def ports(dev: Path = Path("/dev"), by_id: Path = BY_ID) -> list[str]:
+    """Return the serial ports on which drives may be: names that stay where there are any, then other nodes."""
+    stable = _entries(by_id)
+    named = {link.resolve().name for link in stable}
+    nodes = [node for kind in ("ttyUSB*", "ttyACM*", "ttyAMA*") for node in sorted(dev.glob(kind))]
+    return [str(each) for each in (*stable, *(node for node in nodes if node.name not in named))]
+
+
 def line_errors(descriptor: int) -> LineErrors | None:
     """Return what the driver of an open port has counted; None where it counts nothing."""
     with contextlib.suppress(OSError):

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from ldcnd.cli.scan import write
+from ldcnd.config.begun import begun_with, write
 from ldcnd.config.rig import load_config
 from ldcnd.drivers.ldcn.addressing import NULLS
 from ldcnd.drivers.ldcn.packet import Command, PacketReader
@@ -178,10 +178,10 @@ async def test_a_configuration_is_begun_and_continued_and_what_a_person_wrote_st
     drives, _, _ = await scanned(chain, give_addresses=True)
     file = tmp_path / "rig.new"
 
-    write(file, "ldcn", PORT, drives[:2])
+    write(begun_with(file, "ldcn", PORT, drives[:2]))
     begun = file.read_text().replace('name = "axis1"', 'name = "x" # the long one').replace("# gains", "gains")
     file.write_text(begun)
-    said = write(file, "ldcn", PORT, drives)
+    said = write(begun_with(file, "ldcn", PORT, drives))
 
     rig = load_config(file)
     assert [axis.name for axis in rig.bus[0].axis] == ["x", "axis3"]
@@ -189,7 +189,10 @@ async def test_a_configuration_is_begun_and_continued_and_what_a_person_wrote_st
     assert [module.model for module in rig.bus[0].module] == ["pic-io"]
     assert file.read_text().startswith(begun.rstrip("\n"))
     assert "1 of 3 added" in said[-1]
-    assert write(file, "ldcn", PORT, drives[1:])[0] == "address 1 is configured as ls-182ap; nothing answers there"
+    assert (
+        write(begun_with(file, "ldcn", PORT, drives[1:]))[0]
+        == "address 1 is configured as ls-182ap; nothing answers there"
+    )
     assert load_config(file) == rig
     assert list(tmp_path.iterdir()) == [file]
 
@@ -199,6 +202,6 @@ async def test_a_line_of_which_no_axis_can_be_made_leaves_the_file_as_it_was(tmp
     drives, _, _ = await scanned(chain, give_addresses=True)
 
     with pytest.raises(ConfigError, match="not written"):
-        write(tmp_path / "rig.toml", "ldcn", PORT, drives)
+        write(begun_with(tmp_path / "rig.toml", "ldcn", PORT, drives))
 
     assert list(tmp_path.iterdir()) == []

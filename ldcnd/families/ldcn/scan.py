@@ -280,13 +280,16 @@ def configured_line(name: str, port: str, drives: Sequence[ScannedDrive]) -> str
     tops = [PROFILES[drive.model].top_baud for drive in drives if drive.model]
     baud = USUAL_BAUD if all(top >= USUAL_BAUD for top in tops) else RESET_BAUD
     seen = ", ".join(sorted({str(drive.baud) for drive in drives}))
+    adapter = adapter_of(Path(port))
+    simulated = adapter is not None and not adapter.driver
+    margin = "margin_ms = 200  # behind a pseudo-terminal a program answers, when it gets to it"
     return f"""
 [[bus]]
 name = "{name}"
 port = "{port}"
 baud = {baud}  # the drives are brought to it; they were found at {seen}
 # adapter_latency_ms = 1.0  # as the scan measured it
-# margin_ms = 25
+{margin if simulated else "# margin_ms = 25"}
 # start = "adopt"  # takes drives over as they are; "reset", the default, resets and addresses them
 """
 
