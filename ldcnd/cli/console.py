@@ -1,7 +1,10 @@
 """`ldcnd console`: the rigs in a browser, from a process of its own."""
 
 import asyncio
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +14,9 @@ from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
 from ldcnd.messaging.zenoh_settings import ZenohSettings
+
+if TYPE_CHECKING:
+    from ldcnd.console.server import MoreRoutes
 
 DEFAULT_ADDRESS = "127.0.0.1:8470"
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -27,6 +33,11 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--certificate", type=FILE, help="PEM file: serve HTTPS with this certificate.")
 @click.option("--key", type=FILE, help="PEM file with its key.")
 @click.option("--token-file", type=FILE, help="File with the token that lets browsers in, instead of one-time links.")
+@click.option(
+    "--commission",
+    type=FILE,
+    help="Serve the commissioning page for this configuration of a rig: it writes the file, and its steps move axes.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
 @click.option(
     "--log-level",
@@ -45,12 +56,14 @@ def command(
     key: Path | None,
     token_file: Path | None,
     *,
+    commission: Path | None,
     as_json: bool,
     log_level: str,
 ) -> None:
     """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it. SIGUSR1 prints another one.
 
-    It stops axes, it is not an emergency stop.
+    It stops axes, it is not an emergency stop. With --commission every browser that is let in can also search a port
+    for drives, write the configuration, and run the steps of `ldcnd commission` and `ldcnd tune`.
     """
     try:
         from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
@@ -74,4 +87,14 @@ def command(
         token=read_token(token_file) if token_file else None,
         as_json=as_json,
     )
-    asyncio.run(serve(settings))
+    asyncio.run(serve(settings, _commissioning(commission, endpoints) if commission else None))
+
+
+def _commissioning(config: Path, endpoints: Sequence[str]) -> "MoreRoutes":
+    """Return the routes of the commissioning page for a configuration."""
+    from ldcnd.commissioning_page.routes import Commissioning  # noqa: PLC0415 - its packages are optional
+
+    words = ["ldcnd", "run", "--config", str(config)]
+    if endpoints and endpoints[0] != DEFAULT_ENDPOINT:
+        words += ["--listen", endpoints[0]]  # where this console looks for it
+    return lambda rigs: Commissioning(rigs, config, shlex.join(words)).routes()

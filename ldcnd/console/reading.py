@@ -36,7 +36,7 @@ _FAULT_PAGE = """<!doctype html>
 """
 
 
-def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors) -> list[BaseRoute]:
+def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors, *, commissions: bool = False) -> list[BaseRoute]:
     """Return what pages may GET, and the WebSocket."""
 
     async def page(_: Request) -> Response:
@@ -48,6 +48,7 @@ def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors) -> list[BaseRoute
             client=request.state.visitor.client,
             endpoints=rigs.endpoints,
             rigs=await rigs.described(),
+            commissions=commissions,
         )
         return Response(reply.model_dump_json(), media_type="application/json")
 

@@ -51,6 +51,8 @@ class RigsReply(Frozen):
     """The sessions of the console."""
     rigs: tuple[RigReply, ...]
     """By name."""
+    commissions: bool = False
+    """It has a commissioning page."""
 
 
 class StopsReply(Frozen):

@@ -5,7 +5,7 @@ import json
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import click
@@ -13,7 +13,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route
+from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
@@ -46,27 +46,41 @@ PONG_TIME_S = 4.0
 """Time without answer after which a browser's pages are gone, seconds; a browser answers for hidden pages, too."""
 
 
+MoreRoutes = Callable[[Rigs], Sequence[BaseRoute]]
+"""What else a console serves behind its gate, such as the commissioning page."""
+
+
 def build_app(
-    settings: ConsoleSettings, rigs: Rigs, feed: Feed, visitors: Visitors, new_link: Callable[[], str]
+    settings: ConsoleSettings,
+    rigs: Rigs,
+    feed: Feed,
+    visitors: Visitors,
+    new_link: Callable[[], str],
+    commissioning: MoreRoutes | None = None,
 ) -> ASGIApp:
-    """Return the web application, behind its gate."""
+    """Return the web application, behind its gate; `commissioning` adds the routes of that page."""
 
     async def link(_: Request) -> Response:
         return Response(LinkReply(link=new_link()).model_dump_json(), media_type="application/json")
 
     pages = Pages(rigs)
     routes = [
-        *reading_routes(rigs, feed, visitors),
+        *reading_routes(rigs, feed, visitors, commissions=commissioning is not None),
         *control_routes(pages),
         Route("/api/link", link, methods=["POST"]),
         *command_routes(rigs, pages),
+        *(commissioning(rigs) if commissioning else ()),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
     return Gate(Starlette(routes=routes), visitors, settings.scheme, settings.known_hosts)
 
 
-async def serve(settings: ConsoleSettings) -> None:
+async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = None) -> None:
     """Serve until SIGTERM, SIGINT or the end of the terminal; SIGUSR1 prints another link.
+
+    Args:
+        settings: of the console.
+        commissioning: the routes of the commissioning page, where it is served.
 
     Raises:
         ConfigError: the address, the certificate or what was said about Zenoh cannot be used.
@@ -84,7 +98,7 @@ async def serve(settings: ConsoleSettings) -> None:
         return f"{settings.scheme}://{settings.shown_host}:{port}/?link={visitors.new_link()}"
 
     async with Feed(values, time.time_ns) as feed, asyncio.TaskGroup() as group:
-        server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link), settings))
+        server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link, commissioning), settings))
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, server.end)
         loop.add_signal_handler(signal.SIGUSR1, lambda: _print(new_link(), settings))

@@ -198,10 +198,11 @@ def is_trouble(told: ConsoleMessage) -> bool:
 
 
 @asynccontextmanager
-async def console(*endpoints: str) -> AsyncIterator[str]:
-    """Run `ldcnd console` on a free port; yields the link that it prints."""
+async def console(*endpoints: str, commission: Path | None = None) -> AsyncIterator[str]:
+    """Run `ldcnd console` on a free port, for commissioning with a configuration; yields the link that it prints."""
     connect = [word for endpoint in endpoints for word in ("-e", endpoint)]
-    async with process("console", *connect, "--listen", "127.0.0.1:0", "--json") as running:
+    more = ["--commission", str(commission)] if commission else []
+    async with process("console", *connect, *more, "--listen", "127.0.0.1:0", "--json") as running:
         assert running.stdout
         async with asyncio.timeout(PATIENCE_S):
             told = await running.stdout.readline()

@@ -13,7 +13,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.console.feed import Feed
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.rigs import Endpoint, Rigs
-from ldcnd.console.server import build_app
+from ldcnd.console.server import MoreRoutes, build_app
 from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import Visitors
 from ldcnd.listen_address import ListenAddress
@@ -176,7 +176,9 @@ async def running_console(config: RigConfig | None = None) -> AsyncIterator[Runn
 
 
 @asynccontextmanager
-async def console_of(rig: RunningRig, session: Session) -> AsyncIterator[RunningConsole]:
+async def console_of(
+    rig: RunningRig, session: Session, commissioning: MoreRoutes | None = None
+) -> AsyncIterator[RunningConsole]:
     """Run a console over a session."""
     loop = asyncio.get_running_loop()
     values = LatestValues()
@@ -184,7 +186,11 @@ async def console_of(rig: RunningRig, session: Session) -> AsyncIterator[Running
     visitors = Visitors(loop.time)
     settings = ConsoleSettings((ENDPOINT,), (), ListenAddress("127.0.0.1", 8470))
     async with Feed(values, lambda: EPOCH_NS + round(loop.time() * 1e9)) as feed, asyncio.TaskGroup() as group:
-        app = build_app(settings, rigs, feed, visitors, lambda: f"{ORIGIN}/?link={visitors.new_link()}")
+
+        def new_link() -> str:
+            return f"{ORIGIN}/?link={visitors.new_link()}"
+
+        app = build_app(settings, rigs, feed, visitors, new_link, commissioning)
 
         async def ask(question: WebQuestion) -> WebAnswer:
             return await _asked(app, question)

@@ -2,6 +2,7 @@
 
 import { html, render, useEffect, useErrorBoundary, useRef, useState } from "./html.js";
 import { AxisPage } from "./pages/axis.js";
+import { CommissioningPage } from "./pages/commissioning.js";
 import { EventsPage } from "./pages/events.js";
 import { NetworkPage } from "./pages/network.js";
 import { ParametersPage } from "./pages/parameters.js";
@@ -14,7 +15,7 @@ import { Mark } from "./parts/state.js";
 import { StopAll } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost } from "./session/control.js";
 import { feed } from "./session/feed.js";
-import { failure, rigs, useRigs, watch } from "./session/rigs.js";
+import { commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -24,6 +25,7 @@ const PAGES = [
   ["parameters", "Parameters", ParametersPage],
   ["network", "Network", NetworkPage],
   ["events", "Events", EventsPage],
+  ["commissioning", "Commissioning", CommissioningPage],
 ];
 
 /** The parts of the address behind the hash: page, rig, axis. */
@@ -34,7 +36,7 @@ function place() {
 
 function Navigation({ at }) {
   return html`<nav aria-label="Pages">
-    ${PAGES.map(([page, title]) => html`<a
+    ${PAGES.filter(([page]) => commissions || page !== "commissioning").map(([page, title]) => html`<a
       href=${`#/${page}`} aria-current=${at.page === page ? "page" : null}>${title}</a>`)}
   </nav>`;
 }

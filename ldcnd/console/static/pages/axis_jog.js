@@ -1,15 +1,15 @@
 /** Jog: run for as long as a button or an arrow key is held, or move by a step. */
 
-import { html, useEffect, useId, useRef, useState } from "../html.js";
+import { html, useId, useState } from "../html.js";
 import { Action, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { HoldButton } from "../parts/hold_button.js";
 import { beginJog, command, endJog, jogRefusal } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 
 const STEPS = [-10, -1, -0.1, 0.1, 1, 10];
 /** At first a jog has this share of the velocity limit: slow enough to let go in time. */
 const FIRST_SHARE = 0.1;
-const KEYS = { ArrowLeft: -1, ArrowRight: 1 };
 
 export function JogPanel({ axis }) {
   const [speed, setSpeed] = useState(axis.info.limits.velocity * FIRST_SHARE);
@@ -24,8 +24,10 @@ export function JogPanel({ axis }) {
       <${Field} label="Speed" unit=${`${unit}/s`} value=${speed} onChange=${setSpeed} min="0" />
     </div>
     <p class="row jog" role="group" aria-label=${`Jog ${axis.name}`}>
-      <${HoldButton} axis=${axis} velocity=${-speed} way=${way} reason=${reason}>◀ Hold to run −<//>
-      <${HoldButton} axis=${axis} velocity=${speed} way=${way} reason=${reason}>Hold to run + ▶<//>
+      <${HoldButton} begin=${() => beginJog(axis, -speed)} end=${endJog} keys=${["ArrowLeft"]} obstacle=${way}
+        reason=${reason}>◀ Hold to run −<//>
+      <${HoldButton} begin=${() => beginJog(axis, speed)} end=${endJog} keys=${["ArrowRight"]} obstacle=${way}
+        reason=${reason}>Hold to run + ▶<//>
     </p>
     ${axis.can("move_relative") && html`<p class="row steps" role="group" aria-label=${`Steps of ${axis.name}`}>
       ${STEPS.map((step) => html`<${Action} key=${step} obstacle=${stepWay} reason=${reason}
@@ -35,47 +37,4 @@ export function JogPanel({ axis }) {
     ${(way ?? stepWay) && html`<${Reason} id=${reason} text=${way ?? stepWay} />`}
     <${RefusalText} refusal=${jogRefusal} />
   <//>`;
-}
-
-/** A button that lets an axis run while it is held, whatever ends that: finger, key, focus, window or page. */
-function HoldButton({ axis, velocity, way, reason, children }) {
-  const holding = useRef(false);
-
-  function begin() {
-    if (way || holding.current) return;
-    holding.current = true;
-    beginJog(axis, velocity);
-  }
-  function end() {
-    if (!holding.current) return;
-    holding.current = false;
-    endJog();
-  }
-  useEffect(() => {
-    const hidden = () => document.hidden && end();
-    addEventListener("blur", end);
-    document.addEventListener("visibilitychange", hidden);
-    return () => {
-      end();
-      removeEventListener("blur", end);
-      document.removeEventListener("visibilitychange", hidden);
-    };
-  }, []);
-
-  const mine = (event) => event.key === " " || event.key === "Enter" || KEYS[event.key] === Math.sign(velocity);
-  return html`<button type="button" class="hold" aria-disabled=${way ? "true" : null}
-    aria-describedby=${way ? reason : null}
-    onPointerDown=${(event) => {
-      if (event.button !== 0) return;
-      event.target.setPointerCapture(event.pointerId);
-      begin();
-    }}
-    onPointerUp=${end} onPointerCancel=${end} onLostPointerCapture=${end} onBlur=${end}
-    onContextMenu=${(event) => event.preventDefault()}
-    onKeyDown=${(event) => {
-      if (!mine(event)) return;
-      event.preventDefault();
-      if (!event.repeat) begin();
-    }}
-    onKeyUp=${(event) => mine(event) && end()}>${children}</button>`;
 }

@@ -208,6 +208,9 @@ export const rigs = new Map();
 /** Where rigs are looked for, and what is wrong there. */
 export let endpoints = [];
 
+/** Whether this console has a commissioning page. */
+export let commissions = false;
+
 /** Why the descriptions could not be read; null while they can. */
 export let failure = null;
 
@@ -254,9 +257,10 @@ function unlessUnderWay(act) {
 /** Read all descriptions anew; values come by the feed. */
 export const describe = unlessUnderWay(async () => {
   try {
-    const { rigs: told, endpoints: looked } = await read("/api/rigs");
+    const { rigs: told, endpoints: looked, commissions: may } = await read("/api/rigs");
     endpoints = looked;
     for (const each of told) rigNamed(each.name).describe(each);
+    commissions = may ?? false;
     failure = null;
   } catch (error) {
     failure = error;

@@ -1,0 +1,106 @@
+"""A person at a page: late and foreign answers answer nothing, and a button that was let go stays let go."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.commissioning_page.messages import Answer, Hold
+from ldcnd.commissioning_page.page_person import HELD_S, PagePerson
+from ldcnd.person import Left
+
+
+@pytest.fixture
+def person():
+    return PagePerson(lambda: None)
+
+
+async def asked(person):
+    """Wait for a question."""
+    while person.question is None:
+        await asyncio.sleep(0)
+    return person.question
+
+
+async def test_only_an_answer_to_the_present_question_counts(person):
+    async with asyncio.TaskGroup() as group:
+        choice = group.create_task(person.choose("which", {"one": "the first", "other": "the second"}))
+        question = await asked(person)
+        person.answer(Answer(number=question.number - 1, text="one"))
+        person.answer(Answer(number=question.number, text="neither"))
+        person.hold(Hold(number=question.number, on=True))
+        await asyncio.sleep(0)
+        assert not choice.done()
+        person.answer(Answer(number=question.number, text="other"))
+
+    assert choice.result() == "other"
+
+
+async def test_a_number_is_asked_for_until_it_is_one(person):
+    async with asyncio.TaskGroup() as group:
+        number = group.create_task(person.number("how far", 2.5))
+        first = await asked(person)
+        person.answer(Answer(number=first.number, text="far"))
+        while person.question is None or person.question.number == first.number:
+            await asyncio.sleep(0)
+        person.answer(Answer(number=person.question.number, text=" 4 "))
+
+    assert first.default == "2.5"
+    assert number.result() == 4
+    assert person.lines == ("'far' is no number",)
+
+
+async def test_control_characters_of_drives_and_files_reach_no_page(person):
+    person.tell("a\x1b[2Jb")
+
+    assert person.lines == ("a\\x1b[2Jb",)
+
+
+async def test_a_press_that_is_over_at_once_holds_nothing(person):
+    async def held():
+        with pytest.raises(Left):
+            async with person.holding("it moves"):
+                pytest.fail("nothing holds it")
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(held())
+        first = (await asked(person)).number
+        person.hold(Hold(number=first, on=True))
+        person.hold(Hold(number=first, on=False))
+        while person.question is None or person.question.number == first:
+            await asyncio.sleep(0)
+        assert not person.holds
+        person.hold(Hold(number=first, on=True))  # a late message of the first button
+        await asyncio.sleep(0)
+        assert not person.holds
+        person.leave()
+
+
+async def test_silence_releases_the_button_for_good(person):
+    loop = asyncio.get_running_loop()
+    async with asyncio.TaskGroup() as group:
+        begun = group.create_task(asked(person))
+        await asyncio.sleep(0)
+
+        async def press():
+            question = await begun
+            for _ in range(5):
+                person.hold(Hold(number=question.number, on=True))
+                await asyncio.sleep(0.1)
+            return question.number, loop.time()
+
+        pressing = group.create_task(press())
+        async with person.holding("it moves") as released:
+            await released.wait()
+            number, last_s = await pressing
+            person.hold(Hold(number=number, on=True))
+            assert released.is_set()
+            assert not person.holds
+
+    assert loop.time() - last_s == pytest.approx(HELD_S - 0.1)
+
+
+async def test_a_page_that_is_gone_is_asked_nothing(person):
+    person.leave()
+
+    with pytest.raises(Left):
+        await person.ask("anything")
