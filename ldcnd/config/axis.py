@@ -255,7 +255,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             )
         if self.modulo is not None and (limits.position_min, limits.position_max) != (None, None):
             raise ValueError("modulo: an axis that turns without an end has no position limits")
-        if self.modulo is not None and self.modulo * (self.counts_per_unit or 1.0) < LEAST_TURN_COUNTS:
+        if self.modulo is not None and self.modulo * abs(self.signed_counts_per_unit) < LEAST_TURN_COUNTS:
             raise ValueError(f"modulo {self.modulo:g} is less than {LEAST_TURN_COUNTS} encoder counts")
         if limits.velocity is not None and self.velocity > limits.velocity:
             raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
@@ -263,6 +263,12 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
         self._check_tracking()
         return self
+
+    @property
+    def signed_counts_per_unit(self) -> float:
+        """Encoder counts per unit, 1 when the axis works in counts; negative where forward is backward in counts."""
+        counts_per_unit = self.counts_per_unit or 1.0
+        return -counts_per_unit if self.direction == "reverse" else counts_per_unit
 
     @property
     def switch_active(self) -> Literal["high", "low"]:
@@ -274,7 +280,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         tracking, limits = self.tracking, self.limits
         if tracking is None:
             return
-        step_counts = tracking.step * (self.counts_per_unit or 1.0)
+        step_counts = tracking.step * abs(self.signed_counts_per_unit)
         if self.gains and step_counts >= self.gains.el:
             raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {self.gains.el}")
         if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:

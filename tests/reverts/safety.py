@@ -166,7 +166,7 @@ REVERTS = (
         ),
     ),
     revert(
-        "ldcnd/daemon/axis/permit.py",
+        "ldcnd/daemon/axis/guards.py",
         "        self._right.holds()\n",
         "",
         (

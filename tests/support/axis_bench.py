@@ -15,7 +15,7 @@ from typing_extensions import override
 from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.daemon.axis.permit import UNCONDITIONAL, Right
+from ldcnd.daemon.axis.guards import UNCONDITIONAL, Right
 from ldcnd.daemon.axis.state import ActiveCommand
 from ldcnd.daemon.axis.telemetry import Arrival
 from ldcnd.daemon.clock import Clock
@@ -251,7 +251,8 @@ class AxisBench:
         self, command: AxisCommand[CommandReply], command_id: str | None = None, right: Right = UNCONDITIONAL
     ) -> CommandReply:
         """Carry out a command under a permit of its own."""
-        return await self.axis.execute(command, command_id, self.axis.permit(command.verb, right))
+        name = command_id or next(self._ids)
+        return await self.axis.execute(command, self.axis.permit(name, command.verb, right))
 
     async def power_on(self) -> None:
         """Close the loop at rest, and forget how."""

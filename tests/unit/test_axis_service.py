@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.daemon.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
-from ldcnd.daemon.axis.permit import Right
+from ldcnd.daemon.axis.guards import Right
 from ldcnd.drivers.driver import Fault, StopMode
 from ldcnd.errors import (
     BusDown,
@@ -279,8 +279,8 @@ async def test_a_drive_that_takes_no_stop_over_its_line_is_neither_latched_nor_t
 
 
 async def in_turn(bench: AxisBench, move, right: Right = Right(), command_id: str = "next"):  # noqa: B008 - immutable
-    permit = bench.axis.permit(move.verb, right)
-    return await bench.axis.in_turn(move, permit, lambda: bench.axis.execute(move, command_id, permit))
+    permit = bench.axis.permit(command_id, move.verb, right)
+    return await bench.axis.in_turn(move, permit, lambda: bench.axis.execute(move, permit))
 
 
 def buffered(position: float = 20.0, mode: BufferMode = BufferMode.BUFFERED) -> MoveAbsolute:

@@ -46,6 +46,13 @@ def test_an_axis_without_a_scale_works_in_counts(tmp_path):
 
     assert rig.bus[0].axis[0].unit == "count"
     assert rig.bus[0].axis[0].counts_per_unit is None
+    assert rig.bus[0].axis[0].signed_counts_per_unit == 1
+
+
+def test_a_reversed_axis_counts_backwards(tmp_path):
+    rig = load(tmp_path, GOOD.replace("acceleration = 100", 'acceleration = 100\ndirection = "reverse"'))
+
+    assert rig.bus[0].axis[0].signed_counts_per_unit == -1000
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,7 @@
-from dataclasses import replace
-
 import pytest
 
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.guards import AxisView
+from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.errors import (
     AccelerationLimit,
     AxisUnreachable,
@@ -14,19 +12,21 @@ from ldcnd.errors import (
     WrongState,
 )
 from ldcnd.model.meta import AxisLimits
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.model.samples import AxisState, FaultEntry, LinkState
 
-READY = AxisView(
-    name="x",
-    unit="mm",
-    state=AxisState.STANDSTILL,
-    enabled=True,
-    referenced=True,
-    position_lost=False,
-    stop_latched=False,
-    link=LinkState.UP,
-    faults=(),
-)
+
+
+def ready(*faults: str, **changes: object) -> AxisTracker:
+    """Return an axis that stands and is powered, but for what is changed."""
+    tracker = AxisTracker("x", "mm")
+    tracker.state, tracker.enabled, tracker.referenced, tracker.link = AxisState.STANDSTILL, True, True, LinkState.UP
+    tracker.active_faults = tuple(FaultEntry(code=text, text=text, since=0, source="drive") for text in faults)
+    for name, value in changes.items():
+        setattr(tracker, name, value)
+    return tracker
+
+
+READY = ready()
 LIMITS = AxisLimits(position_min=-10, position_max=10, velocity=5, acceleration=50)
 
 
@@ -40,7 +40,7 @@ def test_an_axis_that_stands_and_is_powered_may_move():
         ({"link": LinkState.DOWN}, AxisUnreachable, "power"),
         ({"stop_latched": True}, StopLatched, "reset"),
         ({"stop_pending": True}, StopLatched, "wait"),
-        ({"state": AxisState.ERROR_STOP, "faults": ("overheat",)}, WrongState, "reset"),
+        ({"state": AxisState.ERROR_STOP}, WrongState, "reset"),
         ({"state": AxisState.DISABLED, "enabled": False}, WrongState, "power"),
         ({"state": AxisState.DISCRETE_MOTION}, WrongState, "halt"),
         ({"state": AxisState.CONTINUOUS_MOTION}, WrongState, "halt"),
@@ -50,7 +50,7 @@ def test_an_axis_that_stands_and_is_powered_may_move():
 )
 def test_a_refusal_names_the_axis_and_the_way_out(change, error, remedy):
     with pytest.raises(error) as refusal:
-        guards.check_may_move(replace(READY, **change))
+        guards.check_may_move(ready(**change))
 
     assert "axis x" in refusal.value.message
     assert refusal.value.axis == "x"
@@ -59,12 +59,12 @@ def test_a_refusal_names_the_axis_and_the_way_out(change, error, remedy):
 
 def test_a_faulted_axis_says_what_its_fault_is():
     with pytest.raises(WrongState, match="overheat"):
-        guards.check_may_move(replace(READY, state=AxisState.ERROR_STOP, faults=("overheat",)))
+        guards.check_may_move(ready("overheat", state=AxisState.ERROR_STOP))
 
 
 def test_an_unreferenced_axis_takes_no_absolute_target():
     with pytest.raises(NotReferenced) as refusal:
-        guards.check_referenced(replace(READY, referenced=False))
+        guards.check_referenced(ready(referenced=False))
 
     assert "home" in refusal.value.remedy
 
@@ -109,6 +109,6 @@ def test_a_lost_position_gets_no_meaning_before_reset():
     guards.check_position_kept(READY)
 
     with pytest.raises(WrongState, match="its position is lost: the counter wrapped") as refusal:
-        guards.check_position_kept(replace(READY, position_lost=True, faults=("the counter wrapped",)))
+        guards.check_position_kept(ready("the counter wrapped", position_lost=True))
 
     assert refusal.value.remedy == "send reset first"

@@ -6,7 +6,6 @@ from pydantic import ValidationError
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.procedures.home import plan_search
 from ldcnd.drivers.driver import Homes, StopMode
-from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.model.commands import Home, HomeMethod
 
@@ -97,7 +96,7 @@ def test_limit_switches_are_those_of_the_drive_whatever_the_axis_calls_forward(m
     drive.home_methods = frozenset(HomeMethod)
     search = plan_search(axis(), drive, Home(method=method, velocity=velocity))
 
-    assert search.runs_onto_switch(Scale(1000, reverse=reverse)) is onto
+    assert search.runs_onto_switch(-1000 if reverse else 1000) is onto
 
 
 def test_a_tracking_step_that_would_trip_the_drive_is_no_configuration():

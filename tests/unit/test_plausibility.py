@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.plausibility import NOISE_COUNTS, ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.drivers.driver import AxisReading, Fault
-from ldcnd.drivers.scaling import Scale
 from ldcnd.exchange import Timing
 
 CONFIG = AxisConfig.model_validate(
@@ -31,7 +30,7 @@ class Axis:
     """A gate that has believed a reading, and the clock of its line."""
 
     def __init__(self, reading: AxisReading = RESTING) -> None:
-        self.gate = PlausibilityGate(CONFIG, Scale(1000.0))
+        self.gate = PlausibilityGate(CONFIG)
         self.now_s = 0.0
         self.read(reading)
         moved = reading.position_counts + round(reading.velocity_counts_per_s * EXCHANGE_S)
@@ -49,7 +48,7 @@ def at(counts: int, velocity: float = 0.0) -> AxisReading:
 
 
 def test_the_first_reading_is_believed_but_nothing_has_jumped_away_from_it():
-    gate = PlausibilityGate(CONFIG, Scale(1000.0))
+    gate = PlausibilityGate(CONFIG)
     assert (gate.jumped, gate.foreign) == (False, False)
 
     verdicts = [

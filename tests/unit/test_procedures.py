@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis.permit import Right
+from ldcnd.daemon.axis.guards import Right
 from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.drivers.driver import AnalogMotion, Fault, HomeCapture, Motion, PwmOutput, StopMode
 from ldcnd.errors import (

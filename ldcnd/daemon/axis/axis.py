@@ -19,9 +19,8 @@ from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.daemon.axis.parameters import Parameters
-from ldcnd.daemon.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Unmoved
+from ldcnd.daemon.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
-from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.procedures.jog import Hold
 from ldcnd.daemon.axis.reference import ReferenceKeeper
 from ldcnd.daemon.axis.state import (
@@ -40,7 +39,6 @@ from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.driver import AxisReading, Drive, Fault, Moves, Readable, Records, StopMode, parameters_of
 from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.network import BringUpReport
-from ldcnd.drivers.scaling import Scale
 from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests, WrongState
 from ldcnd.exchange import Timing
@@ -71,14 +69,14 @@ STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
 
 
-Obey = Callable[[Turn, AxisCommand[CommandReply]], Awaitable[CommandReply]]
+Obey = Callable[[Permit, AxisCommand[CommandReply]], Awaitable[CommandReply]]
 
 
 @dataclass(frozen=True, slots=True)
 class WaitingCommand:
     """A command that found the axis at work, and the caller who waits for its answer."""
 
-    turn: Turn
+    permit: Permit
     request: AxisCommand[CommandReply]
     future: "asyncio.Future[CommandReply]"
 
@@ -87,7 +85,7 @@ class WaitingCommand:
         if self.future.done():
             return
         try:
-            reply = await obey(self.turn, self.request)
+            reply = await obey(self.permit, self.request)
         except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
             self.refuse(error)
             return
@@ -100,7 +98,7 @@ class WaitingCommand:
             self.future.set_exception(error)
 
 
-class AxisTurns:
+class CommandQueue:
     """Order of the commands of one axis.
 
     Attributes:
@@ -118,7 +116,7 @@ class AxisTurns:
         """Whether a command that comes now need not wait for another one, or for a step."""
         return not (self._waiting or self.at_work.locked())
 
-    async def wait(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
+    async def wait(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
         """Wait behind all others; return the answer.
 
         Raises:
@@ -133,7 +131,7 @@ class AxisTurns:
                 remedy="wait for a reply before sending the next command",
             )
         future: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
-        self._waiting.append(WaitingCommand(turn, request, future))
+        self._waiting.append(WaitingCommand(permit, request, future))
         self.wake()
         return await future
 
@@ -202,15 +200,14 @@ class AxisService:
     ) -> None:
         self.config = config
         self.driver = driver
-        self.scale = Scale(config.counts_per_unit or 1.0, reverse=config.direction == "reverse")
         self.stoppable = Verb.STOP in driver.capabilities
         tracker = AxisTracker if self.stoppable else ObservedTracker
-        self._arrivals = Arrivals(config, self.scale, self._shown_at, ended, note)
+        self._arrivals = Arrivals(config, self._shown_at, ended, note)
         self.tracker = tracker(config.name, config.unit, self._arrivals.ended)
         self.telemetry = AxisTelemetry(
             publisher,
             self.tracker,
-            self.scale,
+            config.signed_counts_per_unit,
             adc_full_scale=driver.adc_full_scale,
             adc_volts=config.adc_volts,
             shows_inputs=driver.shows_inputs,
@@ -227,11 +224,11 @@ class AxisService:
         )
         self._recalled: float | None = None
         self._motion = AxisMotion(
-            config, moves, self.scale, self.tracker, self.telemetry, clock, self._read, self.reference
+            config, moves, self.tracker, self.telemetry, clock, self._read, self.reference
         )
         self._commands = AxisCommands(self._motion)
-        self._plausibility = PlausibilityGate(config, self.scale)
-        self._turns = AxisTurns(config.name)
+        self._plausibility = PlausibilityGate(config)
+        self._queue = CommandQueue(config.name)
         parameters = parameters_of(driver)
         self._parameters = Parameters(driver, parameters) if parameters else None
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
@@ -252,7 +249,9 @@ class AxisService:
         if isinstance(driver, Records):
             return driver.tracer
         readable = driver if isinstance(driver, Readable) else self._moves
-        channels = host_channels(readable, self.config.unit, self.scale, self.telemetry.position)
+        channels = host_channels(
+            readable, self.config.unit, self.config.signed_counts_per_unit, self.telemetry.position
+        )
         return HostTracer(self._bus, readable, channels, self._require_reachable)
 
     # -- life --------------------------------------------------------------------------------------------------------
@@ -263,9 +262,9 @@ class AxisService:
         try:
             while True:
                 if not self._commands.step_due:
-                    await self._turns.woken(self._commands.deadline_s)
-                async with self._turns.at_work:
-                    waiting = self._turns.take()
+                    await self._queue.woken(self._commands.deadline_s)
+                async with self._queue.at_work:
+                    waiting = self._queue.take()
                     if waiting:
                         await waiting.carry_out(self._obey)
                     else:
@@ -275,7 +274,7 @@ class AxisService:
             self._changed.set()
             if waiting:
                 waiting.refuse(self._gate.ending())
-            self._turns.refuse(self._gate.ending())
+            self._queue.refuse(self._gate.ending())
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
@@ -362,7 +361,7 @@ class AxisService:
         if self._commands.procedure is not None:
             self._commands.observed(reading, timing)
             if self._commands.step_due:
-                self._turns.wake()
+                self._queue.wake()
         if self._inherited:
             self._end_what_has_no_end(reading, timing.sent_at_s)
         t, t_error_ns = self._clock.stamp(timing)
@@ -383,7 +382,7 @@ class AxisService:
                 self._say_changed(DRIVE_CHANGED, reading.altered)
         elif reading.profile_done or not reading.enabled or not self.stoppable:
             return
-        elif tracker.at_rest and not tracker.command and self._turns.free and tracker.concerns(timing):
+        elif tracker.at_rest and not tracker.command and self._queue.free and tracker.concerns(timing):
             self._changed_by_another(DRIVE_CHANGED, "it began to move without a command of this daemon")
 
     def _changed_by_another(self, fault: Fault, what: str) -> None:
@@ -447,47 +446,40 @@ class AxisService:
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
-    def permit(self, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
+    def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
         """Return permission for a command that was admitted just now; a stop makes it void."""
-        return self._gate.permit(verb, right)
+        return self._gate.permit(command_id, verb, right)
 
-    async def execute(
-        self,
-        command: AxisCommand[CommandReply],
-        command_id: str | None = None,
-        permit: Permit | None = None,
-    ) -> CommandReply:
+    async def execute(self, command: AxisCommand[CommandReply], permit: Permit | None = None) -> CommandReply:
         """Carry out a command in its turn; returns once the drive has acknowledged it.
 
         Args:
             command: what to do.
-            command_id: names the command; one is made when it is missing.
             permit: as made when it was admitted; a caller inside the daemon needs none.
 
         Raises:
             RequestRefused: it cannot be done; nothing was sent.
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
-        command_id = command_id or self._next_command_id()
+        permit = permit or self.permit(self._next_command_id(), command.verb)
         if isinstance(command, Stop | QuickStop) and self.stoppable:
             await self.stop(StopMode.SMOOTH if isinstance(command, Stop) else StopMode.ABRUPT)
-            return CommandReply(command_id=command_id, axis=self.config.name, verb=command.verb)
+            return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
         if command.verb not in self.driver.capabilities:
             raise NotSupported(
                 f"axis {self.config.name}: {self.config.model} cannot {command.verb}",
                 axis=self.config.name,
                 value=command.verb.value,
             )
-        turn = Turn(command_id, command.verb, permit or self.permit(command.verb))
-        turn.permit.ask()
-        if not self._turns.free:
-            return await self._turns.wait(turn, command)
+        permit.ask()
+        if not self._queue.free:
+            return await self._queue.wait(permit, command)
         try:
-            async with self._turns.at_work:
-                return await self._obey(turn, command)
+            async with self._queue.at_work:
+                return await self._obey(permit, command)
         finally:
             if not math.isinf(self._commands.deadline_s):
-                self._turns.wake()  # for the steps of what has begun
+                self._queue.wake()  # for the steps of what has begun
 
     async def in_turn(self, move: Move, permit: Permit, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
@@ -518,16 +510,16 @@ class AxisService:
         Raises:
             LdcndError: a motion under way could not be changed; those that begin have the new one all the same.
         """
-        self._motion.speed_share = self.tracker.speed_share = share
+        self.tracker.speed_share = share
         self.telemetry.state(self._clock.now_ns())
         if share <= 0:
             if not self.at_work or self.tracker.state is AxisState.DISABLED:
                 return False, False
             await self.bring_to_rest(StopMode.SMOOTH)
             return False, True
-        async with self._turns.at_work:
+        async with self._queue.at_work:
             changed = await self._commands.change_speed()
-        self._turns.wake()
+        self._queue.wake()
         return changed, False
 
     def begin_hold(self, command_id: str, request: Jog) -> Hold:
@@ -542,7 +534,7 @@ class AxisService:
             RequestRefused: a limit forbids the velocity.
         """
         reply = self._commands.renew_jog(request, command_id)
-        self._turns.wake()
+        self._queue.wake()
         return reply
 
     def planned(self, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:
@@ -599,7 +591,7 @@ class AxisService:
         self._gate.overtake(by)
         self._changed.set()
         overtaken = self._gate.overtaken("a queued command")
-        self._turns.refuse(overtaken)
+        self._queue.refuse(overtaken)
         return overtaken
 
     @property
@@ -705,20 +697,20 @@ class AxisService:
         self.tracker.stop_unconfirmed(self._clock.now_ns())
         self.stop_wanted.set()
 
-    async def _obey(self, turn: Turn, command: AxisCommand[CommandReply]) -> CommandReply:
-        turn.permit.ask()
+    async def _obey(self, permit: Permit, command: AxisCommand[CommandReply]) -> CommandReply:
+        permit.ask()
         if command.capability is Capability.TRACES:
-            return await self.traces.carry_out(turn.command_id, command)
+            return await self.traces.carry_out(permit.command_id, command)
         if self._parameters and command.capability is Capability.PARAMETERS:
-            return await self._parameters.carry_out(turn.command_id, command)
+            return await self._parameters.carry_out(permit.command_id, command)
         try:
-            return await self._commands.carry_out(turn, command)
+            return await self._commands.carry_out(permit, command)
         finally:
             if self.tracker.settle:  # the caller that waits for the reply goes first
                 asyncio.get_running_loop().call_later(LOOK_LATER_S, self._ask_soon)
 
     def _require_reachable(self) -> None:
-        guards.check_reachable(self.tracker.view())
+        guards.check_reachable(self.tracker)
 
     async def _read(self) -> AxisReading:
         """Read the drive's state out of turn, until two readings agree.

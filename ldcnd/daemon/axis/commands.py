@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
-from ldcnd.daemon.axis.permit import cannot
-from ldcnd.daemon.axis.procedure import NEVER_S, Procedure, Turn
+from ldcnd.daemon.axis.guards import Permit, cannot
+from ldcnd.daemon.axis.procedure import NEVER_S, Procedure
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.approach import ApproachMove
 from ldcnd.daemon.axis.procedures.group import GroupMember, GroupMoveRequest
@@ -17,7 +17,7 @@ from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE, VelocityChange, runs
-from ldcnd.daemon.axis.state import Completion
+from ldcnd.daemon.axis.state import MOTION_STATES, Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
 from ldcnd.errors import (
     DriveFault,
@@ -81,10 +81,10 @@ class AxisCommands:
         self._gains = motion.driver.spec.gains
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
-        self._moved: tuple[Turn, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
+        self._moved: tuple[Permit, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
         self._retry_s: float | None = None  # when the step that was not taken is taken again
 
-    async def carry_out(self, turn: Turn, request: AxisCommand[CommandReply]) -> CommandReply:
+    async def carry_out(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says; returns once the drive has acknowledged it.
 
         Raises:
@@ -92,53 +92,53 @@ class AxisCommands:
             DriveFault: the drive's condition forbids it.
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
-        if procedure := self._procedure_for(turn, request):
+        if procedure := self._procedure_for(permit, request):
             return await self._undertake(procedure)
         match request:
             case Power():
-                return await self._power(turn, on=request.on)
+                return await self._power(permit, on=request.on)
             case MoveAbsolute():
-                return await self._move_absolute(turn, request)
+                return await self._move_absolute(permit, request)
             case MoveRelative():
-                return await self._move_relative(turn, request)
+                return await self._move_relative(permit, request)
             case MoveVelocity():
-                return await self._move_velocity(turn, request)
+                return await self._move_velocity(permit, request)
             case SetPosition():
-                return await self._set_position(turn, request.position)
+                return await self._set_position(permit, request.position)
             case SetGains():
-                return await self._set_gains(turn, request)
+                return await self._set_gains(permit, request)
             case SetOutputs():
-                return await self._set_outputs(turn, request)
+                return await self._set_outputs(permit, request)
             case Halt():
-                return await self._halt(turn)
+                return await self._halt(permit)
             case Reset():
-                return await self._reset(turn)
+                return await self._reset(permit)
             case _:
                 raise NotSupported(f"axis {self._config.name} cannot {turn.verb}", axis=self._config.name)
 
-    def _procedure_for(self, turn: Turn, request: AxisCommand[CommandReply]) -> Procedure | None:
+    def _procedure_for(self, permit: Permit, request: AxisCommand[CommandReply]) -> Procedure | None:
         """Return what carries out a request that takes more than one step."""
         match request:
             case PathShareRequest():
-                return PathMember(self._motion, turn, request)
+                return PathMember(self._motion, permit, request)
             case GroupMoveRequest():
-                return GroupMember(self._motion, turn, request)
+                return GroupMember(self._motion, permit, request)
             case Home():
-                return HomeSequence(self._motion, turn, request)
+                return HomeSequence(self._motion, permit, request)
             case Probe():
-                return ProbeMove(self._motion, turn, request)
+                return ProbeMove(self._motion, permit, request)
             case MoveAnalog():
-                return AnalogMove(self._motion, turn, request)
+                return AnalogMove(self._motion, permit, request)
             case SetPwm():
-                return PwmRun(self._motion, turn, request)
+                return PwmRun(self._motion, permit, request)
             case Jog():
-                hold = self.holds.get(turn.command_id)
+                hold = self.holds.get(permit.command_id)
                 now_s = self._motion.clock.now_s()
-                return HeldJog(self._motion, turn, hold or self.holds.begin(turn.command_id, request, now_s))
+                return HeldJog(self._motion, permit, hold or self.holds.begin(permit.command_id, request, now_s))
             case MoveVelocity() if runs(self._tracker) and not self._driver.retargets:
-                return VelocityChange(self._motion, turn, request)
+                return VelocityChange(self._motion, permit, request)
             case Track():
-                return SetPoint(self._motion, turn, request, self.procedure)
+                return SetPoint(self._motion, permit, request, self.procedure)
             case _:
                 return None
 
@@ -156,7 +156,7 @@ class AxisCommands:
             hold.over = True
         now_s = self._motion.clock.now_s()
         hold.check(now_s)
-        plan = self._motion.planner.at_velocity(self._tracker.view(), request.velocity, request.acceleration)
+        plan = self._motion.plan_at(request.velocity, request.acceleration)
         hold.renew(request, now_s)
         if isinstance(procedure, HeldJog) and procedure.wants_step:
             self.step_due = True
@@ -227,7 +227,7 @@ class AxisCommands:
         except (RequestRefused, DriveFault) as error:
             if self._tracker.energised and not procedure.outlived(self._tracker):
                 await self._driver.stop(StopMode.SMOOTH)  # of the step before something may still run
-                self._motion.stopping(procedure.turn.command_id, procedure.turn.verb)
+                self._motion.stopping(procedure.permit.command_id, procedure.permit.verb)
                 self._tracker.failing(error.message)
             elif not procedure.outlived(self._tracker):
                 self._tracker.finished(error.message)
@@ -247,58 +247,57 @@ class AxisCommands:
             self._take_up(procedure)
             raise
         command = self._tracker.command
-        if command and command.command_id == procedure.turn.command_id:  # else a stop has ended it meanwhile
+        if command and command.command_id == procedure.permit.command_id:  # else a stop has ended it meanwhile
             self._take_up(procedure)
         return reply
 
     # -- power -------------------------------------------------------------------------------------------------------
 
-    async def _power(self, turn: Turn, *, on: bool) -> CommandReply:
-        view = self._tracker.view()
+    async def _power(self, permit: Permit, *, on: bool) -> CommandReply:
+        tracker = self._tracker
         if on:
-            guards.check_may_power_on(view)
-            guards.check_stands(view)
+            guards.check_may_power_on(tracker)
+            guards.check_stands(tracker)
             if self._gains is None and isinstance(self._driver, TakesGains):
                 raise WrongState(
-                    f"axis {view.name} has no gains: its loop cannot close",
-                    axis=view.name,
+                    f"axis {tracker.name} has no gains: its loop cannot close",
+                    axis=tracker.name,
                     remedy=Remedy("configure gains or {}", step("set_gains")),
                 )
         else:
-            guards.check_reachable(view)
+            guards.check_reachable(tracker)
         if on:
-            await turn.permit.power_on()
+            await permit.power_on()
         else:
             await self._driver.stop(StopMode.OFF)
         self._drop_procedure()
         self._motion.target_counts = None
         self._tracker.powered(on=on, now_s=self._motion.clock.now_s())
         self._motion.publish_state()
-        return self._motion.reply(turn)
+        return self._motion.reply(permit)
 
-    async def _halt(self, turn: Turn) -> CommandReply:
-        view = self._tracker.view()
-        guards.check_reachable(view)
-        if view.state in guards.MOTION_STATES or self._moves_by_force():
+    async def _halt(self, permit: Permit) -> CommandReply:
+        tracker = self._tracker
+        guards.check_reachable(tracker)
+        if tracker.state in MOTION_STATES or self._moves_by_force():
             await self._driver.stop(StopMode.SMOOTH)
-            self.brought_to_rest(turn.command_id, turn.verb)
-        return self._motion.reply(turn)
+            self.brought_to_rest(permit.command_id, permit.verb)
+        return self._motion.reply(permit)
 
-    async def _reset(self, turn: Turn) -> CommandReply:
+    async def _reset(self, permit: Permit) -> CommandReply:
         """Recover from what has stopped the motor; mere warnings are cleared with a closed loop as it is.
 
         A drive whose loop is open may hold a cause that it does not show: a Logosol drive hides a position error while
         its power driver is off, and a host that took it over has not seen what came before.
         """
         tracker = self._tracker
-        view = tracker.view()
-        guards.check_reachable(view)
-        guards.check_stop_confirmed(view)
-        guards.check_stands(view)  # a stop that is under way keeps its latch
+        guards.check_reachable(tracker)
+        guards.check_stop_confirmed(tracker)
+        guards.check_stands(tracker)  # a stop that is under way keeps its latch
         if tracker.state is AxisState.ERROR_STOP and self._moves_by_force():
             raise WrongState(
-                f"axis {view.name} still moves, or may: a reset would switch its motor off at speed",
-                axis=view.name,
+                f"axis {tracker.name} still moves, or may: a reset would switch its motor off at speed",
+                axis=tracker.name,
                 value=tracker.moving.value,
                 remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
             )
@@ -309,10 +308,10 @@ class AxisCommands:
             tracker.switched(on=False, now_s=self._motion.clock.now_s())
         elif tracker.active_faults and isinstance(self._driver, Warns):
             await self._driver.clear_warnings()
-        turn.still_wanted()  # a stop that came meanwhile keeps its latch
+        permit.still_wanted()  # a stop that came meanwhile keeps its latch
         tracker.cleared(self._motion.clock.now_s())
         self._motion.publish_state()
-        return self._motion.reply(turn)
+        return self._motion.reply(permit)
 
     def _moves_by_force(self) -> bool:
         """Tell whether the motor has voltage and turns, or may, whatever the state says."""
@@ -338,7 +337,7 @@ class AxisCommands:
 
     def _check_may_start(self, request: Move) -> None:
         if not (self.retargets(request) or (isinstance(request, MoveVelocity) and runs(self._tracker))):
-            guards.check_may_move(self._tracker.view())
+            guards.check_may_move(self._tracker)
 
     def check(self, request: Move) -> None:
         """Refuse a move that could not follow what the axis is doing now; nothing is halted for it.
@@ -346,7 +345,7 @@ class AxisCommands:
         Raises:
             RequestRefused: as the move itself would be, once the axis stands.
         """
-        guards.check_may_follow(self._tracker.view())
+        guards.check_may_follow(self._tracker)
         match request:
             case MoveAbsolute():
                 goal = self._plan_absolute(request)
@@ -357,37 +356,37 @@ class AxisCommands:
             case MoveVelocity():
                 self._plan_velocity(request)
             case Jog():
-                self._motion.planner.at_velocity(self._tracker.view(), request.velocity, request.acceleration)
+                self._motion.plan_at(request.velocity, request.acceleration)
 
-    async def _move_absolute(self, turn: Turn, request: MoveAbsolute) -> CommandReply:
+    async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(request)
-        return await self._move_to(turn, request, self._plan_absolute(request))
+        return await self._move_to(permit, request, self._plan_absolute(request))
 
-    async def _move_relative(self, turn: Turn, request: MoveRelative) -> CommandReply:
+    async def _move_relative(self, permit: Permit, request: MoveRelative) -> CommandReply:
         self._check_may_start(request)
         if self._motion.target_counts is None:
             here = (await self._motion.read()).position_counts  # one reading alone may be wrong
-            turn.still_wanted()
+            permit.still_wanted()
             self._check_may_start(request)
-            return await self._move_to(turn, request, self._plan_relative(request, here))
-        return await self._move_to(turn, request, self._plan_relative(request))
+            return await self._move_to(permit, request, self._plan_relative(request, here))
+        return await self._move_to(permit, request, self._plan_relative(request))
 
-    async def _move_to(self, turn: Turn, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
+    async def _move_to(self, permit: Permit, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
         """Go to a goal, from the configured side where there is one."""
         if self._motion.config.approach and (
             first := self._motion.before_approach(goal, request.velocity, request.acceleration)
         ):
-            return await self._undertake(ApproachMove(self._motion, turn, request, first, goal))
-        return await self._move(turn, goal, AxisState.DISCRETE_MOTION)
+            return await self._undertake(ApproachMove(self._motion, permit, request, first, goal))
+        return await self._move(permit, goal, AxisState.DISCRETE_MOTION)
 
-    async def _move_velocity(self, turn: Turn, request: MoveVelocity) -> CommandReply:
+    async def _move_velocity(self, permit: Permit, request: MoveVelocity) -> CommandReply:
         self._check_may_start(request)
         velocity, bounded = self._plan_velocity(request)
-        reply = await self._move(turn, bounded, AxisState.CONTINUOUS_MOTION)
+        reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity})
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
-        guards.check_referenced(self._tracker.view())
+        guards.check_referenced(self._tracker)
         position = self._motion.unwrapped(request.position, request.direction)
         return self._motion.plan_to(position, request.velocity, request.acceleration)
 
@@ -401,28 +400,28 @@ class AxisCommands:
 
     def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan]:
         """Return the velocity as the drive will have it, and a trapezoid that ends by itself even if this host dies."""
-        view, planner = self._tracker.view(), self._motion.planner
-        plan = planner.at_velocity(view, request.velocity, request.acceleration)
-        end = planner.limit_ahead(request.velocity) if view.referenced else None
+        motion = self._motion
+        plan = motion.plan_at(request.velocity, request.acceleration)
+        end = motion.limit_ahead(request.velocity) if self._tracker.referenced else None
         if end is None:
-            here = self._motion.telemetry.position(self._motion.latest().position_counts)
+            here = motion.telemetry.position(motion.latest().position_counts)
             longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(plan.motion.velocity_counts_per_s)
-            end = here + plan.velocity * min(self._motion.config.jog_horizon_s, longest_s)
-        return plan.velocity, self._motion.plan_to(end, abs(request.velocity), request.acceleration)
+            end = here + plan.velocity * min(motion.config.jog_horizon_s, longest_s)
+        return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration)
 
     async def _move(
         self,
-        turn: Turn,
+        permit: Permit,
         plan: MotionPlan,
         state: AxisState,
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
-        await turn.permit.load(plan.motion)
-        self._moved = turn, plan.motion, self._motion.speed_share
-        await self._motion.start(turn, state, completion, plan=plan)
+        await permit.load(plan.motion)
+        self._moved = permit, plan.motion, self._tracker.speed_share
+        await self._motion.start(permit, state, completion, plan=plan)
         self._motion.target_counts = plan.motion.target_counts
         self._motion.approached = state is AxisState.DISCRETE_MOTION
-        return self._motion.reply(turn).model_copy(
+        return self._motion.reply(permit).model_copy(
             update={
                 "position": self._motion.shown(plan.position),
                 "velocity": plan.velocity,
@@ -440,24 +439,24 @@ class AxisCommands:
             RequestRefused: it may not be moved any more.
             BusError: the line failed; it goes on at the one velocity or the other.
         """
-        tracker, share = self._tracker, self._motion.speed_share
+        tracker, share = self._tracker, self._tracker.speed_share
         command = tracker.command
         if isinstance(self.procedure, HeldJog):
             self.step_due = self.step_due or self.procedure.wants_step
             return self.step_due
         if self._moved is None or not self._driver.retargets or command is None or share <= 0:
             return False
-        turn, motion, before = self._moved
-        if command.command_id != turn.command_id or command.completion is not Completion.PROFILE or share == before:
+        permit, motion, before = self._moved
+        if command.command_id != permit.command_id or command.completion is not Completion.PROFILE or share == before:
             return False
         changed = self._driver.quantise(
             replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
         )
-        await turn.permit.load(changed)
+        await permit.load(changed)
         if tracker.command is not command:
             return False  # it has ended meanwhile: what was loaded is not started
-        await turn.permit.start()
-        self._moved = turn, changed, share
+        await permit.start()
+        self._moved = permit, changed, share
         way = abs((changed.target_counts or 0) - self._motion.latest().position_counts)
         tracker.ends_after(
             rest_of_profile_s(
@@ -470,24 +469,24 @@ class AxisCommands:
 
     # -- registers ---------------------------------------------------------------------------------------------------
 
-    async def _set_position(self, turn: Turn, position: float) -> CommandReply:
+    async def _set_position(self, permit: Permit, position: float) -> CommandReply:
         motion = self._motion
-        view = self._tracker.view()
-        guards.check_reachable(view)
-        guards.check_stands(view)
-        guards.check_position_kept(view)
+        tracker = self._tracker
+        guards.check_reachable(tracker)
+        guards.check_stands(tracker)
+        guards.check_position_kept(tracker)
         here = await motion.read()  # one reading alone may be wrong
         await motion.reference.forget()
-        turn.still_wanted()
-        guards.check_position_kept(self._tracker.view())
-        motion.telemetry.origin_counts = here.position_counts - motion.scale.to_counts(position)
+        permit.still_wanted()
+        guards.check_position_kept(self._tracker)
+        motion.telemetry.origin_counts = here.position_counts - position * motion.counts_per_unit
         self._tracker.referenced = True
         motion.publish_state()
-        return motion.reply(turn).model_copy(update={"position": position})
+        return motion.reply(permit).model_copy(update={"position": position})
 
-    async def _set_gains(self, turn: Turn, request: SetGains) -> CommandReply:
-        view = self._tracker.view()
-        guards.check_reachable(view)
+    async def _set_gains(self, permit: Permit, request: SetGains) -> CommandReply:
+        tracker = self._tracker
+        guards.check_reachable(tracker)
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name)) is not None}
         if self._gains is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
@@ -498,11 +497,11 @@ class AxisCommands:
         gains = self._gains or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
         changed = Gains(**{name: asked.get(name, getattr(gains, name)) for name in Gains.__slots__})
         if changed.sr != gains.sr:
-            guards.check_stands(view)
+            guards.check_stands(tracker)
         self._check_tracking_step(changed)
-        await turn.permit.set_gains(changed)
+        await permit.set_gains(changed)
         self._gains = changed
-        return self._motion.reply(turn)
+        return self._motion.reply(permit)
 
     def _check_tracking_step(self, gains: Gains) -> None:
         """Refuse a position error limit that the next set-point of `track` could exceed.
@@ -513,7 +512,7 @@ class AxisCommands:
         config = self._motion.config
         if config.tracking is None:
             return
-        step_counts = math.ceil(config.tracking.step * self._motion.scale.counts_per_unit)
+        step_counts = math.ceil(config.tracking.step * abs(self._motion.counts_per_unit))
         if gains.el <= step_counts:
             raise ValueOutOfRange(
                 f"axis {config.name}: el {gains.el} is not above a tracking step of {step_counts} counts",
@@ -524,9 +523,9 @@ class AxisCommands:
                 remedy="configure a shorter tracking step",
             )
 
-    async def _set_outputs(self, turn: Turn, request: SetOutputs) -> CommandReply:
-        guards.check_reachable(self._tracker.view())
+    async def _set_outputs(self, permit: Permit, request: SetOutputs) -> CommandReply:
+        guards.check_reachable(self._tracker)
         if not isinstance(self._driver, HasOutputs):
             raise cannot(self._driver.spec, "set outputs")
         await self._driver.set_outputs(request.limit1, request.limit2)
-        return self._motion.reply(turn)
+        return self._motion.reply(permit)

@@ -1,44 +1,58 @@
-"""May this start now? Pure checks; each refusal says what, which limit, and what to do."""
+"""Permission to move one axis: what must hold before a motion starts, the gate that asks, and the only way to send it.
 
-from dataclasses import dataclass
+The checks are pure; each refusal says what, which limit, and what to do. A `Permit` is made when a command is admitted
+and travels with it, from its turn in the queue of its axis to its last step. The rest of the daemon holds a
+`QuietDrive`, which has no call that can move; those are methods of the permit. Each of them checks permission directly
+before its first packet, and the bus checks again when the turn of each such packet comes. So a move that waited (for
+its turn, for the motion ahead of it, for the other members of its group, for a step of a homing, for the line) is
+judged by the state at its start, not by the state at its arrival.
+"""
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NoReturn, Protocol
+
+from typing_extensions import override
+
+from ldcnd.daemon.axis.state import MOTION_STATES, AxisTracker
+from ldcnd.drivers.driver import (
+    AnalogMotion,
+    AxisReading,
+    AxisSpec,
+    Drive,
+    Gains,
+    HomeCapture,
+    Homes,
+    Motion,
+    Moves,
+    PathStatus,
+    PwmOutput,
+    StopMode,
+    TakesGains,
+    Tracks,
+    WalksPaths,
+)
 from ldcnd.errors import (
     AccelerationLimit,
     AxisUnreachable,
     NotReferenced,
+    NotSupported,
     PositionLimit,
     Remedy,
+    RequestRefused,
+    ShuttingDown,
     StopLatched,
     VelocityLimit,
     WrongState,
     step,
 )
+from ldcnd.exchange import Condition, Exchange, only_while
+from ldcnd.model.commands import Verb
 from ldcnd.model.meta import AxisLimits
-from ldcnd.model.samples import AxisState, LinkState
-
-MOTION_STATES = frozenset(
-    {AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING}
-)
+from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
 
 
-@dataclass(frozen=True, slots=True)
-class AxisView:
-    """State of an axis for the guards; faults are texts; `position_lost` while one of them has lost the position."""
-
-    name: str
-    unit: str
-    state: AxisState
-    enabled: bool
-    referenced: bool
-    position_lost: bool
-    stop_latched: bool
-    link: LinkState
-    faults: tuple[str, ...]
-    stop_pending: bool = False
-    reference_refused: str = ""
-
-
-def check_reachable(axis: AxisView) -> None:
+def check_reachable(axis: AxisTracker) -> None:
     """Refuse when the drive does not answer."""
     if axis.link is LinkState.DOWN:
         raise AxisUnreachable(
@@ -46,14 +60,14 @@ def check_reachable(axis: AxisView) -> None:
         )
 
 
-def check_not_latched(axis: AxisView) -> None:
+def check_not_latched(axis: AxisTracker) -> None:
     """Refuse while a stop is latched, or not confirmed by the drive."""
     check_stop_confirmed(axis)
     if axis.stop_latched:
         raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
 
 
-def check_stop_confirmed(axis: AxisView) -> None:
+def check_stop_confirmed(axis: AxisTracker) -> None:
     """Refuse while the drive has not confirmed a stop."""
     if axis.stop_pending:
         raise StopLatched(
@@ -63,13 +77,13 @@ def check_stop_confirmed(axis: AxisView) -> None:
         )
 
 
-def check_not_in_error(axis: AxisView) -> None:
+def check_not_in_error(axis: AxisTracker) -> None:
     """Refuse while a fault, or a command that ended badly, waits to be acknowledged."""
     if axis.state is AxisState.ERROR_STOP:
         raise _faulted(axis)
 
 
-def check_enabled(axis: AxisView) -> None:
+def check_enabled(axis: AxisTracker) -> None:
     """Refuse a motion while the position loop is open."""
     if axis.state is AxisState.DISABLED:
         raise WrongState(
@@ -80,26 +94,26 @@ def check_enabled(axis: AxisView) -> None:
         )
 
 
-def check_may_power_on(axis: AxisView) -> None:
+def check_may_power_on(axis: AxisTracker) -> None:
     """Refuse to close the loop of an axis that is unreachable, latched or faulted."""
     check_reachable(axis)
     check_not_latched(axis)
     check_not_in_error(axis)
 
 
-def check_may_follow(axis: AxisView) -> None:
+def check_may_follow(axis: AxisTracker) -> None:
     """Refuse a motion unless the axis is powered; it may still move."""
     check_may_power_on(axis)
     check_enabled(axis)
 
 
-def check_may_move(axis: AxisView) -> None:
+def check_may_move(axis: AxisTracker) -> None:
     """Refuse a motion unless the axis is powered and stands still."""
     check_may_follow(axis)
     check_stands(axis)
 
 
-def check_stands(axis: AxisView) -> None:
+def check_stands(axis: AxisTracker) -> None:
     """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
     if axis.state in MOTION_STATES:
         raise WrongState(
@@ -110,10 +124,10 @@ def check_stands(axis: AxisView) -> None:
         )
 
 
-def check_referenced(axis: AxisView) -> None:
+def check_referenced(axis: AxisTracker) -> None:
     """Refuse an absolute position on an axis that is not referenced."""
     if not axis.referenced:
-        kept = f"; what was kept of it was refused: {axis.reference_refused}" if axis.reference_refused else ""
+        kept = f"; what was kept of it was refused: {axis.refused}" if axis.refused else ""
         raise NotReferenced(
             f"axis {axis.name} is not referenced: its position means nothing{kept}",
             axis=axis.name,
@@ -121,17 +135,17 @@ def check_referenced(axis: AxisView) -> None:
         )
 
 
-def check_position_kept(axis: AxisView) -> None:
+def check_position_kept(axis: AxisTracker) -> None:
     """Refuse to give the position a meaning while the drive says that it has lost it."""
     if axis.position_lost:
         raise WrongState(
-            f"axis {axis.name}: its position is lost: {'; '.join(axis.faults)}",
+            f"axis {axis.name}: its position is lost: {_said(axis)}",
             axis=axis.name,
             remedy=Remedy("{} first", step("reset")),
         )
 
 
-def check_position(axis: AxisView, limits: AxisLimits, position: float) -> None:
+def check_position(axis: AxisTracker, limits: AxisLimits, position: float) -> None:
     """Refuse a target outside the software limits, naming the nearest that is inside."""
     if limits.position_min is not None and position < limits.position_min:
         limit, side = limits.position_min, "below"
@@ -148,7 +162,7 @@ def check_position(axis: AxisView, limits: AxisLimits, position: float) -> None:
     )
 
 
-def check_velocity(axis: AxisView, limits: AxisLimits, velocity: float) -> None:
+def check_velocity(axis: AxisTracker, limits: AxisLimits, velocity: float) -> None:
     """Refuse a speed above the limit."""
     if limits.velocity is not None and abs(velocity) > limits.velocity:
         raise VelocityLimit(
@@ -161,7 +175,7 @@ def check_velocity(axis: AxisView, limits: AxisLimits, velocity: float) -> None:
         )
 
 
-def check_acceleration(axis: AxisView, limits: AxisLimits, acceleration: float) -> None:
+def check_acceleration(axis: AxisTracker, limits: AxisLimits, acceleration: float) -> None:
     """Refuse an acceleration above the limit."""
     if limits.acceleration is not None and acceleration > limits.acceleration:
         raise AccelerationLimit(
@@ -184,11 +198,314 @@ def no_speed(axis: str) -> WrongState:
     )
 
 
-def _faulted(axis: AxisView) -> WrongState:
-    causes = "; ".join(axis.faults) or "a command ended badly"
+def _faulted(axis: AxisTracker) -> WrongState:
+    causes = _said(axis) or "a command ended badly"
     return WrongState(
         f"axis {axis.name} is in error_stop: {causes}",
         axis=axis.name,
         value=axis.state,
         remedy=Remedy("remove the cause, then {}", step("reset")),
     )
+
+
+def _said(axis: AxisTracker) -> str:
+    return "; ".join(fault.text for fault in axis.active_faults)
+
+
+def always() -> None:
+    """Forbid nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Right:
+    """Conditions on the sender of a command, besides the state of the axis.
+
+    Attributes:
+        holds: checked before every motion of the command: its lease, no other daemon.
+        in_time: checked until its first motion has begun: its `not_after`.
+    """
+
+    holds: Condition = always
+    in_time: Condition = always
+
+    def also(self, condition: Condition) -> "Right":
+        """Return this right with one more condition, checked before every motion."""
+
+        def both() -> None:
+            self.holds()
+            condition()
+
+        return replace(self, holds=both)
+
+
+UNCONDITIONAL = Right()
+"""Right of commands that bring an axis to rest, and of callers inside the daemon."""
+
+
+class QuietDrive(Protocol):
+    """Calls to a drive that need no permission: none of them can make it move."""
+
+    spec: AxisSpec
+    adc_full_scale: int | None
+    retargets: bool
+
+    def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
+    async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
+    async def reset(self) -> None: ...  # noqa: D102
+
+
+def homing(drive: QuietDrive) -> Homes:
+    """Return a drive as one that captures its position.
+
+    Raises:
+        NotSupported: it does not.
+    """
+    if isinstance(drive, Homes):
+        return drive
+    raise cannot(drive.spec, "home")
+
+
+def walking(drive: QuietDrive) -> WalksPaths:
+    """Return a drive as one that walks paths.
+
+    Raises:
+        NotSupported: it does not.
+    """
+    if isinstance(drive, WalksPaths):
+        return drive
+    raise cannot(drive.spec, "walk a path")
+
+
+def cannot(spec: AxisSpec, what: str) -> NotSupported:
+    """Return the refusal of what a drive cannot do."""
+    return NotSupported(f"axis {spec.name}: {spec.model} cannot {what}", axis=spec.name)
+
+
+class Unmoved(Moves):
+    """Stands for the motion of a drive that takes none over its line: everything is refused."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.spec = drive.spec
+        self.identity = drive.identity
+        self.capabilities = drive.capabilities
+
+    @override
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        self._refuse(f"read {', '.join(sorted(items))} at once")
+
+    @override
+    def quantise(self, motion: Motion) -> Motion:
+        self._refuse("move")
+
+    @override
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        return ()
+
+    @override
+    async def power(self, *, on: bool) -> None:
+        self._refuse("be enabled" if on else "be disabled")
+
+    @override
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        self._refuse("move")
+
+    @override
+    async def start(self) -> None:
+        self._refuse("move")
+
+    @override
+    async def stop(self, mode: StopMode) -> StopMode:
+        self._refuse("be stopped")
+
+    @override
+    async def reset(self) -> None:
+        self._refuse("be reset")
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise NotSupported(
+            f"axis {self.spec.name}: {self.spec.model} cannot {what} over its line",
+            axis=self.spec.name,
+            remedy="use the drive's own inputs",
+        )
+
+
+class Permit:
+    """Permission of one command, with all its steps, to move the drive of its axis; made by `Gate`.
+
+    Attributes:
+        command_id: names the command everywhere.
+        verb: what it is.
+    """
+
+    def __init__(self, gate: "Gate", command_id: str, verb: Verb, right: Right) -> None:
+        self.command_id = command_id
+        self.verb = verb
+        self._gate = gate
+        self._right = right
+        self._epoch = gate.epoch
+        self._begun = False
+
+    def still_wanted(self) -> None:
+        """Raise when the command was overtaken.
+
+        Raises:
+            StopLatched: a stop has come since.
+            ShuttingDown: the daemon ends.
+        """
+        if self._gate.closed:
+            raise self._gate.ending()
+        if self._epoch != self._gate.epoch:
+            raise self._gate.overtaken(self.verb)
+
+    def renew(self) -> None:
+        """Go on after a stop that this command has requested itself."""
+        self._epoch = self._gate.epoch
+
+    def begun(self) -> None:
+        """Note that the first motion has begun: from now on `not_after` does not count."""
+        self._begun = True
+
+    def ask(self) -> None:
+        """Raise when the command must not be carried out any more.
+
+        Raises:
+            StopLatched, ShuttingDown: see `still_wanted`.
+            RequestRefused: its sender has lost the right to it, or it comes too late.
+        """
+        self._ask(begun=self._begun)
+
+    def _ask(self, *, begun: bool) -> None:
+        self.still_wanted()
+        self._right.holds()
+        if not begun:
+            self._right.in_time()
+
+    def ask_to_move(self) -> None:
+        """Raise when nothing of this command may move the axis now.
+
+        Raises:
+            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
+                speed override of 0.
+        """
+        self.to_move()()
+
+    def to_move(self) -> Condition:
+        """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
+        energise, tracker = self._to_energise(), self._gate.tracker
+
+        def condition() -> None:
+            energise()
+            if tracker.speed_share <= 0:
+                raise no_speed(tracker.name)
+
+        return condition
+
+    def _to_energise(self) -> Condition:
+        """Return the condition that is checked before the loop is closed."""
+        begun, tracker = self._begun, self._gate.tracker
+
+        def condition() -> None:
+            self._ask(begun=begun)
+            check_may_power_on(tracker)
+
+        return condition
+
+    # -- what can move -----------------------------------------------------------------------------------------------
+
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
+        self.ask_to_move()
+        with only_while(self.to_move()):
+            await self._gate.driver.load(motion, home=home)
+
+    async def start(self) -> None:
+        """Start what was loaded; see `Moves.start`."""
+        with self._beginning(self.to_move()):
+            await self._gate.driver.start()
+
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once; see `Tracks`."""
+        drive = self._gate.driver
+        if not isinstance(drive, Tracks):
+            raise cannot(drive.spec, "track")
+        with self._beginning(self.to_move()):
+            await drive.track(position_counts)
+
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """Have the drive go on along a path; see `WalksPaths`."""
+        drive = walking(self._gate.driver)
+        self.ask_to_move()
+        with self._beginning(self.to_move()):
+            return await drive.add_points(steps)
+
+    async def power_on(self) -> None:
+        """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
+        self._to_energise()()
+        was_on = self._gate.tracker.enabled
+        try:
+            with self._beginning(self._to_energise()):
+                await self._gate.driver.power(on=True)
+            self.still_wanted()
+        except RequestRefused:
+            if not was_on:
+                await self._gate.driver.stop(StopMode.OFF)
+            raise
+
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the registers of the loop, which act at once; see `TakesGains`."""
+        self.ask()
+        drive = self._gate.driver
+        if not isinstance(drive, TakesGains):
+            raise cannot(drive.spec, "take gains")
+        with only_while(self.ask):
+            await drive.set_gains(gains)
+
+    def _beginning(self, condition: Condition) -> only_while:
+        """Return the context of the packets that begin a motion; from now on `not_after` does not count."""
+        self.begun()
+        return only_while(condition)
+
+
+class Gate:
+    """The gate of one axis: makes permits, and makes them void.
+
+    Attributes:
+        driver: of the drive; nothing but permits and the axis's stops uses it.
+        tracker: of its state.
+        epoch: number of stops so far; a permit of an earlier epoch is void.
+        closed: the daemon ends; no permit holds.
+    """
+
+    def __init__(self, driver: Moves, tracker: AxisTracker) -> None:
+        self.driver = driver
+        self.tracker = tracker
+        self.epoch = 0
+        self.closed = False
+
+    def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
+        """Return the permit of a command, valid until the next stop."""
+        return Permit(self, command_id, verb, right)
+
+    def overtake(self, by: Permit | None = None) -> None:
+        """Make all permits void, except the caller's."""
+        self.epoch += 1
+        if by is not None:
+            by.renew()
+
+    def close(self) -> None:
+        """Make all permits void permanently."""
+        self.closed = True
+
+    def ending(self) -> ShuttingDown:
+        """Return the refusal of a daemon that ends."""
+        name = self.tracker.name
+        return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
+
+    def overtaken(self, what: str) -> StopLatched:
+        """Return the refusal of a command that a stop has overtaken."""
+        name = self.tracker.name
+        return StopLatched(
+            f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
+        )

@@ -12,21 +12,19 @@ from dataclasses import dataclass, replace
 from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.guards import (
-    AxisView,
+    Permit,
+    QuietDrive,
     check_acceleration,
     check_position,
     check_velocity,
     no_speed,
 )
-from ldcnd.daemon.axis.permit import QuietDrive
-from ldcnd.daemon.axis.procedure import Turn
 from ldcnd.daemon.axis.reference import ReferenceKeeper
 from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
 from ldcnd.daemon.axis.straight import LineAxis
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Homes, Motion, StopMode
-from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import (
     BusError,
     MalformedRequest,
@@ -62,109 +60,6 @@ class MotionPlan:
     duration_s: float | None
 
 
-class MotionPlanner:
-    """Plans the motions of one axis."""
-
-    def __init__(
-        self, config: AxisConfig, driver: QuietDrive, scale: Scale, speed_share: Callable[[], float] = lambda: 1.0
-    ) -> None:
-        """Plan by this configuration.
-
-        Args:
-            config: of the axis.
-            driver: of its drive.
-            scale: between counts and axis units.
-            speed_share: returns the share of every velocity that the speed override of the rig leaves.
-        """
-        self._speed_share = speed_share
-        self._config = config
-        self._driver = driver
-        self._scale = scale
-
-    def to_position(
-        self,
-        view: AxisView,
-        position: float,
-        *,
-        from_counts: int,
-        origin_counts: float,
-        velocity: float | None,
-        acceleration: float | None,
-    ) -> MotionPlan:
-        """Plan a trapezoid to a position in axis units.
-
-        Raises:
-            PositionLimit, VelocityLimit, AccelerationLimit: a software limit forbids it; names the nearest value.
-            ValueOutOfRange: a register cannot hold it.
-        """
-        speed, rate = self._checked(view, velocity, acceleration)
-        if view.referenced:
-            check_position(view, self._config.limits, position)
-        target = round(self._scale.to_counts(position) + origin_counts)
-        if abs(target - from_counts) > LARGEST_COUNT:
-            nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
-            raise ValueOutOfRange(
-                f"axis {view.name}: target {position:g} {view.unit} is {abs(target - from_counts)} counts away, farther"
-                " than the drive's 32-bit counter reaches",
-                axis=view.name,
-                value=position,
-                limit=LARGEST_COUNT,
-                nearest=self._scale.to_units(nearest - origin_counts),
-                remedy="move there in parts",
-            )
-        counts_per_unit = self._scale.counts_per_unit
-        motion = self._driver.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
-        duration_s = profile_duration_s(
-            abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
-        )
-        return MotionPlan(
-            motion,
-            self._scale.to_units(target - origin_counts),
-            motion.velocity_counts_per_s / counts_per_unit,
-            motion.acceleration_counts_per_s2 / counts_per_unit,
-            duration_s,
-        )
-
-    def at_velocity(self, view: AxisView, velocity: float, acceleration: float | None) -> MotionPlan:
-        """Plan a motion at a constant velocity in units a second, without an end.
-
-        Raises:
-            ValueOutOfRange: the velocity is 0, or a register cannot hold it.
-            VelocityLimit, AccelerationLimit: a software limit forbids it.
-        """
-        if velocity == 0:
-            raise ValueOutOfRange(
-                f"axis {view.name}: a velocity of 0 is not a motion",
-                axis=view.name,
-                value=0.0,
-                remedy=Remedy("{}", step("halt")),
-            )
-        speed, rate = self._checked(view, velocity, acceleration)
-        motion = self._driver.quantise(Motion(None, self._scale.to_counts(speed), rate * self._scale.counts_per_unit))
-        return MotionPlan(
-            motion,
-            None,
-            self._scale.to_units(motion.velocity_counts_per_s),
-            motion.acceleration_counts_per_s2 / self._scale.counts_per_unit,
-            None,
-        )
-
-    def limit_ahead(self, velocity: float) -> float | None:
-        """Return the software limit that a motion at this velocity runs towards, in axis units."""
-        limits = self._config.limits
-        return limits.position_max if velocity > 0 else limits.position_min
-
-    def _checked(self, view: AxisView, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
-        speed = self._config.velocity if velocity is None else velocity
-        rate = self._config.acceleration if acceleration is None else acceleration
-        check_velocity(view, self._config.limits, speed)
-        check_acceleration(view, self._config.limits, rate)
-        share = self._speed_share()
-        if share <= 0:
-            raise no_speed(view.name)
-        return speed * share, rate
-
-
 def both_s(first: MotionPlan, goal: MotionPlan) -> float:
     """Return how long a motion and the approach that follows it take, without settling."""
     way = abs((goal.motion.target_counts or 0) - (first.motion.target_counts or 0))
@@ -190,17 +85,16 @@ class AxisMotion:
     """Motions of one axis, shared by its commands and their procedures.
 
     Attributes:
+        counts_per_unit: negative where forward in axis units is backward in counts.
         reading: the latest; None before the first.
         target_counts: target of the last motion; None when it had no end or was followed by something else.
         approached: that motion came from the side that the configuration names.
-        speed_share: of every velocity, by the speed override of the rig; 0 to 1.
     """
 
     def __init__(
         self,
         config: AxisConfig,
         driver: QuietDrive,
-        scale: Scale,
         tracker: AxisTracker,
         telemetry: AxisTelemetry,
         clock: Clock,
@@ -212,7 +106,6 @@ class AxisMotion:
         Args:
             config: of the axis.
             driver: of its drive.
-            scale: between counts and axis units.
             tracker: of its state.
             telemetry: publishes it.
             clock: of the daemon.
@@ -223,13 +116,11 @@ class AxisMotion:
         self.config = config
         self._window_counts = window_counts(config)
         self.driver = driver
-        self.scale = scale
+        self.counts_per_unit = config.signed_counts_per_unit
         self.tracker = tracker
         self.telemetry = telemetry
         self.clock = clock
         self.read = read
-        self.speed_share = 1.0
-        self.planner = MotionPlanner(config, driver, scale, lambda: self.speed_share)
         self.reading: AxisReading | None = None
         self.target_counts: int | None = None
         self.approached = False
@@ -239,7 +130,6 @@ class AxisMotion:
         """Plan with other limits and speeds from now on."""
         self.config = config
         self._window_counts = window_counts(config)
-        self.planner = MotionPlanner(config, self.driver, self.scale, lambda: self.speed_share)
 
     def latest(self) -> AxisReading:
         """Return the latest reading.
@@ -258,7 +148,7 @@ class AxisMotion:
     def counts_of(self, position: float) -> int:
         """Return the count of the drive that a position stands for; on an axis with a modulo the nearest of them."""
         position = self.unwrapped(position)
-        return round(self.scale.to_counts(position) + self.telemetry.origin_counts)
+        return round(position * self.counts_per_unit + self.telemetry.origin_counts)
 
     def unwrapped(self, position: float, direction: Direction | None = None) -> float:
         """Return the position, counted through all turns, to which a request means to go.
@@ -282,7 +172,7 @@ class AxisMotion:
         here_counts = self.latest().position_counts if self.target_counts is None else self.target_counts
         here = self.telemetry.position(here_counts)
         forward = (position - here) % modulo
-        count = 1.0 / self.scale.counts_per_unit
+        count = 1.0 / abs(self.counts_per_unit)
         if forward < count or modulo - forward < count:
             way = forward if forward < count else forward - modulo
         elif direction is Direction.NEGATIVE or (direction is not Direction.POSITIVE and forward > modulo / 2):
@@ -295,16 +185,85 @@ class AxisMotion:
         """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
         return None if position is None else self.telemetry.within_turn(position)[0]
 
+    # -- plans -------------------------------------------------------------------------------------------------------
+
     def plan_to(self, position: float, velocity: float | None, acceleration: float | None) -> MotionPlan:
-        """Plan a trapezoid from where the axis is to a position (through all turns); raises as `MotionPlanner`."""
-        return self.planner.to_position(
-            self.tracker.view(),
-            position,
-            from_counts=self.latest().position_counts,
-            origin_counts=self.telemetry.origin_counts,
-            velocity=velocity,
-            acceleration=acceleration,
+        """Plan a trapezoid from where the axis is to a position in axis units, counted through all turns.
+
+        Raises:
+            PositionLimit, VelocityLimit, AccelerationLimit: a software limit forbids it; names the nearest value.
+            ValueOutOfRange: a register cannot hold it.
+            WrongState: the position has not been read yet.
+        """
+        tracker, origin_counts, from_counts = self.tracker, self.telemetry.origin_counts, self.latest().position_counts
+        speed, rate = self._checked(velocity, acceleration)
+        if tracker.referenced:
+            check_position(tracker, self.config.limits, position)
+        target = round(position * self.counts_per_unit + origin_counts)
+        if abs(target - from_counts) > LARGEST_COUNT:
+            nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
+            raise ValueOutOfRange(
+                f"axis {tracker.name}: target {position:g} {tracker.unit} is {abs(target - from_counts)} counts away,"
+                " farther than the drive's 32-bit counter reaches",
+                axis=tracker.name,
+                value=position,
+                limit=LARGEST_COUNT,
+                nearest=(nearest - origin_counts) / self.counts_per_unit,
+                remedy="move there in parts",
+            )
+        counts_per_unit = abs(self.counts_per_unit)
+        motion = self.driver.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
+        duration_s = profile_duration_s(
+            abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
         )
+        return MotionPlan(
+            motion,
+            (target - origin_counts) / self.counts_per_unit,
+            motion.velocity_counts_per_s / counts_per_unit,
+            motion.acceleration_counts_per_s2 / counts_per_unit,
+            duration_s,
+        )
+
+    def plan_at(self, velocity: float, acceleration: float | None) -> MotionPlan:
+        """Plan a motion at a constant velocity in units a second, without an end.
+
+        Raises:
+            ValueOutOfRange: the velocity is 0, or a register cannot hold it.
+            VelocityLimit, AccelerationLimit: a software limit forbids it.
+        """
+        if velocity == 0:
+            raise ValueOutOfRange(
+                f"axis {self.tracker.name}: a velocity of 0 is not a motion",
+                axis=self.tracker.name,
+                value=0.0,
+                remedy=Remedy("{}", step("halt")),
+            )
+        speed, rate = self._checked(velocity, acceleration)
+        counts_per_unit = self.counts_per_unit
+        motion = self.driver.quantise(Motion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
+        return MotionPlan(
+            motion,
+            None,
+            motion.velocity_counts_per_s / counts_per_unit,
+            motion.acceleration_counts_per_s2 / abs(counts_per_unit),
+            None,
+        )
+
+    def limit_ahead(self, velocity: float) -> float | None:
+        """Return the software limit that a motion at this velocity runs towards, in axis units."""
+        limits = self.config.limits
+        return limits.position_max if velocity > 0 else limits.position_min
+
+    def _checked(self, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
+        """Return the speed that the speed override leaves, and the acceleration, both within their limits."""
+        speed = self.config.velocity if velocity is None else velocity
+        rate = self.config.acceleration if acceleration is None else acceleration
+        check_velocity(self.tracker, self.config.limits, speed)
+        check_acceleration(self.tracker, self.config.limits, rate)
+        share = self.tracker.speed_share
+        if share <= 0:
+            raise no_speed(self.tracker.name)
+        return speed * share, rate
 
     def before_approach(
         self, goal: MotionPlan, velocity: float | None, acceleration: float | None
@@ -337,7 +296,7 @@ class AxisMotion:
         return LineAxis(
             from_counts=self.latest().position_counts if here is None else here,
             target_counts=motion.target_counts or 0,
-            counts_per_unit=self.scale.counts_per_unit,
+            counts_per_unit=abs(self.counts_per_unit),
             most_velocity=motion.velocity_counts_per_s,
             most_acceleration=motion.acceleration_counts_per_s2,
             quantise=self.driver.quantise,
@@ -347,7 +306,7 @@ class AxisMotion:
     def replanned(self, plan: MotionPlan, motion: Motion) -> MotionPlan:
         """Return a plan with another velocity and acceleration, to the same target."""
         share = self.on_line(replace(plan, motion=motion))
-        counts_per_unit = self.scale.counts_per_unit
+        counts_per_unit = abs(self.counts_per_unit)
         return replace(
             plan,
             motion=motion,
@@ -356,9 +315,11 @@ class AxisMotion:
             duration_s=profile_duration_s(share.way, share.most_velocity, share.most_acceleration),
         )
 
+    # -- motions -----------------------------------------------------------------------------------------------------
+
     async def start(
         self,
-        turn: Turn,
+        permit: Permit,
         state: AxisState,
         completion: Completion,
         *,
@@ -366,33 +327,33 @@ class AxisMotion:
         plan: MotionPlan | None = None,
     ) -> None:
         """Start what was loaded, if that is still permitted; the state says so before the drive does."""
-        turn.permit.ask_to_move()
+        permit.ask_to_move()
         in_motion = self.tracker.command is not None and not self.tracker.at_rest
-        self.begin(turn.command_id, turn.verb, state, completion, opens_loop=opens_loop, plan=plan)
+        self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
         try:
-            await turn.permit.start()
+            await permit.start()
         except OutcomeUnknown:
             self.tracker.started(self.clock.now_s())  # the next readings tell
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             if in_motion:
-                await self._end_what_went_before(turn, error)
+                await self._end_what_went_before(permit, error)
             else:
                 self.tracker.finished(error.message)
             self.publish_state()
             raise
         self.tracker.started(self.clock.now_s())
 
-    async def _end_what_went_before(self, turn: Turn, error: BusError | RequestRefused) -> None:
+    async def _end_what_went_before(self, permit: Permit, error: BusError | RequestRefused) -> None:
         """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""
         command = self.tracker.command
-        if command is None or command.command_id != turn.command_id:
+        if command is None or command.command_id != permit.command_id:
             return  # a stop has taken over
         self.tracker.started(self.clock.now_s())
         self.tracker.failing(error.message)
         await self.driver.stop(StopMode.SMOOTH)
         if self.tracker.command is command:
-            self.stopping(turn.command_id, turn.verb)
+            self.stopping(permit.command_id, permit.verb)
             self.tracker.failing(error.message)
 
     def begin(
@@ -442,9 +403,9 @@ class AxisMotion:
         self.reference.woken.set()
         self.telemetry.state(self.clock.now_ns())
 
-    def reply(self, turn: Turn) -> CommandReply:
+    def reply(self, permit: Permit) -> CommandReply:
         """Return the bare reply to a command."""
-        return CommandReply(command_id=turn.command_id, axis=self.config.name, verb=turn.verb)
+        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=permit.verb)
 
 
 def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
@@ -495,7 +456,7 @@ def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
             here = motion.telemetry.position(motion.latest().position_counts)
             return motion.plan_to(here + distance, velocity, request.acceleration)
         case None, None, float() as velocity:
-            return motion.planner.at_velocity(motion.tracker.view(), velocity, request.acceleration)
+            return motion.plan_at(velocity, request.acceleration)
     raise MalformedRequest(
         f"axis {motion.config.name}: a plan needs exactly one of position, distance, or velocity alone",
         axis=motion.config.name,

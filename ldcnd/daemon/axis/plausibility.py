@@ -10,7 +10,6 @@ from enum import Enum
 
 from ldcnd.config.axis import AxisConfig
 from ldcnd.drivers.driver import AxisReading
-from ldcnd.drivers.scaling import Scale
 from ldcnd.exchange import Timing
 
 NOISE_COUNTS = 16
@@ -53,7 +52,7 @@ class PlausibilityGate:
         withheld: number of readings not accepted so far.
     """
 
-    def __init__(self, config: AxisConfig, scale: Scale) -> None:
+    def __init__(self, config: AxisConfig) -> None:
         self.jumped = False
         self.zeroed = False
         self.foreign = False
@@ -63,12 +62,11 @@ class PlausibilityGate:
         self._doubtful: _Seen | None = None
         self._rounds = 0
         self._sure = False  # nothing jumps away from the very first reading, which is accepted as it is
-        self._scale = scale
         self.reconfigure(config)
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Judge by other limits."""
-        counts, limits = self._scale.counts_per_unit, config.limits
+        counts, limits = abs(config.signed_counts_per_unit), config.limits
         self._speed = counts * max(config.velocity, limits.velocity or 0.0)
         self._acceleration = ACCELERATIONS * counts * max(config.acceleration, limits.acceleration or 0.0)
         self._following = config.gains.el if config.gains else 0

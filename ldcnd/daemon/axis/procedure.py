@@ -1,44 +1,24 @@
 """Interface of commands that go on after they were accepted: a homing, a timed duty, a stream of set-points."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
-from ldcnd.daemon.axis.permit import Permit
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.driver import AxisReading
-from ldcnd.model.commands import CommandReply, Verb
+from ldcnd.model.commands import CommandReply
 
 NEVER_S = float("inf")
-
-
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """One command whose turn has come, with all its steps.
-
-    Attributes:
-        command_id: names it everywhere.
-        verb: the command.
-        permit: the only way to the calls that can move the drive.
-    """
-
-    command_id: str
-    verb: Verb
-    permit: Permit
-
-    def still_wanted(self) -> None:
-        """Raise when a stop has overtaken the command; see `Permit`."""
-        self.permit.still_wanted()
 
 
 class Procedure(ABC):
     """A command that takes steps of its own: when a reading calls for one, or at its deadline.
 
     Attributes:
-        turn: of the command that began it.
+        permit: of the command that began it.
         deadline_s: when it takes a step without being called for, in loop time.
     """
 
-    turn: Turn
+    permit: Permit
     deadline_s: float = NEVER_S
 
     @abstractmethod
@@ -66,4 +46,4 @@ class Procedure(ABC):
 
     def outlived(self, tracker: AxisTracker) -> bool:
         """Tell whether the axis has left its command: a fault, a stop or another command ended it."""
-        return tracker.command is None or tracker.command.command_id != self.turn.command_id
+        return tracker.command is None or tracker.command.command_id != self.permit.command_id

@@ -396,8 +396,7 @@ class ReferenceKeeper:
 
 
 def _scale_of(config: AxisConfig) -> tuple[float, str, float | None]:
-    scale = config.counts_per_unit or 1.0
-    return (-scale if config.direction == "reverse" else scale, config.unit, config.modulo)
+    return (config.signed_counts_per_unit, config.unit, config.modulo)
 
 
 def _words(error: Exception) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.guards import MOTION_STATES, AxisView
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 from ldcnd.fault_pages import page_of
@@ -79,6 +78,11 @@ OF_DAEMON = (
 OF_DAEMON_CODES = frozenset(fault.code for fault in OF_DAEMON)
 
 
+MOTION_STATES = frozenset(
+    {AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING}
+)
+
+
 class Completion(Enum):
     """When a command is done."""
 
@@ -112,7 +116,7 @@ class Settling:
 def window_counts(config: AxisConfig) -> float:
     """Return how far from its target an axis may be that has settled, in counts."""
     if config.settle.window is not None:
-        return config.settle.window * (config.counts_per_unit or 1.0)
+        return config.settle.window * abs(config.signed_counts_per_unit)
     return max(LEAST_WINDOW_COUNTS, WINDOW_OF_EL * config.gains.el if config.gains else 0.0)
 
 
@@ -282,22 +286,6 @@ class AxisTracker:
         self._rest = RestJudge()
 
     # -- for other modules -------------------------------------------------------------------------------------------
-
-    def view(self) -> AxisView:
-        """Return the state for the guards."""
-        return AxisView(
-            self.name,
-            self.unit,
-            self.state,
-            self.enabled,
-            self.referenced,
-            self.position_lost,
-            self.stop_latched,
-            self.link,
-            tuple(fault.text for fault in self.active_faults),
-            self.stop_pending,
-            self.refused,
-        )
 
     def shown(self) -> "StateShown":
         """Return what a state sample says besides when; compared after every poll, so no model is built for it."""

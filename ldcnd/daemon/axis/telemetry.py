@@ -8,7 +8,6 @@ from ldcnd.daemon.axis.state import NOT_SETTLED, QUALITIES, ActiveCommand, AxisT
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.monitor_value import MonitorValue
-from ldcnd.drivers.scaling import Scale
 from ldcnd.log import get_logger
 from ldcnd.model.events import UNSETTLED, CommandStatus
 from ldcnd.model.samples import CurrentCommand, FaultEntry, LatchSample, Quality, TelemetryItem
@@ -29,7 +28,7 @@ class AxisTelemetry:
         self,
         publisher: Publisher,
         tracker: AxisTracker,
-        scale: Scale,
+        counts_per_unit: float,
         *,
         adc_full_scale: int | None,
         adc_volts: float,
@@ -39,10 +38,9 @@ class AxisTelemetry:
         self.origin_counts = 0.0
         self._publisher = publisher
         self._tracker = tracker
-        self._scale = scale
         self._adc_full_scale = adc_full_scale
         self._adc_volts = adc_volts
-        self._counts_per_unit = scale.signed_counts_per_unit
+        self._counts_per_unit = counts_per_unit
         self._unit, self._velocity_unit = tracker.unit, f"{tracker.unit}/s"
         self._position, self._velocity, self._adc, self._inputs, self._state, self._faults = (
             publisher.item(tracker.name, item)
@@ -64,7 +62,7 @@ class AxisTelemetry:
 
     def position(self, counts: float) -> float:
         """Return the position that a count of the drive stands for, in axis units, counted through all turns."""
-        return self._scale.to_units(counts - self.origin_counts)
+        return (counts - self.origin_counts) / self._counts_per_unit
 
     def within_turn(self, position: float) -> tuple[float, int | None]:
         """Return a position as clients see it, and how many whole turns lie below it; None without a modulo."""
@@ -262,12 +260,10 @@ class Arrivals:
         over: the commands that it has ended.
     """
 
-    def __init__(
-        self, config: AxisConfig, scale: Scale, shown: Callable[[int], float], told: EndTold, note: Note
-    ) -> None:
+    def __init__(self, config: AxisConfig, shown: Callable[[int], float], told: EndTold, note: Note) -> None:
         self.reading: AxisReading | None = None
         self._config = config
-        self._scale = scale
+        self._counts_per_unit = config.signed_counts_per_unit
         self._shown = shown
         self._told = told
         self._note = note
@@ -282,7 +278,7 @@ class Arrivals:
         lag = reading.following_error_counts
         if command.settling:
             lag = command.settling.target_counts - reading.position_counts
-        following_error = None if lag is None else self._scale.to_units(lag)
+        following_error = None if lag is None else lag / self._counts_per_unit
         arrival = Arrival(self._shown(reading.position_counts), following_error, settled)
         self.over.append((command, status, reason, arrival))
 
@@ -294,7 +290,7 @@ class Arrivals:
             self._told(command, status, reason, arrival)
             if arrival.settled is False and command.settling:
                 settling, unit = command.settling, self._config.unit
-                window = abs(self._scale.to_units(settling.window_counts))
+                window = abs(settling.window_counts / self._counts_per_unit)
                 said = (
                     f"{command.verb} did not stay within {window:.6g} {unit} of its target for {settling.time_s:g} s"
                     f" in {settling.timeout_s:g} s; it is {arrival.following_error:.6g} {unit} off"

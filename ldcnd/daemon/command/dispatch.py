@@ -6,7 +6,7 @@ from functools import partial
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.daemon.axis.permit import UNCONDITIONAL, Permit, Right
+from ldcnd.daemon.axis.guards import UNCONDITIONAL, Permit, Right
 from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
 from ldcnd.daemon.axis.procedures.path import PathShareRequest, SharedPath
 from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
@@ -168,11 +168,11 @@ class Dispatcher:
         hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
-        permit = axis.permit(command.verb, right)
+        permit = axis.permit(command_id, command.verb, right)
         self._ledger.open(Entry(command_id, axis_name, command, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
-            return await self._execute(axis, command, command_id, permit)
+            return await self._execute(axis, command, permit)
         except LdcndError as error:
             self._ledger.answered(command_id, error, _status(error))
             raise
@@ -186,23 +186,23 @@ class Dispatcher:
                 hold.over = True
 
     async def _execute(
-        self, axis: AxisService, command: AxisCommand[CommandReply], command_id: str, permit: Permit
+        self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit
     ) -> CommandReply:
         def start() -> Awaitable[CommandReply]:
-            return self._start(axis, command, command_id, permit)
+            return self._start(axis, command, permit)
 
         if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
             return await axis.in_turn(command, permit, start)
         return await start()
 
     async def _start(
-        self, axis: AxisService, command: AxisCommand[CommandReply], command_id: str, permit: Permit
+        self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit
     ) -> CommandReply:
-        reply = await axis.execute(command, command_id, permit)
-        moving = axis.tracker.command is not None and axis.tracker.command.command_id == command_id
+        reply = await axis.execute(command, permit)
+        moving = axis.tracker.command is not None and axis.tracker.command.command_id == permit.command_id
         ends_later = command.ends is Ends.BY_READING and moving
         status = CommandStatus.EXECUTING if ends_later else CommandStatus.DONE
-        self._ledger.answered(command_id, reply, status)
+        self._ledger.answered(permit.command_id, reply, status)
         return reply
 
     def stopped(self, names: tuple[str, ...], confirmed: tuple[str, ...], command: Stop, login: str | None) -> None:
@@ -251,7 +251,7 @@ class Dispatcher:
             holder = self.authority.holder(name)
             own = holder.token if holder and holder.token in command.leases else command.lease
             self.authority.admit(name, own, None, self._clock.now_s())
-            guards.check_not_latched(self._rig.axis(name).tracker.view())
+            guards.check_not_latched(self._rig.axis(name).tracker)
 
     async def _answer_again(self, entry: Entry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""

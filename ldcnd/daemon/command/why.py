@@ -18,18 +18,17 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         admit: raises what the authority would refuse the sender with.
         absolute: whether the motion would name a position.
     """
-    view = tracker.view()
     checks: list[Callable[[], None]] = [
         admit,
-        lambda: guards.check_reachable(view),
-        lambda: guards.check_not_latched(view),
-        *(_fault(view.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
-        lambda: guards.check_not_in_error(view),
-        lambda: guards.check_enabled(view),
-        lambda: guards.check_stands(view),
+        lambda: guards.check_reachable(tracker),
+        lambda: guards.check_not_latched(tracker),
+        *(_fault(tracker.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
+        lambda: guards.check_not_in_error(tracker),
+        lambda: guards.check_enabled(tracker),
+        lambda: guards.check_stands(tracker),
     ]
     if absolute:
-        checks.append(lambda: guards.check_referenced(view))
+        checks.append(lambda: guards.check_referenced(tracker))
     causes = []
     for check in checks:
         try:
@@ -46,7 +45,7 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
             )
     first = tracker.first_fault
     return WhyReply(
-        axis=view.name,
+        axis=tracker.name,
         can_move=not causes,
         causes=tuple(causes),
         first_fault=f"{first.code}: {first.text}" if first else None,

@@ -14,7 +14,6 @@ from typing_extensions import override
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority, next_on_grid
 from ldcnd.drivers.driver import AxisReading, Readable
-from ldcnd.drivers.scaling import Scale
 from ldcnd.drivers.tracer import (
     ArmedTrace,
     Granted,
@@ -177,17 +176,20 @@ class HostChannel:
 
 
 def host_channels(
-    driver: Readable, unit: str, scale: Scale, position: Callable[[float], float]
+    driver: Readable, unit: str, counts_per_unit: float, position: Callable[[float], float]
 ) -> tuple[HostChannel, ...]:
     """Return what can be sampled of a drive.
 
     Args:
         driver: the drive.
         unit: of the axis.
-        scale: between its counts and units.
+        counts_per_unit: negative where forward in units is backward in counts.
         position: the present position in units that a count stands for.
     """
-    factor = 1.0 / scale.signed_counts_per_unit
+    factor = 1.0 / counts_per_unit
+
+    def to_units(counts: float) -> float:
+        return counts / counts_per_unit
 
     def named(name: str, of_unit: str, times: float | None) -> TraceChannel:
         return TraceChannel(name=name, unit=of_unit, scale=times)
@@ -195,12 +197,12 @@ def host_channels(
     channels = [
         HostChannel(named("position", unit, None), lambda reading: reading.position_counts, position),
         HostChannel(
-            named("velocity", f"{unit}/s", factor), lambda reading: reading.velocity_counts_per_s, scale.to_units
+            named("velocity", f"{unit}/s", factor), lambda reading: reading.velocity_counts_per_s, to_units
         ),
         HostChannel(
             named("following_error", unit, factor),
             lambda reading: reading.following_error_counts,
-            scale.to_units,
+            to_units,
             TelemetryItem.POSITION,
         ),
     ]

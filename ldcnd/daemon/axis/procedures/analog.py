@@ -6,8 +6,9 @@ limit switches stop it in the drive, where they are armed.
 """
 
 from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AnalogMotion, AxisReading, StopMode
 from ldcnd.errors import ValueOutOfRange
@@ -18,9 +19,9 @@ from ldcnd.model.samples import AxisState
 class AnalogMove(Procedure):
     """One such motion; it ends when the drive says so, and its only step is to stop at one of its bounds."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: MoveAnalog) -> None:
+    def __init__(self, motion: AxisMotion, permit: Permit, request: MoveAnalog) -> None:
         bounds = motion.config.analog
-        self.turn = turn
+        self.permit = permit
         self._motion = motion
         self._request = request
         self._timeout_s = request.timeout_s or bounds.timeout_s
@@ -36,20 +37,20 @@ class AnalogMove(Procedure):
             DriveFault: the sensor reads like a broken one.
         """
         motion, request = self._motion, self._request
-        view = motion.tracker.view()
-        guards.check_may_move(view)
+        tracker = motion.tracker
+        guards.check_may_move(tracker)
         self._check_target()
         speed = motion.config.velocity if request.velocity is None else request.velocity
-        plan = motion.planner.at_velocity(view, speed, request.acceleration)
+        plan = motion.plan_at(speed, request.acceleration)
         self._distance = self._distance or abs(plan.velocity) * self._timeout_s
         self._from_counts = motion.latest().position_counts
-        await self.turn.permit.load(
+        await self.permit.load(
             AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
         )
         self.deadline_s = motion.clock.now_s() + self._timeout_s
         self._failure = f"not there within {self._timeout_s:g} s"
-        await motion.start(self.turn, AxisState.DISCRETE_MOTION, Completion.PROFILE)
-        return motion.reply(self.turn).model_copy(
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
+        return motion.reply(self.permit).model_copy(
             update={"target": request.target, "velocity": plan.velocity, "acceleration": plan.acceleration}
         )
 
@@ -58,7 +59,7 @@ class AnalogMove(Procedure):
         motion, tracker = self._motion, self._motion.tracker
         if tracker.command is None:
             return True
-        travelled = abs(motion.scale.to_units(reading.position_counts - self._from_counts))
+        travelled = abs((reading.position_counts - self._from_counts) / motion.counts_per_unit)
         if self._distance is not None and travelled > self._distance:
             self._failure = f"not there within {self._distance:g} {motion.config.unit}"
             return True
@@ -77,7 +78,7 @@ class AnalogMove(Procedure):
         ours = motion.tracker.command is not None
         await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
         if ours:
-            motion.stopping(self.turn.command_id, self.turn.verb)
+            motion.stopping(self.permit.command_id, self.permit.verb)
             motion.tracker.failing(self._failure)
         return False
 

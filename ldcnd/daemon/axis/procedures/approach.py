@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from typing_extensions import override
 
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, both_s
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.model.commands import CommandReply, MoveAbsolute, MoveRelative
@@ -20,9 +21,9 @@ class ApproachMove(Procedure):
     """Two motions under one command: to the point where the approach begins, and from there to the goal."""
 
     def __init__(
-        self, motion: AxisMotion, turn: Turn, request: MoveAbsolute | MoveRelative, first: MotionPlan, goal: MotionPlan
+        self, motion: AxisMotion, permit: Permit, request: MoveAbsolute | MoveRelative, first: MotionPlan, goal: MotionPlan
     ) -> None:
-        self.turn = turn
+        self.permit = permit
         self._motion = motion
         self._request = request
         self._first = first
@@ -32,9 +33,9 @@ class ApproachMove(Procedure):
         """See `Procedure`; the command is of the goal from the beginning."""
         motion, goal = self._motion, self._goal
         whole = replace(goal, duration_s=both_s(self._first, goal))
-        await self.turn.permit.load(self._first.motion)
-        await motion.start(self.turn, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=whole)
-        return motion.reply(self.turn).model_copy(
+        await self.permit.load(self._first.motion)
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=whole)
+        return motion.reply(self.permit).model_copy(
             update={
                 "position": motion.shown(goal.position),
                 "velocity": goal.velocity,
@@ -54,7 +55,7 @@ class ApproachMove(Procedure):
             motion.tracker.finished()
             return False
         goal = motion.plan_to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)
-        await self.turn.permit.load(goal.motion)
-        await motion.start(self.turn, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=goal)
+        await self.permit.load(goal.motion)
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=goal)
         motion.target_counts, motion.approached = goal.motion.target_counts, True
         return False

@@ -6,19 +6,20 @@ others have arrived; then the line starts them together, or none of them moves.
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from typing_extensions import override
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
-from ldcnd.daemon.axis.permit import start_together
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.guards import Permit
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.daemon.axis.straight import straight_line
-from ldcnd.drivers.driver import AxisReading
+from ldcnd.drivers.driver import AxisReading, Motion
 from ldcnd.drivers.network import Network
 from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
+from ldcnd.exchange import only_while
 from ldcnd.model.commands import CommandReply, MoveAbsolute
 from ldcnd.model.rig_commands import MoveTogetherReply
 from ldcnd.model.samples import AxisState
@@ -164,7 +165,7 @@ class Meeting(Rendezvous):
                 for name, member in self._members.items():
                     member.plan = plans[name]
             motions = {name: member.plan.motion for name, member in self._members.items()}
-            permits = [member.turn.permit for member in self._members.values()]
+            permits = [member.permit for member in self._members.values()]
             await start_together(self._network, motions, permits, self._about_to_start)
         except LdcndError as error:
             self.fail(error)
@@ -186,8 +187,8 @@ class Meeting(Rendezvous):
 class GroupMember(Procedure):
     """One axis of a group move; over as soon as the group was started, the readings tell the rest."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: GroupMoveRequest) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: GroupMoveRequest) -> None:
+        self.permit = permit
         self.plan: MotionPlan
         self.motion = motion
         self._request = request
@@ -201,9 +202,9 @@ class GroupMember(Procedure):
         """
         meeting, motion = self._request.rendezvous, self.motion
         try:
-            view = motion.tracker.view()
-            guards.check_may_move(view)
-            guards.check_referenced(view)
+            tracker = motion.tracker
+            guards.check_may_move(tracker)
+            guards.check_referenced(tracker)
             position = motion.unwrapped(self._request.position, self._request.direction)
             self.plan = motion.plan_to(position, self._request.velocity, self._request.acceleration)
             await meeting.join(motion.config.name, self)
@@ -213,7 +214,7 @@ class GroupMember(Procedure):
             raise
         motion.tracker.started(motion.clock.now_s())
         motion.target_counts = self.plan.motion.target_counts
-        return motion.reply(self.turn).model_copy(
+        return motion.reply(self.permit).model_copy(
             update={
                 "position": motion.shown(self.plan.position),
                 "velocity": self.plan.velocity,
@@ -226,7 +227,7 @@ class GroupMember(Procedure):
         """Say that the axis moves, before its drive does."""
         self._announced = True
         self.motion.begin(
-            self.turn.command_id, self.turn.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=self.plan
+            self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=self.plan
         )
 
     def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - part of the contract
@@ -253,3 +254,34 @@ def _look(started: "asyncio.Future[None]") -> None:
     """Retrieve an error that no member waits for, so that asyncio does not report it."""
     if not started.cancelled():
         started.exception()
+
+
+async def start_together(
+    network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
+) -> None:
+    """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
+
+    Args:
+        network: of their line.
+        motions: by axis name.
+        permits: of all members.
+        announce: called between the last check and the first packet.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.
+    """
+
+    def about_to_start() -> None:
+        ask_all()
+        for permit in permits:
+            permit.begun()
+        announce()
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    conditions = [permit.to_move() for permit in permits]
+    ask_all()
+    with only_while(ask_all):
+        await network.start_group(motions, about_to_start)

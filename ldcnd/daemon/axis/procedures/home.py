@@ -12,12 +12,11 @@ from typing_extensions import override
 from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
-from ldcnd.daemon.axis.permit import QuietDrive, homing
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.guards import Permit, QuietDrive, homing
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.procedures.probe import check_index_is_seen
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode, Warns
-from ldcnd.drivers.scaling import Scale
 from ldcnd.errors import MalformedRequest, NotSupported
 from ldcnd.log import get_logger
 from ldcnd.model.commands import CommandReply, Home, HomeMethod, HomeStop
@@ -61,9 +60,9 @@ class HomeSearch:
     move_to: float | None
     active_high: bool
 
-    def runs_onto_switch(self, scale: Scale) -> bool:
+    def runs_onto_switch(self, counts_per_unit: float) -> bool:
         """Tell whether the search moves towards the limit switch that it looks for."""
-        forward = scale.to_counts(self.velocity) > 0
+        forward = self.velocity * counts_per_unit > 0
         return self.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
 
 
@@ -133,29 +132,28 @@ class Leg(Enum):
 class HomeSequence(Procedure):
     """One homing, from the request to the reference."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: Home) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: Home) -> None:
+        self.permit = permit
         self._motion = motion
         self._search = plan_search(motion.config, motion.driver, request)
         self._leg = Leg.SEARCH
 
     @override
     async def begin(self) -> CommandReply:
-        motion = self._motion
-        view = motion.tracker.view()
-        guards.check_may_move(view)
+        motion, tracker = self._motion, self._motion.tracker
+        guards.check_may_move(tracker)
         search = self._search
-        plan = motion.planner.at_velocity(view, search.velocity, search.acceleration)
+        plan = motion.plan_at(search.velocity, search.acceleration)
         if search.method is HomeMethod.INDEX:
             check_index_is_seen(motion, plan, search.index_width)
         if search.move_to is not None:
-            guards.check_position(view, motion.config.limits, search.move_to)
+            guards.check_position(tracker, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
-        off_switch = search.runs_onto_switch(motion.scale) and self._on_switch(await motion.read())
+        off_switch = search.runs_onto_switch(motion.counts_per_unit) and self._on_switch(await motion.read())
         await motion.reference.forget()  # before the drive captures: the kept reference has another origin
-        finds = search.find_velocity is not None and search.runs_onto_switch(motion.scale)
-        await self._set_out(self.turn, Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
-        return motion.reply(self.turn).model_copy(
+        finds = search.find_velocity is not None and search.runs_onto_switch(motion.counts_per_unit)
+        await self._set_out(Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
+        return motion.reply(self.permit).model_copy(
             update={"position": search.position, "velocity": plan.velocity, "acceleration": plan.acceleration}
         )
 
@@ -168,51 +166,50 @@ class HomeSequence(Procedure):
 
     @override
     async def step(self) -> bool:
-        turn = self.turn
         reading = self._motion.latest()
         match self._leg:
             case Leg.CLEAR if self._motion.clock.now_s() >= self.deadline_s:
-                return await self._give_up(turn, f"not at rest off the switch within {self._search.timeout_s:g} s")
+                return await self._give_up(f"not at rest off the switch within {self._search.timeout_s:g} s")
             case Leg.CLEAR if self._on_switch(reading):
-                return await self._give_up(turn, f"the axis does not come off the {self._search.method} switch")
+                return await self._give_up(f"the axis does not come off the {self._search.method} switch")
             case Leg.CLEAR:
-                await self._set_out(turn, Leg.SEARCH)
+                await self._set_out(Leg.SEARCH)
                 return True
             case Leg.BRAKE:
-                await self._set_out(turn, Leg.OFF_SWITCH)
+                await self._set_out(Leg.OFF_SWITCH)
                 return True
             case Leg.FOUND:
-                return await self._move_on(turn)
+                return await self._move_on()
         if reading.homing:
-            return await self._give_up(turn, self._failure())
+            return await self._give_up(self._failure())
         if self._leg is Leg.SEARCH:
-            return await self._take_over(turn)
+            return await self._take_over()
         await self._motion.driver.stop(StopMode.SMOOTH)
-        turn.still_wanted()
+        self.permit.still_wanted()
         self._leg = Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR
-        self._motion.stopping(turn.command_id, turn.verb, AxisState.HOMING, Completion.PROCEDURE)
+        self._motion.stopping(self.permit.command_id, self.permit.verb, AxisState.HOMING, Completion.PROCEDURE)
         return True
 
-    async def _set_out(self, turn: Turn, leg: Leg) -> None:
+    async def _set_out(self, leg: Leg) -> None:
         """Begin a leg that looks for the mark."""
         motion, search = self._motion, self._search
         away = leg is Leg.OFF_SWITCH
         velocity = -search.velocity if away else search.velocity
         if leg is Leg.FIND and search.find_velocity is not None:
             velocity = math.copysign(search.find_velocity, search.velocity)
-        plan = motion.planner.at_velocity(motion.tracker.view(), velocity, search.acceleration)
+        plan = motion.plan_at(velocity, search.acceleration)
         capture = HomeCapture(search.method, search.stop if leg is Leg.SEARCH else StopMode.SMOOTH)
         leg_motion = replace(
             plan.motion,
             target_counts=self._end_of_leg(plan),
             velocity_counts_per_s=abs(plan.motion.velocity_counts_per_s),
         )
-        await turn.permit.load(leg_motion, home=capture)
+        await self.permit.load(leg_motion, home=capture)
         self._leg = leg
         motion.tracker.referenced = False
         opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
         self.deadline_s = motion.clock.now_s() + search.timeout_s
-        await motion.start(turn, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH)
+        await motion.start(self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH)
 
     def _end_of_leg(self, plan: MotionPlan) -> int:
         search, here = self._search, self._motion.latest().position_counts
@@ -220,7 +217,7 @@ class HomeSequence(Procedure):
         if search.distance is None:
             reach = abs(speed) * search.timeout_s * BEYOND
         else:
-            reach = search.distance * self._motion.scale.counts_per_unit
+            reach = search.distance * abs(self._motion.counts_per_unit)
         return here + round(math.copysign(min(reach, LARGEST_COUNT), speed))
 
     def _failure(self) -> str:
@@ -229,15 +226,15 @@ class HomeSequence(Procedure):
             return f"no {search.method} within {search.timeout_s:g} s"
         return f"no {search.method} within {search.distance:g} {self._motion.config.unit}"
 
-    async def _give_up(self, turn: Turn, failure: str) -> bool:
+    async def _give_up(self, failure: str) -> bool:
         await self._motion.driver.stop(StopMode.SMOOTH)
-        turn.still_wanted()
+        self.permit.still_wanted()
         log.warning("homing failed", axis=self._motion.config.name, reason=failure)
-        self._motion.stopping(turn.command_id, turn.verb)
+        self._motion.stopping(self.permit.command_id, self.permit.verb)
         self._motion.tracker.failing(failure)
         return False
 
-    async def _take_over(self, turn: Turn) -> bool:
+    async def _take_over(self) -> bool:
         """Read what was captured and make it the reference; the axis comes to rest meanwhile."""
         motion, search = self._motion, self._search
         driver, tracker = motion.driver, motion.tracker
@@ -248,30 +245,30 @@ class HomeSequence(Procedure):
         captured = await homing(driver).captured_home()
         if isinstance(driver, Warns):
             await driver.clear_warnings()  # homing on the current sets one
-        turn.still_wanted()
+        self.permit.still_wanted()
         closed = search.stop is not StopMode.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:
-            await turn.permit.power_on()
+            await self.permit.power_on()
         tracker.switched(on=closed, now_s=motion.clock.now_s())
-        motion.telemetry.origin_counts = captured - motion.scale.to_counts(search.position)
+        motion.telemetry.origin_counts = captured - search.position * motion.counts_per_unit
         tracker.referenced = True
         if not closed:
             tracker.finished()
             motion.publish_state()
             return False
         if search.move_to is None:
-            motion.stopping(turn.command_id, turn.verb, AxisState.HOMING)
+            motion.stopping(self.permit.command_id, self.permit.verb, AxisState.HOMING)
             return False
         self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
         return True
 
-    async def _move_on(self, turn: Turn) -> bool:
+    async def _move_on(self) -> bool:
         motion, move_to = self._motion, self._search.move_to
         if move_to is None or not motion.tracker.at_rest:
-            return await self._give_up(turn, f"not at rest within {self._search.timeout_s:g} s")
+            return await self._give_up(f"not at rest within {self._search.timeout_s:g} s")
         plan = motion.plan_to(motion.unwrapped(move_to), None, None)
-        await turn.permit.load(plan.motion)
-        await motion.start(turn, AxisState.HOMING, Completion.PROFILE, plan=plan)
+        await self.permit.load(plan.motion)
+        await motion.start(self.permit, AxisState.HOMING, Completion.PROFILE, plan=plan)
         motion.target_counts = plan.motion.target_counts
         return False
 

@@ -13,8 +13,9 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, StopMode
@@ -116,8 +117,8 @@ class _Phase(Enum):
 class HeldJog(Procedure):
     """A jog, from its first packet to the stop that ends it."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, hold: Hold) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, hold: Hold) -> None:
+        self.permit = permit
         self._motion = motion
         self._hold = hold
         self._wanted: tuple[float, float | None, float] = (0.0, None, 1.0)  # at what it runs: see `_asked`
@@ -137,12 +138,12 @@ class HeldJog(Procedure):
             PositionLimit: the axis stands at the software limit ahead.
             LeaseExpired: no renewal came while the command waited.
         """
-        guards.check_may_move(self._motion.tracker.view())
+        guards.check_may_move(self._motion.tracker)
         try:
             return await self._run()
         finally:
             command = self._motion.tracker.command
-            self._hold.begun = command is not None and command.command_id == self.turn.command_id
+            self._hold.begun = command is not None and command.command_id == self.permit.command_id
 
     def is_of(self, hold: Hold) -> bool:
         """Tell whether this is the jog of a hold, and goes on."""
@@ -185,42 +186,42 @@ class HeldJog(Procedure):
     @property
     def _asked(self) -> tuple[float, float | None, float]:
         """Velocity and acceleration, and the share of the velocity that the speed override leaves."""
-        return self._hold.velocity, self._hold.acceleration, self._motion.speed_share
+        return self._hold.velocity, self._hold.acceleration, self._motion.tracker.speed_share
 
     async def _run(self) -> CommandReply:
         """Have the drive run to a goal that is as far ahead as it may be."""
         motion, asked = self._motion, self._asked
         here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
-        self.turn.permit.ask_to_move()
+        self.permit.ask_to_move()
         plan, velocity, reach_s, at_limit = self._plan(motion.telemetry.position(here), *asked[:2])
-        await self.turn.permit.load(plan.motion)
+        await self.permit.load(plan.motion)
         self._wanted = asked
         self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if it is unknown whether the drive has started
         extends = motion.driver.retargets and not at_limit
         self._extend_at_s = motion.clock.now_s() + EXTEND_HOLDS * self._hold.hold_s if extends else math.inf
-        await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        return motion.reply(self.turn).model_copy(
+        await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        return motion.reply(self.permit).model_copy(
             update={"velocity": velocity, "acceleration": plan.acceleration, "duration_s": reach_s}
         )
 
     def _plan(self, here: float, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
         """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""
-        motion, view = self._motion, self._motion.tracker.view()
-        steady = motion.planner.at_velocity(view, velocity, acceleration)
+        motion, tracker = self._motion, self._motion.tracker
+        steady = motion.plan_at(velocity, acceleration)
         forward = velocity > 0
         longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
         reach_s = min(self._reach_s, longest_s)
         way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
         end = here + way if forward else here - way
         at_limit = False
-        if view.referenced:
-            limits, limit = motion.config.limits, motion.planner.limit_ahead(velocity)
+        if tracker.referenced:
+            limits, limit = motion.config.limits, motion.limit_ahead(velocity)
             if limit is not None and (end >= limit if forward else end <= limit):
                 end, at_limit = limit, True
                 if here >= limit if forward else here <= limit:
                     raise PositionLimit(
-                        f"axis {view.name} is at its limit {limit:g} {view.unit}",
-                        axis=view.name,
+                        f"axis {tracker.name} is at its limit {limit:g} {tracker.unit}",
+                        axis=tracker.name,
                         value=here,
                         limit=limit,
                         remedy="jog the other way",
@@ -239,7 +240,7 @@ class HeldJog(Procedure):
         """Bring the axis to rest; the jog goes on from there."""
         motion = self._motion
         await motion.driver.stop(StopMode.SMOOTH)
-        motion.begin(self.turn.command_id, self.turn.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         motion.tracker.started(motion.clock.now_s())
         self._phase = _Phase.SLOWS
 
@@ -247,7 +248,7 @@ class HeldJog(Procedure):
         motion = self._motion
         self._over()
         await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
-        motion.stopping(self.turn.command_id, self.turn.verb)
+        motion.stopping(self.permit.command_id, self.permit.verb)
         motion.tracker.failing(reason)
         return False
 

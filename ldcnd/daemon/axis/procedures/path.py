@@ -5,7 +5,7 @@ first. Permission is checked before every packet. An end of one member ends all:
 """
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from typing_extensions import override
@@ -13,9 +13,9 @@ from typing_extensions import override
 from ldcnd.bus.bus import Bus
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
-from ldcnd.daemon.axis.permit import start_path, walking
+from ldcnd.daemon.axis.guards import Permit, walking
 from ldcnd.daemon.axis.polyline import PathAxis, Walk, walk
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.procedures.group import Rendezvous
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, Homes, Motion, StopMode
@@ -29,6 +29,7 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
+from ldcnd.exchange import only_while
 from ldcnd.log import get_logger
 from ldcnd.model.commands import CommandReply, MoveAbsolute
 from ldcnd.model.rig_commands import PathReply
@@ -134,7 +135,7 @@ class SharedPath(Rendezvous):
                 raise WrongState("a member of the path has left, so no axis was started")
             for member in members.values():
                 member.announce()
-            await start_path(self._network, self._names, [member.turn.permit for member in members.values()])
+            await start_path(self._network, self._names, [member.permit for member in members.values()])
         except LdcndError as error:
             if fed:
                 await self.stop_all(error.message)
@@ -225,7 +226,7 @@ class SharedPath(Rendezvous):
         steps = member.steps[share.sent : share.sent + walking(member.motion.driver).path_packet]
         if steps:
             share.sent += len(steps)
-            await member.turn.permit.add_points(steps)
+            await member.permit.add_points(steps)
 
     def left(self) -> str:
         """Say which member has left the path before its end; empty when none has."""
@@ -257,8 +258,8 @@ class SharedPath(Rendezvous):
 class PathMember(Procedure):
     """One axis of a path: feeds its drive until the last point, then settles like any move."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: PathShareRequest) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: PathShareRequest) -> None:
+        self.permit = permit
         self.motion = motion
         self.plan: MotionPlan
         self._request = request
@@ -281,9 +282,9 @@ class PathMember(Procedure):
         """
         path, motion = self._path, self.motion
         try:
-            view = motion.tracker.view()
-            guards.check_may_move(view)
-            guards.check_referenced(view)
+            tracker = motion.tracker
+            guards.check_may_move(tracker)
+            guards.check_referenced(tracker)
             walking(motion.driver).check_path()
             plans = [
                 motion.plan_to(position, self._request.velocity, self._request.acceleration)
@@ -291,7 +292,7 @@ class PathMember(Procedure):
             ]
             self.plan = plans[-1]
             status = await walking(motion.driver).path_status()
-            self.turn.permit.ask_to_move()
+            self.permit.ask_to_move()
             if status.points or status.running or not status.enabled:
                 raise WrongState(
                     f"axis {motion.config.name}: {status.points} points of an earlier path are left in the drive",
@@ -308,7 +309,7 @@ class PathMember(Procedure):
             raise
         motion.tracker.started(motion.clock.now_s())
         self._wait(path.share_of(self).sent)
-        return motion.reply(self.turn).model_copy(
+        return motion.reply(self.permit).model_copy(
             update={
                 "position": motion.shown(self.plan.position),
                 "velocity": self.plan.velocity,
@@ -322,7 +323,7 @@ class PathMember(Procedure):
         motion = self.plan.motion
         return PathAxis(
             self._corners,
-            self.motion.scale.counts_per_unit,
+            abs(self.motion.counts_per_unit),
             abs(motion.velocity_counts_per_s),
             motion.acceleration_counts_per_s2,
         )
@@ -331,14 +332,14 @@ class PathMember(Procedure):
         """Put the acceleration in force by which a smooth stop ends the path: a trapezoid that goes nowhere."""
         motion = self.plan.motion
         here = Motion(self._here, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-        await self.turn.permit.load(here)
-        await self.turn.permit.start()
+        await self.permit.load(here)
+        await self.permit.start()
 
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""
         self._announced = True
         self.motion.begin(
-            self.turn.command_id, self.turn.verb, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=self.plan
+            self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=self.plan
         )
 
     @override
@@ -399,7 +400,7 @@ class PathMember(Procedure):
             motion.publish_state()
             return False
         at_end = MotionPlan(self.plan.motion, self.plan.position, self.plan.velocity, self.plan.acceleration, 0.0)
-        motion.begin(self.turn.command_id, self.turn.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end)
+        motion.begin(self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end)
         motion.tracker.started(motion.clock.now_s())
         motion.target_counts = target
         log.debug("path walked", axis=name)
@@ -410,8 +411,24 @@ class PathMember(Procedure):
         if not self._announced or self.outlived(motion.tracker):
             return
         if isinstance(error, OutcomeUnknown):
-            motion.stopping(self.turn.command_id, self.turn.verb)
+            motion.stopping(self.permit.command_id, self.permit.verb)
             motion.tracker.failing(error.message)
             return
         motion.tracker.finished(error.message)
         motion.publish_state()
+
+
+async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
+    """Start axes on their paths; every member's permission is checked directly before the packet that starts.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
+    """
+    conditions = [permit.to_move() for permit in permits]
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    with only_while(ask_all):
+        await network.start_path(names, ask_all)

@@ -8,8 +8,8 @@ import math
 
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
-from ldcnd.daemon.axis.permit import homing
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.guards import Permit, homing
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode, Warns
 from ldcnd.errors import MalformedRequest, NotSupported, VelocityLimit
@@ -24,8 +24,8 @@ STOPS = {ProbeStop.SMOOTH: StopMode.SMOOTH, ProbeStop.ABRUPT: StopMode.ABRUPT}
 class ProbeMove(Procedure):
     """One such move; its only step is to read what was latched, or to say that nothing was."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: Probe) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: Probe) -> None:
+        self.permit = permit
         self._motion = motion
         self._request = request
         self._stop = STOPS[request.stop]
@@ -42,11 +42,11 @@ class ProbeMove(Procedure):
             VelocityLimit: the index could be missed at this velocity.
         """
         motion = self._motion
-        guards.check_may_move(motion.tracker.view())
+        guards.check_may_move(motion.tracker)
         self._check_sources()
         here = (await motion.read()).position_counts  # one reading alone may be wrong
-        self.turn.still_wanted()
-        guards.check_may_move(motion.tracker.view())
+        self.permit.still_wanted()
+        guards.check_may_move(motion.tracker)
         plan = self._plan(here)
         if HomeMethod.INDEX in self._methods:
             width = motion.config.home.index_width if motion.config.home else 1
@@ -57,9 +57,9 @@ class ProbeMove(Procedure):
         self._ahead = HomeMethod.FORWARD_LIMIT if target > here else HomeMethod.REVERSE_LIMIT
         first, *others = self._methods
         capture = HomeCapture(first, self._stop, also=frozenset(others), guarded=True)
-        await self.turn.permit.load(plan.motion, home=capture)
-        await motion.start(self.turn, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=plan)
-        return motion.reply(self.turn).model_copy(
+        await self.permit.load(plan.motion, home=capture)
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=plan)
+        return motion.reply(self.permit).model_copy(
             update={
                 "position": motion.shown(plan.position),
                 "velocity": plan.velocity,
@@ -80,7 +80,7 @@ class ProbeMove(Procedure):
             self._end("no input came on the way")
             return False
         latched = await homing(motion.driver).captured_home()
-        self.turn.still_wanted()
+        self.permit.still_wanted()
         if HomeMethod.CURRENT in self._methods and isinstance(motion.driver, Warns):
             await motion.driver.clear_warnings()
         if self._ahead not in self._methods and homing(motion.driver).stands_on(self._ahead, reading):
@@ -96,16 +96,16 @@ class ProbeMove(Procedure):
                 value=motion.telemetry.within_turn(motion.telemetry.position(latched))[0],
                 unit=motion.config.unit,
                 counts=latched,
-                error=self._error_counts / motion.scale.counts_per_unit,
+                error=self._error_counts / abs(motion.counts_per_unit),
                 sources=tuple(source.value for source in self._request.sources),
-                command_id=self.turn.command_id,
+                command_id=self.permit.command_id,
             )
         )
         self._end()
         return False
 
     def _end(self, failure: str = "") -> None:
-        self._motion.stopping(self.turn.command_id, self.turn.verb)
+        self._motion.stopping(self.permit.command_id, self.permit.verb)
         if failure:
             self._motion.tracker.failing(failure)
 
@@ -126,7 +126,7 @@ class ProbeMove(Procedure):
         motion, request = self._motion, self._request
         match request.position, request.distance:
             case float() as position, None:
-                guards.check_referenced(motion.tracker.view())
+                guards.check_referenced(motion.tracker)
                 position = motion.unwrapped(position)
             case None, float() as distance:
                 position = motion.telemetry.position(here_counts) + distance
@@ -154,7 +154,7 @@ def check_index_is_seen(motion: AxisMotion, plan: MotionPlan, width: int) -> Non
     sample_s = homing(motion.driver).capture_s
     if not sample_s:
         return
-    limit = INDEX_SHARE * width / sample_s / motion.scale.counts_per_unit
+    limit = INDEX_SHARE * width / sample_s / abs(motion.counts_per_unit)
     if abs(plan.velocity) > limit:
         raise VelocityLimit(
             f"axis {motion.config.name}: at {abs(plan.velocity):g} {motion.config.unit}/s the drive can miss an index"

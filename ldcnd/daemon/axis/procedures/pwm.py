@@ -5,8 +5,9 @@ the axis must be configured for it.
 """
 
 from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, Motion, PwmOutput, StopMode
 from ldcnd.errors import NotSupported, ValueOutOfRange
@@ -20,28 +21,28 @@ FULL_DUTY = 255
 class PwmRun(Procedure):
     """One duty, from the request to the stop that ends it."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: SetPwm) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: SetPwm) -> None:
+        self.permit = permit
         self._motion = motion
         self._request = request
 
     async def begin(self) -> CommandReply:
         """See `Procedure`. A duty under way may be replaced by another."""
         motion, request = self._motion, self._request
-        view, active = motion.tracker.view(), motion.tracker.command
+        tracker, active = motion.tracker, motion.tracker.command
         if active is None or active.verb is not Verb.SET_PWM:
-            guards.check_may_move(view)
+            guards.check_may_move(tracker)
         else:
-            guards.check_may_power_on(view)
+            guards.check_may_power_on(tracker)
         self._check_bounds()
         speed, rate = motion.config.velocity, motion.config.acceleration
-        counts_per_unit = motion.scale.counts_per_unit
+        counts_per_unit = abs(motion.counts_per_unit)
         acceleration = motion.driver.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
-        duty = -request.duty if motion.scale.reverse else request.duty
-        await self.turn.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
+        duty = request.duty if motion.counts_per_unit > 0 else -request.duty
+        await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
         self.deadline_s = motion.clock.now_s() + request.duration_s
-        await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
-        return motion.reply(self.turn).model_copy(
+        await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
+        return motion.reply(self.permit).model_copy(
             update={"duration_s": request.duration_s, "duty": round(request.duty * FULL_DUTY) / FULL_DUTY}
         )
 
@@ -54,7 +55,7 @@ class PwmRun(Procedure):
         ours = self._motion.tracker.command is not None
         await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)
         if ours:
-            self._motion.stopping(self.turn.command_id, self.turn.verb)
+            self._motion.stopping(self.permit.command_id, self.permit.verb)
         return False
 
     def outlived(self, tracker: AxisTracker) -> bool:

@@ -4,8 +4,9 @@ from typing_extensions import override
 
 from ldcnd.config.axis import TrackingConfig
 from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.errors import (
@@ -29,8 +30,8 @@ EARLY = 0.5
 class SetPoint(Procedure):
     """One set-point; it takes the stream over from the one before it."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: Track, before: Procedure | None) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: Track, before: Procedure | None) -> None:
+        self.permit = permit
         self._motion = motion
         self._request = request
         self._before = before if isinstance(before, SetPoint) and not before.outlived(motion.tracker) else None
@@ -44,24 +45,24 @@ class SetPoint(Procedure):
             ValueOutOfRange: farther from the last set-point than the configured step.
         """
         motion, tracker, position = self._motion, self._motion.tracker, self._request.position
-        view, bounds = tracker.view(), self._bounds()
+        bounds = self._bounds()
         before, self._before = self._before, None  # a stream keeps only its last set-point
         if before:
-            guards.check_may_power_on(view)
+            guards.check_may_power_on(tracker)
         else:
-            guards.check_may_move(view)
-        guards.check_referenced(view)
-        guards.check_position(view, motion.config.limits, position)
+            guards.check_may_move(tracker)
+        guards.check_referenced(tracker)
+        guards.check_position(tracker, motion.config.limits, position)
         self._check_rate(before, bounds)
         target = motion.counts_of(position)
         self._check_step(target, bounds)
-        self.turn.permit.ask_to_move()
+        self.permit.ask_to_move()
         if tracker.command and tracker.command.verb is Verb.TRACK:
             tracker.finished()  # the stream goes on under the new command's name
-        motion.begin(self.turn.command_id, self.turn.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
         try:
-            await self.turn.permit.track(target)
+            await self.permit.track(target)
         except OutcomeUnknown:
             motion.target_counts = target  # if it was not executed the next set-point is still near enough
             tracker.started(motion.clock.now_s())
@@ -72,7 +73,7 @@ class SetPoint(Procedure):
             raise
         motion.target_counts = target
         tracker.started(motion.clock.now_s())
-        return motion.reply(self.turn).model_copy(update={"position": motion.shown(motion.telemetry.position(target))})
+        return motion.reply(self.permit).model_copy(update={"position": motion.shown(motion.telemetry.position(target))})
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
@@ -109,7 +110,7 @@ class SetPoint(Procedure):
     def _check_step(self, target: int, bounds: TrackingConfig) -> None:
         motion = self._motion
         last = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
-        step = motion.scale.to_units(target - last)
+        step = (target - last) / motion.counts_per_unit
         if abs(step) > bounds.step:
             nearest = motion.telemetry.position(last) + (bounds.step if step > 0 else -bounds.step)
             raise ValueOutOfRange(

@@ -7,8 +7,9 @@ that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time:
 """
 
 from ldcnd.daemon.axis import guards
+from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
-from ldcnd.daemon.axis.procedure import Procedure, Turn
+from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, StopMode
 from ldcnd.errors import PositionLimit, Remedy, step
@@ -30,8 +31,8 @@ def runs(tracker: AxisTracker) -> bool:
 class VelocityChange(Procedure):
     """A motion in velocity mode, from the change of its velocity to the stop that ends it."""
 
-    def __init__(self, motion: AxisMotion, turn: Turn, request: MoveVelocity) -> None:
-        self.turn = turn
+    def __init__(self, motion: AxisMotion, permit: Permit, request: MoveVelocity) -> None:
+        self.permit = permit
         self._motion = motion
         self._request = request
         self._end: float | None = None
@@ -45,28 +46,28 @@ class VelocityChange(Procedure):
             PositionLimit: the software limit ahead is too near to stop before it.
         """
         motion, request = self._motion, self._request
-        view = motion.tracker.view()
-        guards.check_may_follow(view)
-        plan = motion.planner.at_velocity(view, request.velocity, request.acceleration)
-        before = abs(motion.scale.to_units(motion.latest().velocity_counts_per_s))
+        tracker = motion.tracker
+        guards.check_may_follow(tracker)
+        plan = motion.plan_at(request.velocity, request.acceleration)
+        before = abs(motion.latest().velocity_counts_per_s / motion.counts_per_unit)
         self._velocity, speed = plan.velocity, max(abs(plan.velocity), before)
         self._margin = speed * speed / (2 * plan.acceleration) + speed * LATENCY_S
-        self._end = motion.planner.limit_ahead(plan.velocity) if view.referenced else None
+        self._end = motion.limit_ahead(plan.velocity) if tracker.referenced else None
         if self._ends_here(motion.latest()):
             raise PositionLimit(
-                f"axis {view.name}: the limit {self._end:g} {view.unit} is too near for"
-                f" {plan.velocity:g} {view.unit}/s",
-                axis=view.name,
+                f"axis {tracker.name}: the limit {self._end:g} {tracker.unit} is too near for"
+                f" {plan.velocity:g} {tracker.unit}/s",
+                axis=tracker.name,
                 value=plan.velocity,
                 limit=self._end,
                 remedy=Remedy("{}", step("halt")),
             )
-        await self.turn.permit.load(plan.motion)
+        await self.permit.load(plan.motion)
         speed_counts = plan.motion.velocity_counts_per_s
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
         self.deadline_s = motion.clock.now_s() + min(motion.config.jog_horizon_s, COUNTER_SHARE * room_s)
-        await motion.start(self.turn, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        return motion.reply(self.turn).model_copy(update={"velocity": plan.velocity, "acceleration": plan.acceleration})
+        await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        return motion.reply(self.permit).model_copy(update={"velocity": plan.velocity, "acceleration": plan.acceleration})
 
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: the end is near, the drive has stopped, or the command was lost while out of sight."""
@@ -78,7 +79,7 @@ class VelocityChange(Procedure):
         reading, ours = motion.latest(), motion.tracker.command is not None
         await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
         if ours:
-            motion.stopping(self.turn.command_id, self.turn.verb)
+            motion.stopping(self.permit.command_id, self.permit.verb)
             if reading.cut_short:
                 motion.tracker.failing(reading.cut_short)
         return False
