@@ -8,8 +8,9 @@ from typing import TypeVar
 
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
+from ldcnd.messaging.hand_over import Answer
 from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
-from ldcnd.messaging.session import Answer, Declaration, Sample, SampleKind, Session
+from ldcnd.messaging.session import Declaration, Sample, SampleKind, Session
 from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo

@@ -11,23 +11,29 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from ldcnd.errors import OutcomeUnknown, SessionError
-from ldcnd.messaging.hand_over import Admission, HandOver, Intake, QueryIntake, TokenChanges
+from ldcnd.messaging.hand_over import (
+    Admission,
+    Answer,
+    HandOver,
+    Intake,
+    Load,
+    OnQuery,
+    OnRead,
+    OnToken,
+    Query,
+    QueryIntake,
+    TokenChanges,
+)
 from ldcnd.messaging.keys import matches
 from ldcnd.messaging.reads import ReadIntake, Reads
 from ldcnd.messaging.session import (
     NO_PARAMETERS,
     QUERY_TIMEOUT_S,
     UNDELIVERED_SAMPLES,
-    Answer,
     Declaration,
-    Load,
-    OnQuery,
-    OnRead,
     OnSample,
-    OnToken,
     PublishValue,
     Qos,
-    Query,
     Sample,
     SampleKind,
     Session,

@@ -11,8 +11,16 @@ from collections import Counter, deque
 from collections.abc import Iterator
 
 from ldcnd.errors import ShuttingDown, TooManyRequests
-from ldcnd.messaging.hand_over import Admission, HandOver
-from ldcnd.messaging.session import READS_OF_A_CLIENT, READS_OF_UNNAMED, READS_UNANSWERED, Load, OnRead, Query
+from ldcnd.messaging.hand_over import Admission, HandOver, Load, OnRead, Query
+
+READS_OF_A_CLIENT = 64
+"""Maximum number of unanswered reads of a named client session; the next is refused with too_many_requests."""
+
+READS_OF_UNNAMED = 256
+"""The same for all clients together that do not name their sessions: Zenoh does not tell whose query it is."""
+
+READS_UNANSWERED = 1024
+"""The same for all clients together."""
 
 LEAVING_AT_ONCE = 2
 """Maximum number of answers being sent at a time: more threads would only take the interpreter from the loop."""

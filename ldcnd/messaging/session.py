@@ -5,34 +5,15 @@ bounded: a subscription keeps its newest samples, a queryable refuses what is to
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
 
-from ldcnd.errors import InternalError, LdcndError
-from ldcnd.messaging.codec import Encoding, encode, error_reply
+from ldcnd.messaging.hand_over import Answer, Load, OnQuery, OnRead, OnToken
 
 UNDELIVERED_SAMPLES = 64
 """Maximum number of samples that a subscription keeps for its callback; the oldest is dropped."""
-
-PENDING_QUERIES = 64
-"""Maximum number of unanswered queries of a queryable; the next is refused with too_many_requests."""
-
-UNDELIVERED_TOKENS = 1024
-"""Maximum number of changes that a token watch keeps for its callback; the oldest is dropped."""
-
-PENDING_URGENT_QUERIES = 4096
-"""The same for an urgent queryable: a bound on memory, not on clients; a stop is not refused for being one of many."""
-
-READS_OF_A_CLIENT = 64
-"""Maximum number of unanswered reads of a named client session; the next is refused with too_many_requests."""
-
-READS_OF_UNNAMED = 256
-"""The same for all clients together that do not name their sessions: Zenoh does not tell whose query it is."""
-
-READS_UNANSWERED = 1024
-"""The same for all clients together."""
 
 QUERY_TIMEOUT_S = 2.0
 """Default time that a client waits for the answers to a query, seconds."""
@@ -70,149 +51,9 @@ class Sample:
     """When the value was true, UTC in ns since 1970; when it was sent if not given; None without a time stamp."""
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """One answer to a query; an error answer carries an `ErrorReply`."""
-
-    key: str
-    payload: bytes
-    encoding: str
-    measured_at_ns: int | None = None
-    is_error: bool = False
-
-
-def _nobody() -> str | None:
-    return None
-
-
-Send = Callable[[tuple[Answer, ...]], None]
-"""Takes all answers to one query, once, from any thread, without blocking."""
-
-
-class Query:
-    """A question to be answered exactly once, on the event loop, now or later.
-
-    Either one `reply` without a key, or one `refuse` or `reply_error`, or any number of `reply` with a key each and
-    then `finish`. A query that is dropped without an answer is answered with an internal error.
-
-    Attributes:
-        key: of the query; may be an expression with wildcards.
-        parameters: what followed the `?` of the selector, not percent-decoded.
-        payload: empty when there was none.
-        encoding: of the payload, as the client named it; empty when it did not.
-    """
-
-    __slots__ = ("_answered", "_answers", "_login", "_send", "encoding", "key", "parameters", "payload")
-
-    def __init__(
-        self,
-        key: str,
-        parameters: Mapping[str, str],
-        payload: bytes,
-        encoding: str,
-        send: Send,
-        login: Callable[[], str | None] = _nobody,
-    ) -> None:
-        self.key = key
-        self._login = login
-        self.parameters = parameters
-        self.payload = payload
-        self.encoding = encoding
-        self._send = send
-        self._answers: list[Answer] = []
-        self._answered = False
-
-    @property
-    def login(self) -> str | None:
-        """The certificate of the link that its sender says it comes from, by common name; for the record only.
-
-        None when the sender does not say, when it is behind a router, and on links without certificates. A login that
-        may command can name another one's session, so this finds mistakes, not forgers.
-        """
-        return self._login()
-
-    def reply(self, payload: bytes, encoding: str, key: str | None = None, measured_at_ns: int | None = None) -> None:
-        """Answer; finally without a key, with one value of several when a key is given.
-
-        Args:
-            payload: the value.
-            encoding: of the payload.
-            key: the key that has this value; must match the query's. `finish` ends the answer.
-            measured_at_ns: when the value was true, UTC in ns since 1970.
-
-        Raises:
-            InternalError: the query was answered already.
-        """
-        self._refuse_second_answer()
-        self._answers.append(Answer(key or self.key, payload, encoding, measured_at_ns))
-        if key is None:
-            self.finish()
-
-    def reply_error(self, payload: bytes, encoding: str) -> None:
-        """Answer finally with an encoded `ErrorReply`; values given before are not sent.
-
-        Raises:
-            InternalError: the query was answered already.
-        """
-        self._refuse_second_answer()
-        self._answers = [Answer(self.key, payload, encoding, is_error=True)]
-        self.finish()
-
-    def refuse(self, error: LdcndError) -> None:
-        """Answer finally with an error, as JSON.
-
-        Raises:
-            InternalError: the query was answered already.
-        """
-        self.reply_error(*encode(error_reply(error), Encoding.JSON))
-
-    def finish(self) -> None:
-        """End an answer of several values, or of none.
-
-        Raises:
-            InternalError: the query was answered already.
-        """
-        self._refuse_second_answer()
-        self._answered = True
-        self._send(tuple(self._answers))
-
-    def abandon(self) -> None:
-        """Answer with an internal error unless the query was answered; for a caller that gives a query up."""
-        if not self._answered:
-            self.refuse(InternalError(f"{self.key}: the query was dropped without an answer; the log has more"))
-
-    def _refuse_second_answer(self) -> None:
-        if self._answered:
-            raise InternalError(f"{self.key}: the query was answered already")
-
-    def __del__(self) -> None:
-        """Leave no client waiting for a query that was abandoned."""
-        # attributes are missing when the constructor failed
-        if not getattr(self, "_answered", True):
-            self.abandon()
-
-
-OnQuery = Callable[[Query], None]
-OnRead = Callable[[Query], Iterator[None]]
-"""Answers a query in steps: each makes at most one payload, and between two of them the loop does other work."""
 OnSample = Callable[[Sample], None]
-OnToken = Callable[[str, bool], None]
 PublishValue = Callable[[bytes, int], None]
 """Publishes a payload, true at that instant, UTC in ns since 1970."""
-"""Learns that the token of a key has appeared (True) or vanished (False)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Load:
-    """How a declaration keeps up with what arrives.
-
-    Attributes:
-        waiting: queries that have no answer yet; samples and tokens that the callback has not had.
-        lost: queries refused for being too many, samples and tokens that were dropped, since the declaration.
-    """
-
-    waiting: int = 0
-    lost: int = 0
 
 
 class Declaration:

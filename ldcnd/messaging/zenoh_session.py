@@ -23,23 +23,29 @@ from ldcnd.errors import SessionError, ValueOutOfRange
 from ldcnd.log import LogLimit, get_lazy_logger
 from ldcnd.messaging import zenoh_failures
 from ldcnd.messaging.codec import Encoding, encode, error_reply
-from ldcnd.messaging.hand_over import Collector, HandOver, Intake, QueryIntake, TokenChanges
+from ldcnd.messaging.hand_over import (
+    Answer,
+    Collector,
+    HandOver,
+    Intake,
+    Load,
+    OnQuery,
+    OnRead,
+    OnToken,
+    Query,
+    QueryIntake,
+    TokenChanges,
+)
 from ldcnd.messaging.login_probe import refusals
 from ldcnd.messaging.reads import ReadIntake, Reads
 from ldcnd.messaging.session import (
     NO_PARAMETERS,
     QUERY_TIMEOUT_S,
     UNDELIVERED_SAMPLES,
-    Answer,
     Declaration,
-    Load,
-    OnQuery,
-    OnRead,
     OnSample,
-    OnToken,
     PublishValue,
     Qos,
-    Query,
     Session,
 )
 from ldcnd.messaging.workers import Workers

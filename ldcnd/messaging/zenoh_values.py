@@ -5,7 +5,8 @@ from typing import TypedDict
 
 import zenoh
 
-from ldcnd.messaging.session import Answer, Qos, Sample, SampleKind
+from ldcnd.messaging.hand_over import Answer
+from ldcnd.messaging.session import Qos, Sample, SampleKind
 from ldcnd.messaging.zenoh_failures import no_answer
 
 

@@ -3,7 +3,7 @@
 import argparse
 import asyncio
 
-from ldcnd.messaging.session import Query
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
 
 KEY = "bare/answer"

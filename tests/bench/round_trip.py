@@ -18,7 +18,7 @@ import structlog
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.messaging.session import Query
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.wirelog.recorder import WireEvent, WireRecord

@@ -43,7 +43,7 @@ class SettleFigures:
 async def settle_figures(rig: RunningRig, axis: str, distance: float) -> SettleFigures:
     """Move an axis and return how it has settled."""
     service: AxisService = rig.daemon.rig.axis(axis)
-    scale = service.scale.counts_per_unit
+    scale = abs(service.config.signed_counts_per_unit)
     await rig.until(axis, lambda state: state.link == "up")
     await rig.client.command(axis, Power(on=True))
     at_end: list[float] = []

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from ldcnd.daemon.command.dispatch import move_together
+from ldcnd.daemon.command.rig_commands import move_together
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.registers import FRACTION
 from ldcnd.errors import (

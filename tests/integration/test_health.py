@@ -12,8 +12,9 @@ from ldcnd.config.rig import load_config
 from ldcnd.daemon.publish.health import _Rate
 from ldcnd.families.smartstep.family import LEDGER_FILE
 from ldcnd.messaging.codec import decode_received
+from ldcnd.messaging.hand_over import PENDING_QUERIES
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import PENDING_QUERIES, SampleKind
+from ldcnd.messaging.session import SampleKind
 from ldcnd.model.health import BusHealth, DaemonHealth
 from ldcnd.model.samples import LinkState
 from ldcnd.sim.jumping_loop import JumpingLoop

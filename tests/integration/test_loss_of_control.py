@@ -8,7 +8,7 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.command.loss import LeaseWatch
+from ldcnd.daemon.command.leases import LeaseWatch
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, StopLatched

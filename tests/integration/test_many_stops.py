@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.session import PENDING_QUERIES, Query
+from ldcnd.messaging.hand_over import PENDING_QUERIES, Query
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from tests.support.rig import running_rig

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.command.requests import EarlyStops
+from ldcnd.daemon.command.dispatch import EarlyStops
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.publish.meta import WORK_PER_STEP
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.session import READS_OF_A_CLIENT, Query
+from ldcnd.messaging.reads import READS_OF_A_CLIENT
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 

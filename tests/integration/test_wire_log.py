@@ -7,7 +7,7 @@ import pytest
 from ldcnd.client.wire_log import fetch_wire_log
 from ldcnd.config.bus import RecorderConfig
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.capture.flight_recorder import LONGEST_DATA_BYTES
+from ldcnd.daemon.command.rig_commands import LONGEST_DATA_BYTES
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.rig_commands import ReadWireLog
 from ldcnd.wirelog.recorder import WireEvent, parse_records

@@ -18,8 +18,9 @@ from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import ErrorCode, ValueOutOfRange
 from ldcnd.messaging.codec import decode
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Query, Session
+from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_config import endpoints, zenoh_config
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import LEASE_MS, ZenohSettings

@@ -12,7 +12,8 @@ import pytest
 import zenoh
 
 from ldcnd.errors import ConfigError, SessionError
-from ldcnd.messaging.session import PENDING_QUERIES, Qos, Query, Session
+from ldcnd.messaging.hand_over import PENDING_QUERIES, Query
+from ldcnd.messaging.session import Qos, Session
 from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts

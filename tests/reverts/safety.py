@@ -11,7 +11,7 @@ START = "tests/integration/test_start_policies.py::"
 REVERTS = (
     # -- lost control
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         """            self._lost(other, other.axes, f"taken by force by {lease.client}", ErrorCode.LEASE_EXPIRED)
 """,
         "",
@@ -21,13 +21,13 @@ REVERTS = (
         ),
     ),
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         """self._lost(other, other.axes - lease.axes, "its client took a lease that covers less", None)""",
         "pass",
         (LOSS + "test_who_exchanges_a_lease_for_one_that_covers_less_stops_the_rest",),
     ),
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         """self._lost(lease, moving, "released while it moved", None)""",
         "pass",
         (
@@ -36,13 +36,13 @@ REVERTS = (
         ),
     ),
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         "        if not leave_running:\n",
         "        if True:\n",
         (LOSS + "test_a_release_in_mid_motion_stops_unless_it_is_to_leave_it_running[True]",),
     ),
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         """self._lost(lease, lease.axes, "its lease was not renewed", ErrorCode.LEASE_EXPIRED)""",
         "pass",
         (
@@ -52,14 +52,15 @@ REVERTS = (
         ),
     ),
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         "if error.axis is not None and self._refusals.admit() is not None:",
         "if error.axis is not None:",
         (LOSS + "test_refused_acquires_do_not_flood_the_events",),
     ),
     revert(
-        "ldcnd/daemon/command/dispatch.py",
-        "                self._admit_rehearsal(command)\n",
+        "ldcnd/daemon/command/rig_commands.py",
+        "                for name in concerned(self._rig, command):\n"
+        "                    self._admit(name, command.lease)\n",
         "",
         (LOSS + "test_a_loss_is_rehearsed_under_a_lease_that_covers_what_it_concerns",),
     ),
@@ -93,7 +94,7 @@ REVERTS = (
         (PENDING + "test_stops_during_bring_up_are_answered_at_once_and_do_not_restart_it",),
     ),
     revert(
-        "ldcnd/daemon/command/loss.py",
+        "ldcnd/daemon/command/leases.py",
         """    if tracker.stop_latched and policy is LossPolicy.RUN_TO_TARGET:
         policy = LossPolicy.HALT
 """,

@@ -6,8 +6,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from ldcnd.messaging.codec import Encoding, decode
+from ldcnd.messaging.hand_over import Answer, Query
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Answer, Qos, Query, Sample, Session
+from ldcnd.messaging.session import Qos, Sample, Session
 from ldcnd.model.commands import ErrorReply
 
 KEYS = Keys("bench1")

@@ -144,6 +144,6 @@ class Witness:
                 self.wrong.append(f"{name} is {tracker.link}")
             if tracker.referenced and name in places and not moved:
                 said = axis.telemetry.position(self.drive(name).loop.position)
-                true = axis.scale.to_units(counts - places[name])
+                true = (counts - places[name]) / axis.config.signed_counts_per_unit
                 if abs(said - true) > TRUE_WITHIN_UNITS:
                     self.wrong.append(f"{name} is said to be at {said:g} and is at {true:g}")

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.daemon.command.authority import Authority
+from ldcnd.daemon.command.leases import Authority
 from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, StaleSequence, UnknownAxis
 
 

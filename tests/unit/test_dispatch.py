@@ -10,10 +10,9 @@ import pytest
 
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.authority import Authority
-from ldcnd.daemon.command.dispatch import Dispatcher
+from ldcnd.daemon.command.dispatch import PENDING_REQUESTS, Dispatcher, Requests
+from ldcnd.daemon.command.leases import Authority
 from ldcnd.daemon.command.ledger import EventLog, Ledger
-from ldcnd.daemon.command.requests import PENDING_REQUESTS, Requests
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.drivers.driver import StopMode
 from ldcnd.errors import (
@@ -31,7 +30,7 @@ from ldcnd.errors import (
     StaleSequence,
     UnknownAxis,
 )
-from ldcnd.messaging.session import Query
+from ldcnd.messaging.hand_over import Query
 from ldcnd.model.catalogue import RENAMED
 from ldcnd.model.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
 from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome

@@ -15,7 +15,6 @@ from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import AxisState, FaultEntry, LinkState
 
 
-
 def ready(*faults: str, **changes: object) -> AxisTracker:
     """Return an axis that stands and is powered, but for what is changed."""
     tracker = AxisTracker("x", "mm")

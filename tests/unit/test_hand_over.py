@@ -5,8 +5,7 @@ import threading
 
 import pytest
 
-from ldcnd.messaging.hand_over import HandOver, TokenChanges
-from ldcnd.messaging.session import Load
+from ldcnd.messaging.hand_over import HandOver, Load, TokenChanges
 from ldcnd.messaging.workers import Workers
 
 pytestmark = pytest.mark.real_time

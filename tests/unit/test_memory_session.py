@@ -6,8 +6,9 @@ from collections.abc import AsyncIterator
 import pytest
 
 from ldcnd.errors import OutcomeUnknown
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.session import Qos, Query, Sample
+from ldcnd.messaging.session import Qos, Sample
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts
 from tests.support.session_pair import JSON, KEYS, Pair, echo

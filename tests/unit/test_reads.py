@@ -7,9 +7,17 @@ from collections.abc import Iterator
 import pytest
 
 from ldcnd.errors import ErrorCode
+from ldcnd.messaging.hand_over import Answer, Query
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.reads import BLOCKED_S, LEAVING_AT_ONCE, ReadIntake, Reads
-from ldcnd.messaging.session import READS_OF_A_CLIENT, READS_OF_UNNAMED, READS_UNANSWERED, Answer, Query
+from ldcnd.messaging.reads import (
+    BLOCKED_S,
+    LEAVING_AT_ONCE,
+    READS_OF_A_CLIENT,
+    READS_OF_UNNAMED,
+    READS_UNANSWERED,
+    ReadIntake,
+    Reads,
+)
 from tests.support.session_pair import JSON, KEYS, echo, error_of
 
 STEPS = 10

@@ -8,8 +8,9 @@ import pytest
 
 from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
-from ldcnd.messaging.session import Declaration, Qos, Query
+from ldcnd.messaging.session import Declaration, Qos
 from ldcnd.model.commands import Power
 from ldcnd.model.samples import PositionSample
 from tests.support.session_pair import JSON, KEYS, POSITION

@@ -7,10 +7,10 @@ from unittest.mock import Mock
 
 import pytest
 
-from ldcnd.daemon.command.requests import STOPS_AT_ONCE, Requests
+from ldcnd.daemon.command.dispatch import STOPS_AT_ONCE, Requests
 from ldcnd.errors import InternalError
+from ldcnd.messaging.hand_over import Answer, Query
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Answer, Query
 from ldcnd.model.commands import Stop
 from tests.support.session_pair import error_of
 

@@ -16,10 +16,10 @@ from ldcnd.bus.bus import Bus
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
+from ldcnd.daemon.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.daemon.axis.parameters import Parameters
-from ldcnd.daemon.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedures.jog import Hold
 from ldcnd.daemon.axis.reference import ReferenceKeeper
@@ -86,7 +86,7 @@ class WaitingCommand:
             return
         try:
             reply = await obey(self.permit, self.request)
-        except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
+        except Exception as error:  # noqa: BLE001 - the caller gets it whole; dispatch.py translates
             self.refuse(error)
             return
         if not self.future.done():
@@ -223,9 +223,7 @@ class AxisService:
             config, driver, self.tracker, self.telemetry, clock, kept, references=keeps_reference
         )
         self._recalled: float | None = None
-        self._motion = AxisMotion(
-            config, moves, self.tracker, self.telemetry, clock, self._read, self.reference
-        )
+        self._motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, self._read, self.reference)
         self._commands = AxisCommands(self._motion)
         self._plausibility = PlausibilityGate(config)
         self._queue = CommandQueue(config.name)

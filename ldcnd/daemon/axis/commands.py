@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
 from ldcnd.daemon.axis.guards import Permit, cannot
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
 from ldcnd.daemon.axis.procedure import NEVER_S, Procedure
 from ldcnd.daemon.axis.procedures.analog import AnalogMove
 from ldcnd.daemon.axis.procedures.approach import ApproachMove
@@ -114,7 +114,7 @@ class AxisCommands:
             case Reset():
                 return await self._reset(permit)
             case _:
-                raise NotSupported(f"axis {self._config.name} cannot {turn.verb}", axis=self._config.name)
+                raise NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
 
     def _procedure_for(self, permit: Permit, request: AxisCommand[CommandReply]) -> Procedure | None:
         """Return what carries out a request that takes more than one step."""
@@ -421,14 +421,7 @@ class AxisCommands:
         await self._motion.start(permit, state, completion, plan=plan)
         self._motion.target_counts = plan.motion.target_counts
         self._motion.approached = state is AxisState.DISCRETE_MOTION
-        return self._motion.reply(permit).model_copy(
-            update={
-                "position": self._motion.shown(plan.position),
-                "velocity": plan.velocity,
-                "acceleration": plan.acceleration,
-                "duration_s": plan.duration_s,
-            }
-        )
+        return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
         """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
@@ -482,7 +475,7 @@ class AxisCommands:
         motion.telemetry.origin_counts = here.position_counts - position * motion.counts_per_unit
         self._tracker.referenced = True
         motion.publish_state()
-        return motion.reply(permit).model_copy(update={"position": position})
+        return motion.reply(permit, position=position)
 
     async def _set_gains(self, permit: Permit, request: SetGains) -> CommandReply:
         tracker = self._tracker

@@ -403,9 +403,19 @@ class AxisMotion:
         self.reference.woken.set()
         self.telemetry.state(self.clock.now_ns())
 
-    def reply(self, permit: Permit) -> CommandReply:
-        """Return the bare reply to a command."""
-        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=permit.verb)
+    def reply(self, permit: Permit, plan: MotionPlan | None = None, **values: float | None) -> CommandReply:
+        """Return the reply to a command: what is planned, and what it says besides or instead, by field."""
+        planned: dict[str, float | None] = {}
+        if plan:
+            planned = {
+                "position": self.shown(plan.position),
+                "velocity": plan.velocity,
+                "acceleration": plan.acceleration,
+                "duration_s": plan.duration_s,
+            }
+        return CommandReply(
+            command_id=permit.command_id, axis=self.config.name, verb=permit.verb, **{**planned, **values}
+        )
 
 
 def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:

@@ -180,7 +180,7 @@ Ended = Callable[[ActiveCommand, CommandStatus, str | None, bool | None], None]
 means nothing."""
 
 
-def _nobody(_command: ActiveCommand, _status: CommandStatus, _reason: str | None, _settled: bool | None) -> None:  # noqa: FBT001
+def _ignore_end(_command: ActiveCommand, _status: CommandStatus, _reason: str | None, _settled: bool | None) -> None:  # noqa: FBT001
     pass
 
 
@@ -252,7 +252,7 @@ class AxisTracker:
         settle: judges the end of the motion under way; None where the end of its profile is its end.
     """
 
-    def __init__(self, name: str, unit: str, ended: Ended = _nobody) -> None:
+    def __init__(self, name: str, unit: str, ended: Ended = _ignore_end) -> None:
         """Begin in ignorance.
 
         Args:

@@ -1,4 +1,4 @@
-"""Captures of a line and their causes: the flight recorder's journal and pages, and captures on disk.
+"""Captures of a line on disk, and their causes.
 
 Serves operators who search for a fault. Start with `captures.py`.
 """

@@ -1,36 +1,40 @@
-"""Where commands are admitted and routed: who may, whether again, what became of it; then the axis, then the ledger."""
+"""Commands and stops: from a query to its answer, the only place where an exception becomes an error reply.
+
+A command is decoded, admitted (who may, whether again, whether in time), written into the flight recorder of its line,
+carried out by its axis, and entered into the ledger. What is not for one axis alone is in rig_commands.py.
+"""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from functools import partial
+import hashlib
+import json
+from collections.abc import Awaitable, Callable
 
-from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.guards import UNCONDITIONAL, Permit, Right
-from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
-from ldcnd.daemon.axis.procedures.path import PathShareRequest, SharedPath
-from ldcnd.daemon.capture.flight_recorder import Journal, wire_page
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.authority import Authority, Lease
+from ldcnd.daemon.command.leases import Authority, LeaseWatch
 from ldcnd.daemon.command.ledger import Entry, EventLog, Ledger
-from ldcnd.daemon.command.loss import LeaseWatch, concerned, rehearse
-from ldcnd.daemon.command.why import explain
-from ldcnd.daemon.line.line import BusService
-from ldcnd.daemon.line.modules import ModuleService
+from ldcnd.daemon.command.rig_commands import RigCommands
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import (
     CommandExpired,
     DuplicateDaemon,
     InternalError,
     LdcndError,
-    MalformedRequest,
-    NotSupported,
     OutcomeUnknown,
     RequestRefused,
+    ShuttingDown,
+    TooManyRequests,
+    UnknownVerb,
 )
-from ldcnd.log import get_logger
-from ldcnd.messaging.keys import RIG_ITSELF
+from ldcnd.log import LogLimit, get_logger
+from ldcnd.messaging.codec import decode, encode, reply_encoding, to_json
+from ldcnd.messaging.hand_over import OnQuery, Query
+from ldcnd.messaging.keys import RIG_ITSELF, CommandAddress, Keys
+from ldcnd.messaging.session import Declaration, Session
+from ldcnd.model.catalogue import BY_VERB, RENAMED
 from ldcnd.model.commands import (
+    About,
     AxisCommand,
     BufferMode,
     Command,
@@ -39,35 +43,231 @@ from ldcnd.model.commands import (
     Ends,
     Jog,
     Move,
-    MoveAbsolute,
-    Preview,
     Stop,
-    Why,
-    WhyReply,
+    StopReply,
 )
-from ldcnd.model.events import CommandOutcome, CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.model.events import CommandStatus
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.leases import Acquire, Holder, HolderList, LeaseReply, ListHolders, Release, Renew
-from ldcnd.model.rig_commands import (
-    AxisShare,
-    GroupMoves,
-    LinePath,
-    MoveTogether,
-    MoveTogetherReply,
-    PathReply,
-    PreviewTogether,
-    PreviewTogetherReply,
-    ReadWireLog,
-    Rehearse,
-    SetIo,
-    SetIoTimer,
-    SetSpeedOverride,
-    Snapshot,
-    SpeedOverrideReply,
-    WalkPath,
-)
+from ldcnd.model.leases import Acquire
+from ldcnd.wirelog.recorder import WireEvent
 
-log = get_logger("commands")
+log = get_logger("requests")
+
+STOP = "@stop"
+STOPS_AT_ONCE = 8
+"""Maximum number of concurrent stops of the same axes; further ones join."""
+PENDING_REQUESTS = 64
+"""Maximum number of concurrent commands; stops are not counted."""
+
+
+class Journal:
+    """Writes the requests of clients into the flight recorders of the lines concerned, between the packets.
+
+    A line of it is `axis/verb {payload}`, or `@stop/axis {}`, with the payload as JSON; requests that concern the whole
+    rig are written to all lines. A lease is named by a fingerprint: a reader of a wire log must not be able to command
+    with what it contains.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        logs = [(line.bus.wire_log, [axis.config.name for axis in line.axes]) for line in rig.buses]
+        self._logs = {name: [log] for log, names in logs for name in names}
+        self._logs[RIG_ITSELF] = [log for log, _ in logs]
+
+    def asked(self, axis: str, command: Command[Frozen], lease: str | None = None) -> None:
+        """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
+        token = lease or getattr(command, "lease", None)
+        if token is None:
+            payload = to_json(command, exclude_defaults=True)
+        else:
+            fields = command.model_dump(mode="json", exclude_defaults=True)
+            payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":")).encode()
+        self._note(axis, f"{axis}/{command.verb} ".encode() + payload)
+
+    def stopped(self, axis: str | None) -> None:
+        """Note a stop of an axis, or of the rig."""
+        what = f"{STOP}/{axis}" if axis else STOP
+        self._note(axis or RIG_ITSELF, f"{what} {{}}".encode())
+
+    def _note(self, axis: str, line: bytes) -> None:
+        now_s = asyncio.get_running_loop().time()
+        for log in self._logs[axis]:
+            log.add(now_s, WireEvent.COMMAND, line)
+
+
+def fingerprint(token: str) -> str:
+    """Return a name for a lease that does not give it away."""
+    return hashlib.sha256(token.encode()).hexdigest()[:16]
+
+
+class EarlyStops:
+    """Takes stops from the moment on at which clients can connect; they wait until there is a daemon to answer them."""
+
+    def __init__(self) -> None:
+        self._declarations: list[Declaration] = []
+        self._held: list[Query] = []
+        self._take: OnQuery = self._held.append
+
+    async def declare(self, session: Session, keys: Keys) -> None:
+        """Serve the stops of a rig."""
+        for stop in keys.all_stops:
+            self._declarations.append(await session.serve(stop, self._pass_on, complete=True, urgent=True))
+
+    def hand_over(self, take: OnQuery) -> list[Declaration]:
+        """Give the stops that wait, and all that come from now on, to a daemon; return what it has to close."""
+        self._take = take
+        held, self._held = self._held, []
+        for query in held:
+            take(query)
+        return self._declarations
+
+    def _pass_on(self, query: Query) -> None:
+        self._take(query)
+
+
+class Requests:
+    """Answers the command and stop queries of one rig, each exactly once."""
+
+    def __init__(self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, dispatcher: "Dispatcher") -> None:
+        self._rig = rig
+        self._dispatcher = dispatcher
+        self._keys = keys
+        self._group = group
+        self._journal = Journal(rig)
+        self._pending = 0
+        self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
+        self._closing = False
+        self._refusals_logged = LogLimit(now_s=asyncio.get_running_loop().time)
+
+    def close(self) -> None:
+        """Refuse further commands; stops are still taken."""
+        self._closing = True
+
+    def on_command(self, query: Query) -> None:
+        """Take a query on `@cmd/**`."""
+        self._dispatcher.leases.expire()  # before anything that waited while this process or its client was frozen
+        if self._pending >= PENDING_REQUESTS:
+            self._refuse(
+                query,
+                TooManyRequests(
+                    f"{PENDING_REQUESTS} commands are under way already; nothing was done",
+                    limit=PENDING_REQUESTS,
+                    remedy="wait for replies before sending more",
+                ),
+            )
+            return
+        self._pending += 1
+        task = self._group.create_task(self._answer(query, self._command), name=f"command {query.key}")
+        task.add_done_callback(self._done)
+
+    def on_stop(self, query: Query) -> None:
+        """Take a query on `@stop` or `@stop/<axis>`."""
+        self._group.create_task(self._answer(query, self._stop), name=f"stop {query.key}")
+
+    def _done(self, _task: "asyncio.Task[None]") -> None:
+        self._pending -= 1
+
+    async def _answer(self, query: Query, run: Callable[[Query], Awaitable[Frozen]]) -> None:
+        try:
+            reply = await run(query)
+        except LdcndError as error:
+            self._refuse(query, error)
+        except asyncio.CancelledError:
+            self._refuse(query, ShuttingDown("the daemon is stopping"))
+            raise
+        except Exception:
+            log.exception("bug while answering", key=query.key)
+            self._refuse(query, InternalError("an error inside ldcnd; its log has the details"))
+        else:
+            query.reply(*encode(reply, reply_encoding(query.encoding)))
+
+    async def _command(self, query: Query) -> Frozen:
+        address = self._keys.parse_command(query.key)
+        if self._closing:
+            raise ShuttingDown("the daemon is stopping", axis=address.axis)
+        if address.axis != RIG_ITSELF:
+            self._rig.axis(address.axis)  # an unknown axis is refused before an unknown verb
+        kind = _command_class(address)
+        command = decode(kind, query.payload, query.encoding)
+        return await self._dispatcher.answer(address.axis, command, query.login)
+
+    async def _stop(self, query: Query) -> Frozen:
+        """Stop even if the payload is nonsense: a stop is always accepted."""
+        name = self._keys.parse_stop(query.key)
+        names = tuple(self._rig.axes) if name is None else (self._rig.axis(name).config.name,)
+        try:
+            self._journal.stopped(name)
+        except Exception:
+            log.exception("stop not recorded", key=query.key)  # it is carried out all the same
+        return StopReply(axes=names, confirmed=await self._stop_once(names, query))
+
+    async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
+        """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.
+
+        Hundreds of clients may request a stop at once, and a few stops serve all. Only a stop whose latches still hold
+        is joined: since they were set nothing has begun to move, so there is nothing that it does not stop. What joins
+        leaves no event of its own.
+        """
+        under_way = self._stops.setdefault(names, [])
+        if len(under_way) >= STOPS_AT_ONCE and self._are_latched(names):
+            confirmed = await asyncio.shield(under_way[-1])
+            if self._are_latched(names):
+                return confirmed
+            # a reset that was under way has taken the latch from this stop
+        for axis in (self._rig.axis(name) for name in names):
+            if axis.stoppable:
+                axis.tracker.latch_stop()  # at once, for requests of this same loop iteration
+        own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
+        under_way.append(own)
+        try:
+            confirmed = await self._rig.stop(names)
+        except BaseException:
+            own.set_exception(InternalError("the stop that this one had joined was cut short"))
+            own.exception()  # perhaps no other stop has joined
+            raise
+        else:
+            own.set_result(confirmed)
+            self._enter_stop(query, names, confirmed)
+            return confirmed
+        finally:
+            under_way.remove(own)
+
+    def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
+        """Record the requester of a stop in the events, as far as that can be read; nothing has waited for this."""
+        try:
+            request = decode(Stop, query.payload, query.encoding)
+        except LdcndError:
+            request = Stop()
+        try:
+            self._dispatcher.stopped(names, confirmed, request, query.login)
+        except Exception:
+            log.exception("stop not entered into the events", key=query.key)
+
+    def _are_latched(self, names: tuple[str, ...]) -> bool:
+        axes = (self._rig.axis(name) for name in names)
+        return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
+
+    def _refuse(self, query: Query, error: LdcndError) -> None:
+        if (fields := self._refusals_logged.admit()) is not None:
+            log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
+        query.refuse(error)
+
+
+def _command_class(address: CommandAddress) -> type[Command[Frozen]]:
+    """Return what a key stands for.
+
+    Raises:
+        UnknownVerb: there is no such command.
+    """
+    axis = None if address.axis == RIG_ITSELF else address.axis
+    known = BY_VERB[About.RIG if axis is None else About.AXIS]
+    if command := known.get(address.verb):
+        return command
+    if now := RENAMED.get(address.verb):
+        raise UnknownVerb(
+            f"the command {address.verb!r} is called {now!r} now", axis=axis, value=address.verb, remedy=f"send {now}"
+        )
+    whose = "the rig has" if axis is None else "there is"
+    raise UnknownVerb(f"{whose} no command {address.verb!r}, only {', '.join(known)}", axis=axis, value=address.verb)
 
 
 class Dispatcher:
@@ -99,6 +299,9 @@ class Dispatcher:
         self._ledger = ledger
         self._clock = clock
         self._under_way: dict[str, asyncio.Event] = {}
+        self._rig_commands = RigCommands(
+            rig, authority, self.leases, ledger, events, clock, self.carry_out, self._admit_lease
+        )
 
     async def answer(self, axis: str, command: Command[Frozen], login: str | None = None) -> Frozen:
         """Carry out a command that has just arrived, and return its reply.
@@ -118,31 +321,12 @@ class Dispatcher:
         match command:
             case AxisCommand():
                 return await self.carry_out(axis, command, login)
-            case Why():
-                return self.why(self._rig.axis(axis), command)
-            case Preview():
-                why = self.why(self._rig.axis(axis), Why(absolute=command.position is not None))
-                return self._rig.axis(axis).preview(command, tuple(cause.text for cause in why.causes))
-            case MoveTogether() | WalkPath():
-                return await self._move_together(command, login)
-            case SetSpeedOverride():
-                return await self._set_speed_override(command)
-            case PreviewTogether():
-                return preview_together(self._rig, command)
-            case Snapshot():
-                return await self._rig.line(command.bus).snapshot(self._clock)
-            case SetIo():
-                module = self._rig.module(command.module)
-                return await module.set_io(command, lambda: self._admit_module(module, command))
-            case SetIoTimer():
-                module = self._rig.module(command.module)
-                self._admit_module(module, command)
-                return await module.set_timer(command)
-            case Rehearse():
-                self._admit_rehearsal(command)
-                return await rehearse(self._rig, command)
+            case Acquire():
+                lease = self.leases.acquire(command)
+                self._journal.asked(RIG_ITSELF, command, lease.token)
+                return lease.reply()
             case _:
-                return self._of_rig(command)
+                return await self._rig_commands.answer(axis, command, login)
 
     async def carry_out(
         self, axis_name: str, command: AxisCommand[CommandReply], login: str | None = None
@@ -185,9 +369,7 @@ class Dispatcher:
             if hold and not hold.begun:
                 hold.over = True
 
-    async def _execute(
-        self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit
-    ) -> CommandReply:
+    async def _execute(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         def start() -> Awaitable[CommandReply]:
             return self._start(axis, command, permit)
 
@@ -195,9 +377,7 @@ class Dispatcher:
             return await axis.in_turn(command, permit, start)
         return await start()
 
-    async def _start(
-        self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit
-    ) -> CommandReply:
+    async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)
         moving = axis.tracker.command is not None and axis.tracker.command.command_id == permit.command_id
         ends_later = command.ends is Ends.BY_READING and moving
@@ -226,33 +406,6 @@ class Dispatcher:
             command_id = self.events.next_command_id()
             self._ledger.open(Entry(command_id, name, command, command.client, login, status, reason))
 
-    def why(self, axis: AxisService, request: Why) -> WhyReply:
-        """Tell why a motion of this axis would be refused now, and what would clear that; no effect."""
-
-        def admit() -> None:
-            self._refuse_rival(axis.config.name)
-            self.authority.admit(axis.config.name, request.lease, None, self._clock.now_s())
-
-        return explain(axis.tracker, admit, absolute=request.absolute)
-
-    def _admit_rehearsal(self, command: Rehearse) -> None:
-        """Refuse a loss played on axes that its sender may not move."""
-        for axis in concerned(self._rig, command):
-            self._refuse_rival(axis)
-            self.authority.admit(axis, command.lease, None, self._clock.now_s())
-
-    def _admit_module(self, module: ModuleService, command: SetIo | SetIoTimer) -> None:
-        """Refuse outputs to who may not move the axes of the module's line, and while one of them is stopped.
-
-        What an output switches is not known: it may move something.
-        """
-        for name in module.axes:
-            self._refuse_rival(name)
-            holder = self.authority.holder(name)
-            own = holder.token if holder and holder.token in command.leases else command.lease
-            self.authority.admit(name, own, None, self._clock.now_s())
-            guards.check_not_latched(self._rig.axis(name).tracker)
-
     async def _answer_again(self, entry: Entry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""
         if under_way := self._under_way.get(entry.command_id):
@@ -280,6 +433,11 @@ class Dispatcher:
             )
         self._refuse_late(axis, command)
         return self.authority.admit(axis, command.lease, command.sequence, self._clock.now_s())
+
+    def _admit_lease(self, axis: str, lease: str | None) -> None:
+        """Refuse whatever could move an axis to another client than its holder."""
+        self._refuse_rival(axis)
+        self.authority.admit(axis, lease, None, self._clock.now_s())
 
     def _right(self, axis: str, command: AxisCommand[CommandReply]) -> Right:
         """Return what must still hold of the sender when a motion of its command begins."""
@@ -311,101 +469,6 @@ class Dispatcher:
                 remedy="end one of the two daemons",
             )
 
-    async def _set_speed_override(self, command: SetSpeedOverride) -> SpeedOverrideReply:
-        """Scale the velocities of all axes; to lower them needs no right, as a stop needs none."""
-        share = command.percent / 100.0
-        axes = [self._rig.axis(name) for name in self._rig.axes]
-        if any(share > axis.tracker.speed_share for axis in axes):
-            for name in self._rig.axes:
-                self._refuse_rival(name)
-                holder = self.authority.holder(name)
-                own = holder.token if holder and holder.token in command.leases else None
-                self.authority.admit(name, own, None, self._clock.now_s())
-        log.info("speed override", percent=command.percent, client=command.client)
-        changed, halted = [], []
-
-        async def change(axis: AxisService) -> None:
-            name = axis.config.name
-            try:
-                other_speed, at_rest = await axis.set_speed_share(share)
-            except LdcndError as error:
-                log.warning("motion goes on at its speed", axis=name, reason=error.message)
-                return
-            if other_speed:
-                changed.append(name)
-            if at_rest:
-                halted.append(name)
-
-        async with asyncio.TaskGroup() as group:
-            for axis in axes:
-                group.create_task(change(axis), name=f"speed override {axis.config.name}")
-        return SpeedOverrideReply(percent=command.percent, changed=tuple(sorted(changed)), halted=tuple(sorted(halted)))
-
-    async def _move_together(
-        self, command: MoveTogether | WalkPath, login: str | None
-    ) -> MoveTogetherReply | PathReply:
-        execute = partial(self.carry_out, login=login)
-        reply: MoveTogetherReply | PathReply
-        if isinstance(command, WalkPath):
-            reply = await walk_path(self._rig, command, execute)
-        else:
-            straight, deviation = command.path is LinePath.LINEAR, command.max_deviation
-            reply = await move_together(
-                self._rig, _shares(command), execute, straight=straight, max_deviation=deviation
-            )
-        share = self._ledger.get(reply.replies[0].command_id).command
-        if isinstance(share, (GroupMoveRequest, PathShareRequest)):  # the first time that these ids came
-            reply = share.rendezvous.reply(reply.replies)
-        return reply
-
-    # -- the rig as a whole; nothing here moves anything -----------------------------------------------------------
-
-    def _of_rig(self, command: Command[Frozen]) -> Frozen:
-        now_s = self._clock.now_s()
-        match command:
-            case Acquire():
-                return self._acquire(command)
-            case Renew():
-                return _reply(self.authority.renew(command.lease, now_s))
-            case Release():
-                return _reply(self.leases.release(command.lease, leave_running=command.leave_running))
-            case ListHolders():
-                return self._holders()
-            case ReadOutcome():
-                return self._outcome(command)
-            case ReadEvents():
-                return self.events.page(command)
-            case ReadWireLog():
-                return wire_page(self._rig, command, self._clock)
-            case _:
-                raise InternalError(f"nothing carries out {command.verb}")
-
-    def _acquire(self, request: Acquire) -> LeaseReply:
-        lease = self.leases.acquire(request)
-        self._journal.asked(RIG_ITSELF, request, lease.token)
-        return _reply(lease)
-
-    def _holders(self) -> HolderList:
-        holders = [(axis, self.authority.holder(axis)) for axis in self._rig.axes]
-        return HolderList(
-            required=self.authority.required,
-            holders=tuple(Holder(axis=axis, client=lease.client if lease else None) for axis, lease in holders),
-        )
-
-    def _outcome(self, request: ReadOutcome) -> CommandOutcome:
-        entry = self._ledger.get(request.command_id)
-        arrival = entry.arrival
-        return CommandOutcome(
-            command_id=entry.command_id,
-            axis=entry.axis,
-            verb=entry.verb.value,
-            status=entry.status,
-            reason=entry.reason,
-            position=arrival.position if arrival else None,
-            following_error=arrival.following_error if arrival else None,
-            settled=arrival.settled if arrival else None,
-        )
-
 
 def _status(error: LdcndError) -> CommandStatus:
     match error:
@@ -415,132 +478,3 @@ def _status(error: LdcndError) -> CommandStatus:
             return CommandStatus.REFUSED
         case _:
             return CommandStatus.FAILED
-
-
-def _reply(lease: Lease) -> LeaseReply:
-    return LeaseReply(lease=lease.token, client=lease.client, axes=tuple(sorted(lease.axes)), lease_s=lease.duration_s)
-
-
-Execute = Callable[[str, AxisCommand[CommandReply]], Awaitable[CommandReply]]
-"""Carries out a command of an axis, after all checks of the daemon."""
-
-
-async def move_together(
-    rig: Rig,
-    moves: Mapping[str, MoveAbsolute],
-    execute: Execute,
-    *,
-    straight: bool = False,
-    max_deviation: float | None = None,
-) -> MoveTogetherReply:
-    """Start absolute moves of several axes together; returns once every drive has proven that it started.
-
-    Args:
-        rig: the daemon's.
-        moves: by axis name; exactly the members of one configured group.
-        execute: how a single command is carried out.
-        straight: they keep to a straight line.
-        max_deviation: the line is refused if they would leave it by more, in axis units.
-
-    Raises:
-        UnknownAxis: there is no such axis.
-        NotSupported: the axes are on different lines, or are no group.
-        RequestRefused: a member cannot move, or they would leave the line; nothing was started.
-        BusError: the line failed; `OutcomeUnknown` when a drive may have started, then all were commanded to stop.
-    """
-    line = _line_of(rig, moves)
-    meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)
-
-    requests = {name: GroupMoveRequest.of(move, meeting) for name, move in moves.items()}
-    return meeting.reply(await _all_of(requests, meeting, execute))
-
-
-async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:
-    """Walk axes along a polyline; returns once every drive walks.
-
-    Raises:
-        MalformedRequest: an axis is named twice, or the axes have differently many corners.
-        UnknownAxis, NotSupported, RequestRefused, BusError: as `move_together`.
-    """
-    via = {move.axis: move.via for move in command.moves}
-    if len({len(corners) for corners in via.values()}) > 1 or len(via) < len(command.moves):
-        raise MalformedRequest("a path names each axis once, with equally many corners", remedy="see `via`")
-    line = _line_of(rig, via)
-    path = SharedPath(line.network, line.bus, frozenset(via), command.speed, command.max_deviation)
-    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis", "via"})) for move in command.moves}
-
-    requests = {name: PathShareRequest.of(move, via[name], path) for name, move in moves.items()}
-    return path.reply(await _all_of(requests, path, execute))
-
-
-async def _all_of(
-    requests: Mapping[str, AxisCommand[CommandReply]], rendezvous: Rendezvous, execute: Execute
-) -> tuple[CommandReply, ...]:
-    """Have each axis carry out its part; returns once all have started, and raises why none did."""
-
-    async def take_part(name: str, request: AxisCommand[CommandReply]) -> CommandReply | LdcndError:
-        try:
-            return await execute(name, request)
-        except LdcndError as error:
-            rendezvous.fail(error)
-            return error
-
-    async with asyncio.TaskGroup() as group:
-        tasks = [
-            group.create_task(take_part(name, request), name=f"{request.verb} {name}")
-            for name, request in requests.items()
-        ]
-    replies = []
-    for task in tasks:
-        result = task.result()
-        if isinstance(result, LdcndError):
-            raise rendezvous.failure or result
-        replies.append(result)
-    return tuple(replies)
-
-
-def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply:
-    """Plan moves of a group without sending anything.
-
-    Raises:
-        UnknownAxis, NotSupported, RequestRefused: as `move_together`, but for what is in the way only now.
-    """
-    moves = _shares(request)
-    _line_of(rig, moves)
-    axes = {name: rig.axis(name).planned(move) for name, move in moves.items()}
-    plans, deviation = {name: plan for name, (_, plan) in axes.items()}, None
-    if request.path is LinePath.LINEAR:
-        plans, deviation = plans_on_line(axes, request.max_deviation)
-    shares = tuple(
-        AxisShare(
-            axis=name,
-            position=axes[name][0].shown(plan.position) or 0.0,
-            velocity=plan.velocity,
-            acceleration=plan.acceleration,
-            duration_s=plan.duration_s or 0.0,
-        )
-        for name, plan in plans.items()
-    )
-    longest_s = max(share.duration_s for share in shares)
-    return PreviewTogetherReply(shares=shares, duration_s=longest_s, deviation=deviation)
-
-
-def _shares(command: GroupMoves) -> dict[str, MoveAbsolute]:
-    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in command.moves}
-    if len(moves) < len(command.moves):
-        raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
-    return moves
-
-
-def _line_of(rig: Rig, names: Iterable[str]) -> BusService:
-    """Return the line that all these axes are on.
-
-    Raises:
-        UnknownAxis, NotSupported: as `move_together`.
-    """
-    wanted = list(names)
-    lines = {bus for bus in rig.buses for name in wanted if rig.axis(name) in bus.axes}
-    if len(lines) != 1:
-        raise NotSupported(f"axes {', '.join(wanted)} are not on one line, so they cannot start together")
-    (line,) = lines
-    return line

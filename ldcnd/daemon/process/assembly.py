@@ -14,10 +14,9 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.authority import Authority, random_token
-from ldcnd.daemon.command.dispatch import Dispatcher
+from ldcnd.daemon.command.dispatch import Dispatcher, EarlyStops
+from ldcnd.daemon.command.leases import Authority, random_token
 from ldcnd.daemon.command.ledger import EventLog, Ledger
-from ldcnd.daemon.command.requests import EarlyStops
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.modules import ModuleService
 from ldcnd.daemon.line.rig import Rig

@@ -11,17 +11,17 @@ from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
 from ldcnd.daemon.capture.watch import CaptureWatch
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.dispatch import Dispatcher
-from ldcnd.daemon.command.loss import apply_policy
-from ldcnd.daemon.command.requests import EarlyStops, Requests
+from ldcnd.daemon.command.dispatch import Dispatcher, EarlyStops, Requests
+from ldcnd.daemon.command.leases import apply_policy
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.process.heartbeat import Heartbeat
 from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.daemon.publish.meta import Describing
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.log import get_logger
+from ldcnd.messaging.hand_over import Load
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Declaration, Load, Session
+from ldcnd.messaging.session import Declaration, Session
 from ldcnd.model.meta import DaemonInfo
 from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import LinkState

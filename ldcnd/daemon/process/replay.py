@@ -14,8 +14,8 @@ from pydantic import ValidationError
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.capture.captures import of_one_line
-from ldcnd.daemon.capture.flight_recorder import STOP
-from ldcnd.daemon.command.authority import random_token
+from ldcnd.daemon.command.dispatch import STOP
+from ldcnd.daemon.command.leases import random_token
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.errors import ConfigError, MalformedRequest, ReplayDeviation
 from ldcnd.messaging.codec import Encoding, as_json

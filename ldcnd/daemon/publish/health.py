@@ -10,8 +10,8 @@ from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.daemon.publish.publisher import Publisher, Topic
 from ldcnd.drivers.driver import parameters_of
+from ldcnd.messaging.hand_over import Load
 from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Load
 from ldcnd.model.health import (
     AxisHealth,
     BusHealth,

@@ -16,8 +16,8 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import Drive, registers_of
 from ldcnd.errors import ErrorCode, MalformedRequest
 from ldcnd.messaging.codec import Encoding, encode
+from ldcnd.messaging.hand_over import Query
 from ldcnd.messaging.keys import RIG_ITSELF, Keys, matches
-from ldcnd.messaging.session import Query
 from ldcnd.model.catalogue import COMMANDS
 from ldcnd.model.commands import About, Verb
 from ldcnd.model.frozen import Frozen, schema_name

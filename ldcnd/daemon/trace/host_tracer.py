@@ -196,9 +196,7 @@ def host_channels(
 
     channels = [
         HostChannel(named("position", unit, None), lambda reading: reading.position_counts, position),
-        HostChannel(
-            named("velocity", f"{unit}/s", factor), lambda reading: reading.velocity_counts_per_s, to_units
-        ),
+        HostChannel(named("velocity", f"{unit}/s", factor), lambda reading: reading.velocity_counts_per_s, to_units),
         HostChannel(
             named("following_error", unit, factor),
             lambda reading: reading.following_error_counts,

@@ -50,9 +50,7 @@ class AnalogMove(Procedure):
         self.deadline_s = motion.clock.now_s() + self._timeout_s
         self._failure = f"not there within {self._timeout_s:g} s"
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
-        return motion.reply(self.permit).model_copy(
-            update={"target": request.target, "velocity": plan.velocity, "acceleration": plan.acceleration}
-        )
+        return motion.reply(self.permit, target=request.target, velocity=plan.velocity, acceleration=plan.acceleration)
 
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: a bound is reached, or the axis lost its command while it was out of sight and may run."""

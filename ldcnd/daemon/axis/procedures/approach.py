@@ -21,7 +21,12 @@ class ApproachMove(Procedure):
     """Two motions under one command: to the point where the approach begins, and from there to the goal."""
 
     def __init__(
-        self, motion: AxisMotion, permit: Permit, request: MoveAbsolute | MoveRelative, first: MotionPlan, goal: MotionPlan
+        self,
+        motion: AxisMotion,
+        permit: Permit,
+        request: MoveAbsolute | MoveRelative,
+        first: MotionPlan,
+        goal: MotionPlan,
     ) -> None:
         self.permit = permit
         self._motion = motion
@@ -35,14 +40,7 @@ class ApproachMove(Procedure):
         whole = replace(goal, duration_s=both_s(self._first, goal))
         await self.permit.load(self._first.motion)
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=whole)
-        return motion.reply(self.permit).model_copy(
-            update={
-                "position": motion.shown(goal.position),
-                "velocity": goal.velocity,
-                "acceleration": goal.acceleration,
-                "duration_s": whole.duration_s,
-            }
-        )
+        return motion.reply(self.permit, whole)
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:

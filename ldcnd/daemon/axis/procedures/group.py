@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing_extensions import override
 
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.guards import Permit
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.daemon.axis.straight import straight_line
@@ -214,14 +214,7 @@ class GroupMember(Procedure):
             raise
         motion.tracker.started(motion.clock.now_s())
         motion.target_counts = self.plan.motion.target_counts
-        return motion.reply(self.permit).model_copy(
-            update={
-                "position": motion.shown(self.plan.position),
-                "velocity": self.plan.velocity,
-                "acceleration": self.plan.acceleration,
-                "duration_s": self.plan.duration_s,
-            }
-        )
+        return motion.reply(self.permit, self.plan)
 
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""

@@ -11,8 +11,8 @@ from typing_extensions import override
 
 from ldcnd.config.axis import AxisConfig, HomeConfig
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.guards import Permit, QuietDrive, homing
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.procedures.probe import check_index_is_seen
 from ldcnd.daemon.axis.state import Completion
@@ -153,8 +153,8 @@ class HomeSequence(Procedure):
         await motion.reference.forget()  # before the drive captures: the kept reference has another origin
         finds = search.find_velocity is not None and search.runs_onto_switch(motion.counts_per_unit)
         await self._set_out(Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
-        return motion.reply(self.permit).model_copy(
-            update={"position": search.position, "velocity": plan.velocity, "acceleration": plan.acceleration}
+        return motion.reply(
+            self.permit, position=search.position, velocity=plan.velocity, acceleration=plan.acceleration
         )
 
     @override
@@ -209,7 +209,9 @@ class HomeSequence(Procedure):
         motion.tracker.referenced = False
         opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
         self.deadline_s = motion.clock.now_s() + search.timeout_s
-        await motion.start(self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH)
+        await motion.start(
+            self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH
+        )
 
     def _end_of_leg(self, plan: MotionPlan) -> int:
         search, here = self._search, self._motion.latest().position_counts

@@ -200,9 +200,7 @@ class HeldJog(Procedure):
         extends = motion.driver.retargets and not at_limit
         self._extend_at_s = motion.clock.now_s() + EXTEND_HOLDS * self._hold.hold_s if extends else math.inf
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        return motion.reply(self.permit).model_copy(
-            update={"velocity": velocity, "acceleration": plan.acceleration, "duration_s": reach_s}
-        )
+        return motion.reply(self.permit, velocity=velocity, acceleration=plan.acceleration, duration_s=reach_s)
 
     def _plan(self, here: float, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
         """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""

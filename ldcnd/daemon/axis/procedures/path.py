@@ -12,8 +12,8 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.guards import Permit, walking
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.polyline import PathAxis, Walk, walk
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.procedures.group import Rendezvous
@@ -309,14 +309,7 @@ class PathMember(Procedure):
             raise
         motion.tracker.started(motion.clock.now_s())
         self._wait(path.share_of(self).sent)
-        return motion.reply(self.permit).model_copy(
-            update={
-                "position": motion.shown(self.plan.position),
-                "velocity": self.plan.velocity,
-                "acceleration": self.plan.acceleration,
-                "duration_s": path.plan.duration_s if path.plan else None,
-            }
-        )
+        return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
 
     def on_path(self) -> PathAxis:
         """Return the share of this axis."""
@@ -400,7 +393,9 @@ class PathMember(Procedure):
             motion.publish_state()
             return False
         at_end = MotionPlan(self.plan.motion, self.plan.position, self.plan.velocity, self.plan.acceleration, 0.0)
-        motion.begin(self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end)
+        motion.begin(
+            self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end
+        )
         motion.tracker.started(motion.clock.now_s())
         motion.target_counts = target
         log.debug("path walked", axis=name)

@@ -7,8 +7,8 @@ target, so it ends in the drive also when no input comes and this host is dead.
 import math
 
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.guards import Permit, homing
+from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AxisReading, HomeCapture, StopMode, Warns
@@ -59,14 +59,7 @@ class ProbeMove(Procedure):
         capture = HomeCapture(first, self._stop, also=frozenset(others), guarded=True)
         await self.permit.load(plan.motion, home=capture)
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=plan)
-        return motion.reply(self.permit).model_copy(
-            update={
-                "position": motion.shown(plan.position),
-                "velocity": plan.velocity,
-                "acceleration": plan.acceleration,
-                "duration_s": plan.duration_s,
-            }
-        )
+        return motion.reply(self.permit, plan)
 
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: something was latched, or the move has ended without."""

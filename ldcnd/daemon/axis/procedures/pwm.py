@@ -42,8 +42,8 @@ class PwmRun(Procedure):
         await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
         self.deadline_s = motion.clock.now_s() + request.duration_s
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
-        return motion.reply(self.permit).model_copy(
-            update={"duration_s": request.duration_s, "duty": round(request.duty * FULL_DUTY) / FULL_DUTY}
+        return motion.reply(
+            self.permit, duration_s=request.duration_s, duty=round(request.duty * FULL_DUTY) / FULL_DUTY
         )
 
     def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - what the drive says is no comfort

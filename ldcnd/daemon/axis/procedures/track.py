@@ -73,7 +73,7 @@ class SetPoint(Procedure):
             raise
         motion.target_counts = target
         tracker.started(motion.clock.now_s())
-        return motion.reply(self.permit).model_copy(update={"position": motion.shown(motion.telemetry.position(target))})
+        return motion.reply(self.permit, position=motion.shown(motion.telemetry.position(target)))
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:

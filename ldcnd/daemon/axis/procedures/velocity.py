@@ -67,7 +67,7 @@ class VelocityChange(Procedure):
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
         self.deadline_s = motion.clock.now_s() + min(motion.config.jog_horizon_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        return motion.reply(self.permit).model_copy(update={"velocity": plan.velocity, "acceleration": plan.acceleration})
+        return motion.reply(self.permit, velocity=plan.velocity, acceleration=plan.acceleration)
 
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: the end is near, the drive has stopped, or the command was lost while out of sight."""
