@@ -10,10 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PROFILES, Profile
 from ldcnd.drivers.ldcn.registers import gain_fields
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.trajectory import TrajectoryControl
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.monitors import WORDS

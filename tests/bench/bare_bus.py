@@ -13,8 +13,8 @@ from ldcnd.bus.poller import Poller
 from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
+from ldcnd.drivers.ldcn.packet import Status, StatusItem
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.status import Status, StatusItem
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.transport.port_url import port_opener

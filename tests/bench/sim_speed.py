@@ -26,8 +26,8 @@ from ldcnd.drivers.driver import AxisSpec, Gains, Motion, Moves
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
+from ldcnd.drivers.ldcn.packet import StatusItem
 from ldcnd.drivers.ldcn.profiles import LS_182AP
-from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.families.ldcn.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop

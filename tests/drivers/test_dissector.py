@@ -12,9 +12,8 @@ from click.testing import CliRunner
 from ldcnd.cli import bus
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.replay import config_of
-from ldcnd.drivers.ldcn.packet import Command, PacketReader
+from ldcnd.drivers.ldcn.packet import Command, PacketReader, Status, StatusItem, decode_status, status_bytes
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status, status_bytes
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, decode_command, decode_reply
 from ldcnd.families.dissector import FILE, PERSONAL_PLUGINS, dissector, install
 from ldcnd.wirelog.capture import Capture, parse_capture

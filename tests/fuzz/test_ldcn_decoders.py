@@ -8,10 +8,20 @@ from hypothesis import strategies as st
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.faults import Knowledge, diagnose
-from ldcnd.drivers.ldcn.packet import HEADER, Command, Packet, PacketReader, decode_packet
+from ldcnd.drivers.ldcn.packet import (
+    HEADER,
+    Command,
+    Packet,
+    PacketReader,
+    Status,
+    StatusItem,
+    check_status,
+    decode_packet,
+    decode_status,
+    status_bytes,
+)
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
 from ldcnd.drivers.ldcn.received import decode_command, interpret, interpret_bytes
-from ldcnd.drivers.ldcn.status import Status, StatusItem, check_status, decode_status, status_bytes
 from ldcnd.errors import BadReply
 from ldcnd.exchange import ReplyVerdict
 

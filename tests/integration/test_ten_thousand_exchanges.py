@@ -13,8 +13,8 @@ from ldcnd.drivers.driver import AxisSpec, Gains, Motion
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.network import LdcnNetwork
+from ldcnd.drivers.ldcn.packet import StatusItem
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.errors import BusError, OutcomeUnknown, ReplyTimeout
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

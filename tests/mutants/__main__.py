@@ -16,8 +16,8 @@ from tests.mutants.covering import ROOT, Covering, record
 SUBJECTS = (
     "ldcnd/daemon/command/*.py", "ldcnd/daemon/axis/*.py", "ldcnd/daemon/axis/procedures/*.py", "ldcnd/bus/*.py",
     *(f"ldcnd/drivers/ldcn/{name}.py" for name in (
-        "adoption", "commands", "controls", "faults", "groups", "network", "packet", "path", "received", "registers",
-        "servo", "status", "trajectory",
+        "adoption", "commands", "controls", "faults", "groups", "network", "packet", "path", "received", "record",
+        "registers", "servo", "trajectory",
     )),
     *(f"ldcnd/drivers/smartstep/{name}.py" for name in (
         "commands", "drive", "ledger", "modes", "monitors", "network", "packet", "parameter_store", "parameters",

@@ -12,7 +12,8 @@ import pytest
 
 from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.faults import WARNINGS, DriveState, FaultCode
+from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
+from ldcnd.drivers.ldcn.record import DriveState
 from ldcnd.exchange import Timing
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, Trip
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis

@@ -7,11 +7,23 @@ from hypothesis import strategies as st
 
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
+from ldcnd.drivers.ldcn.packet import (
+    AuxFlag,
+    Command,
+    Packet,
+    PacketReader,
+    ReceivedPacket,
+    Status,
+    StatusFlag,
+    StatusItem,
+    decode_packet,
+    decode_status,
+    encode_packet,
+    encode_status,
+)
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile, Support
 from ldcnd.drivers.ldcn.received import LoadTrajectory, SetGain, decode_command
 from ldcnd.drivers.ldcn.registers import Gains
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, decode_status, encode_status
 from ldcnd.drivers.ldcn.trajectory import (
     ProfileMode,
     Trajectory,

@@ -18,7 +18,7 @@ LDCN = "ldcnd/drivers/ldcn/"
 REVERTS = (
     # -- what a status byte means
     revert(
-        LDCN + "faults.py",
+        LDCN + "record.py",
         "            self.known = replace(self.known, latched=cause, seen=True)\n",
         "            self.known = replace(self.known, seen=True)\n",
         (
@@ -200,7 +200,7 @@ REVERTS = (
         ),
     ),
     revert(
-        LDCN + "status.py",
+        LDCN + "packet.py",
         "        velocity = profile.velocity_sign * int.from_bytes(",
         "        velocity = -int.from_bytes(",
         ("tests/integration/test_dialects.py::test_pic_servo_sc",),

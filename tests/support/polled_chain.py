@@ -13,9 +13,9 @@ from ldcnd.bus.poller import Poller
 from ldcnd.bus.settings import BusSettings, ServoCycle
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
+from ldcnd.drivers.ldcn.packet import Status, StatusItem
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
-from ldcnd.drivers.ldcn.status import Status, StatusItem
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

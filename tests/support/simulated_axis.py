@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import Command, Status, StatusFlag
 from ldcnd.drivers.ldcn.registers import Gains, encode_gains
-from ldcnd.drivers.ldcn.status import Status, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -1,8 +1,7 @@
 """A host on a simulated LDCN/NMC chain that needs no event loop: it passes the time itself."""
 
-from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.packet import Command, Packet, Status, StatusItem, decode_status, encode_packet
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
 from ldcnd.sim.chain import Chain
 
 PATIENCE_S = 0.03

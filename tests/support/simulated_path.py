@@ -2,10 +2,9 @@
 
 from dataclasses import replace
 
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Status
 from ldcnd.drivers.ldcn.path import PathPoint, encode_points
 from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.status import AuxFlag, Status
 from ldcnd.sim.ldcn.chain import model
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import SimulatedAxis

@@ -5,9 +5,9 @@ import pytest
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
+from ldcnd.drivers.ldcn.packet import StatusItem, item_bytes
 from ldcnd.drivers.ldcn.profiles import LS_173AP, LS_182AP
 from ldcnd.drivers.ldcn.received import SetGain, decode_command
-from ldcnd.drivers.ldcn.status import StatusItem, item_bytes
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, TrajectoryControl
 from ldcnd.errors import BadReply
 

@@ -3,8 +3,8 @@
 import pytest
 
 from ldcnd.drivers.ldcn.faults import WARNINGS, Fault, FaultCode, Knowledge, diagnose
+from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 
 LS_182AP = PROFILES["ls-182ap"]
 LS_173AP = PROFILES["ls-173ap"]

@@ -7,9 +7,8 @@ import pytest
 
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.profiles import PROFILES, Support
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.trajectory import TrajectoryControl
 
 ROOT = Path(__file__).parents[2]

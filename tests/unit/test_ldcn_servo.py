@@ -8,10 +8,9 @@ import pytest
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
 from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import Command, StatusItem
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.errors import DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
 from ldcnd.model.commands import HomeMethod, PinMode
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -6,11 +6,10 @@ import pytest
 
 from ldcnd.drivers.driver import AnalogMotion, HomeCapture, Motion, PwmOutput, StopMode
 from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, blocks_homing, with_modes
-from ldcnd.drivers.ldcn.faults import DriveState
+from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
 from ldcnd.drivers.ldcn.profiles import LS_173AP, LS_182AP, PIC_SERVO_SC, PIC_SERVO_V1, PIC_SERVO_V2, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.registers import RegisterBook
+from ldcnd.drivers.ldcn.record import DriveState, RegisterBook
 from ldcnd.drivers.ldcn.servo import home_methods, homing_control, opens_loop
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
 from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
 from ldcnd.model.commands import HomeMethod, PinMode

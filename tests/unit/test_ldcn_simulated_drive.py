@@ -3,8 +3,7 @@
 import pytest
 
 from ldcnd.drivers.ldcn.controls import LimitPins, StopControl
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing

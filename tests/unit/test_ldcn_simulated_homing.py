@@ -3,8 +3,8 @@
 import pytest
 
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
+from ldcnd.drivers.ldcn.packet import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.registers import Gains
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, SimulatedAxis

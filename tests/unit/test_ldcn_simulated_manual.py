@@ -6,9 +6,8 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Packet, StatusFlag, encode_packet
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, Gains
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.power import Condition, Trip

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.packet import Command, Packet, StatusFlag, StatusItem, encode_packet
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V1, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.status import StatusFlag, StatusItem
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings

@@ -6,11 +6,10 @@ import pytest
 
 from ldcnd.drivers.ldcn.commands import Node, add_path_points, start_path
 from ldcnd.drivers.ldcn.controls import IoOption, StopControl
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
 from ldcnd.drivers.ldcn.path import PathPoint, decode_point, encode_point
 from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import FRACTION, Gains, encode_gains
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

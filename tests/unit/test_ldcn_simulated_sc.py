@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drivers.ldcn.controls import IoOption, StartUp, StopControl
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
 from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, encode_gains
-from ldcnd.drivers.ldcn.status import AuxFlag, StatusFlag
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.families.ldcn.simulation import SimulatedChainConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model

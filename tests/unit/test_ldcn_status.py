@@ -2,8 +2,7 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.status import (
+from ldcnd.drivers.ldcn.packet import (
     AuxFlag,
     Status,
     StatusFlag,
@@ -14,6 +13,7 @@ from ldcnd.drivers.ldcn.status import (
     item_bytes,
     status_bytes,
 )
+from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.errors import BadReply
 from ldcnd.exchange import ReplyVerdict
 

@@ -11,7 +11,16 @@ import pytest
 from ldcnd.drivers.ldcn import commands, pic_io
 from ldcnd.drivers.ldcn.commands import Group, Node
 from ldcnd.drivers.ldcn.controls import IoOption, LimitPins, StartUp
-from ldcnd.drivers.ldcn.packet import Command, decode_packet, encode_packet
+from ldcnd.drivers.ldcn.packet import (
+    Command,
+    Status,
+    StatusFlag,
+    StatusItem,
+    decode_packet,
+    decode_status,
+    encode_packet,
+    encode_status,
+)
 from ldcnd.drivers.ldcn.path import PathPoint, decode_point
 from ldcnd.drivers.ldcn.profiles import PROFILES, DeviceKind
 from ldcnd.drivers.ldcn.received import (
@@ -32,7 +41,6 @@ from ldcnd.drivers.ldcn.received import (
     interpret_bytes,
 )
 from ldcnd.drivers.ldcn.registers import BAUD_DIVISORS, BaudCodes, Gains, baud_divisor, module_baud
-from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, decode_status, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, ValueOutOfRange
 

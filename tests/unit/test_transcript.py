@@ -1,6 +1,5 @@
-from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.packet import Command, Packet, Status, StatusFlag, StatusItem, encode_packet, encode_status
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_IO, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.transcript import LdcnTranscript
 from ldcnd.drivers.smartstep.packet import Command as SmartStepCommand
 from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus, SmartStepTranscript

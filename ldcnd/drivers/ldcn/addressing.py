@@ -15,9 +15,9 @@ from typing import TypeVar
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
+from ldcnd.drivers.ldcn.packet import Status, StatusItem, decode_status
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
 from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset
-from ldcnd.drivers.ldcn.status import Status, StatusItem, decode_status
 from ldcnd.drivers.line import GroupSpec
 from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.exchange import Exchange

@@ -25,8 +25,8 @@ from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import Addressing, Expected, Identity, LineRate, differences
 from ldcnd.drivers.ldcn.commands import Node
+from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.profiles import Profile, Support
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.errors import BusDown, BusError, LdcndError, NetworkMismatch
 from ldcnd.log import get_logger
 

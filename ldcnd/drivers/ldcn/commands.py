@@ -32,14 +32,19 @@ from ldcnd.drivers.ldcn.packet import (
     GROUP_MEMBER,
     MOST_ADDRESS,
     POSITION,
+    STATUS_BYTE_ONLY,
     Command,
     Packet,
+    Status,
+    StatusItem,
+    check_status,
     encode_packet,
+    status_bytes,
+    status_decoder,
 )
 from ldcnd.drivers.ldcn.path import PathPoint, encode_points
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, Gains, baud_divisor, encode_gains
-from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusItem, check_status, status_bytes, status_decoder
 from ldcnd.drivers.ldcn.trajectory import Trajectory, encode_trajectory
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.exchange import Exchange, ReplyVerdict

@@ -15,9 +15,9 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
 from ldcnd.drivers.ldcn.commands import Node, unanswered
 from ldcnd.drivers.ldcn.io_module import IoModule
+from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.pic_io import LINES, IoStatus
 from ldcnd.drivers.ldcn.servo import STOP_CONTROLS, LdcnAxis
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.drivers.network import CapturedIo, Instant
 from ldcnd.errors import (
     BusError,

@@ -33,10 +33,10 @@ from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adop
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.io_module import IoModule
+from ldcnd.drivers.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
 from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Support, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
 from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
 from ldcnd.drivers.network import BringUpReport, Instant, IoDriver, Network
 from ldcnd.errors import BusError, NetworkMismatch

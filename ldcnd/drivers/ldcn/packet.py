@@ -1,13 +1,19 @@
-"""LDCN/NMC command packets: header, address, command byte, data, checksum; and the fields that data consist of.
+"""LDCN/NMC packets: commands with their data to a module, status packets from it.
 
-Handles bytes only; the meaning of the data is in commands.py and received.py. Replies have no such frame: status.py.
-Sources: LS-182AP manual, "Serial Command Interface", "Command Description"; PIC-SERVO manual, 4.1, 5.2.
+A command packet is header, address, command byte, data, checksum; the meaning of the data is in commands.py and
+received.py. A status packet has no header, no address and no length: its layout follows from the profile and the item
+mask of the request, never from its length (two devices answer 19 bytes to mask FF with different layouts).
+Sources: LS-182AP manual, "Serial Command Interface", "Command Description", "Define Status", "Status byte and auxiliary
+status byte definitions"; PIC-SERVO manual, 4.1, 5.2, 5.3.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 
+from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.errors import BadReply, ValueOutOfRange
+from ldcnd.exchange import ReplyVerdict
 
 HEADER = 0xAA
 MOST_DATA_BYTES = 15
@@ -203,3 +209,198 @@ GROUP_MEMBER = 0x80
 """This bit of the group address, cleared in the data of Set Address, makes the module the leader of its group."""
 POSITION = Field("position", 4, -0x7FFF_FFFF, 0x7FFF_FFFF)
 """Both manuals leave out the most negative 32-bit value."""
+
+# -- status packets ----------------------------------------------------------------------------------------------------
+
+
+class StatusItem(IntFlag):
+    """Bits of the Define Status and Read Status mask; data follow in this order."""
+
+    POSITION = 0x01
+    ADC = 0x02
+    VELOCITY = 0x04
+    AUX = 0x08
+    HOME = 0x10
+    IDENTITY = 0x20
+    POSITION_ERROR = 0x40
+    BIT7 = 0x80
+
+
+STATUS_BYTE_ONLY = StatusItem(0)
+"""The status items that every module sends after power-up."""
+
+
+class StatusFlag(IntFlag):
+    """The status byte, by PIC-SERVO names; with `pic_ae_diagnostics` bits 3 to 6 mean more, see faults.py."""
+
+    MOVE_DONE = 0x01
+    CHECKSUM_ERROR = 0x02  # the node rejected *our* packet
+    OVERCURRENT = 0x04  # reserved on LS-182AP
+    POWER_ON = 0x08
+    POSITION_ERROR = 0x10
+    LIMIT1 = 0x20  # LS-182AP: reverse limit, or diagnostic bit
+    LIMIT2 = 0x40  # LS-182AP: forward limit, or diagnostic bit
+    HOME_IN_PROGRESS = 0x80
+
+
+class AuxFlag(IntFlag):
+    """The auxiliary status byte."""
+
+    INDEX = 0x01  # complement of the index input (its level with `live_aux`), or diagnostic bit
+    POSITION_WRAP = 0x02
+    SERVO_ON = 0x04
+    ACCEL_DONE = 0x08  # with `live_aux`: accelerating now
+    SLEW_DONE = 0x10  # with `live_aux`: at constant velocity, or standing
+    SERVO_OVERRUN = 0x20
+    PATH_MODE = 0x40  # a path runs
+    MOTION_LOCKED = 0x80  # LS-182AP from version 22 on
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """One decoded status packet; None where the mask did not request the item.
+
+    Attributes:
+        position: counts, signed 32 bit.
+        adc: counts, 0 to 255 or 0 to 1023 as the profile says.
+        velocity: counts per servo tick, **positive forward** (most devices send the opposite).
+        home: counts, signed 32 bit.
+        position_error: counts, commanded minus actual, signed 16 bit.
+        bit7: the byte of status item 7 (PIC-SERVO SC: path points left).
+    """
+
+    flags: StatusFlag
+    position: int | None = None
+    adc: int | None = None
+    velocity: int | None = None
+    aux: AuxFlag | None = None
+    home: int | None = None
+    device_id: int | None = None
+    version: int | None = None
+    position_error: int | None = None
+    bit7: int | None = None
+
+
+_STATUS_FLAGS = tuple(map(StatusFlag, range(256)))
+_AUX_FLAGS = tuple(map(AuxFlag, range(256)))
+"""By the byte: to make a flag costs as much as to decode all other items."""
+
+_POSITION, _ADC, _VELOCITY, _AUX, _HOME, _IDENTITY, _POSITION_ERROR, _BIT7 = map(int, StatusItem)
+"""As numbers: arithmetic with flags costs ten times as much, and every reply needs it."""
+
+
+def item_bytes(profile: Profile, items: StatusItem) -> int:
+    """Return how many data bytes a status packet of this device carries for these items, 0 to 17."""
+    mask = int(items)
+    return (
+        (4 if mask & _POSITION else 0)
+        + (profile.adc_bytes if mask & _ADC else 0)
+        + (2 if mask & _VELOCITY else 0)
+        + (1 if mask & _AUX else 0)
+        + (4 if mask & _HOME else 0)
+        + (2 if mask & _IDENTITY else 0)
+        + (profile.position_error_bytes if mask & _POSITION_ERROR else 0)
+        + (profile.bit7_bytes if mask & _BIT7 else 0)
+    )
+
+
+def status_bytes(profile: Profile, items: StatusItem) -> int:
+    """Return the length of a whole status packet: status byte, items, checksum; 2 to 19."""
+    return 2 + item_bytes(profile, items)
+
+
+def check_status(data: bytes) -> ReplyVerdict:
+    """Judge a complete status packet by its checksum and its checksum-error bit."""
+    if (sum(data) - data[-1]) & 0xFF != data[-1]:
+        return ReplyVerdict.CORRUPT
+    if data[0] & 0x02:  # StatusFlag.CHECKSUM_ERROR, as a number: this runs between two packets
+        return ReplyVerdict.REJECTED
+    return ReplyVerdict.INTACT
+
+
+def encode_status(profile: Profile, items: StatusItem, status: Status) -> bytes:
+    """Build the packet that a device with this profile sends; absent values count as zero.
+
+    Raises:
+        OverflowError: a value does not fit its field.
+    """
+    mask = int(items)
+    body = bytearray([status.flags])
+    if mask & _POSITION:
+        body += (status.position or 0).to_bytes(4, "little", signed=True)
+    if mask & _ADC:
+        body += (status.adc or 0).to_bytes(profile.adc_bytes, "little")
+    if mask & _VELOCITY:
+        body += (profile.velocity_sign * (status.velocity or 0)).to_bytes(2, "little", signed=True)
+    if mask & _AUX:
+        body.append(status.aux or 0)
+    if mask & _HOME:
+        body += (status.home or 0).to_bytes(4, "little", signed=True)
+    if mask & _IDENTITY:
+        body += bytes([status.device_id or 0, status.version or 0])
+    if mask & _POSITION_ERROR and profile.position_error_bytes:
+        body += (status.position_error or 0).to_bytes(2, "little", signed=True)
+    if mask & _BIT7 and profile.bit7_bytes:
+        body.append(status.bit7 or 0)
+    body.append(sum(body) & 0xFF)
+    return bytes(body)
+
+
+def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
+    """Decode a status packet of this device for these items; unknown flag bits are kept.
+
+    Raises:
+        BadReply: the length does not fit the mask, or the checksum is wrong.
+    """
+    return status_decoder(profile, items)(data)
+
+
+def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Status]:
+    """Return `decode_status` for many packets of one kind."""
+    mask, expected, sign = int(items), status_bytes(profile, items), profile.velocity_sign
+    layout, pick = _layout(profile, mask)
+    unpack = layout.unpack
+
+    def decode(data: bytes) -> Status:
+        if len(data) != expected:
+            raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
+        if (sum(data) - data[-1]) & 0xFF != data[-1]:
+            raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
+        fields = pick((None, *unpack(data)))
+        flags, position, adc, velocity, aux, home, device_id, version, position_error, bit7 = fields
+        return Status(
+            _STATUS_FLAGS[flags],
+            position,
+            adc,
+            None if velocity is None else sign * velocity,
+            None if aux is None else _AUX_FLAGS[aux],
+            home,
+            device_id,
+            version,
+            position_error,
+            bit7,
+        )
+
+    return decode
+
+
+def _layout(profile: Profile, mask: int) -> tuple[Struct, Callable[[tuple[Any, ...]], tuple[Any, ...]]]:
+    """Return how the bytes are read, and what picks the fields of a `Status` from None and what was read."""
+    formats = (
+        (_POSITION, "i"),
+        (_ADC, "B" if profile.adc_bytes == 1 else "H"),
+        (_VELOCITY, "h"),
+        (_AUX, "B"),
+        (_HOME, "i"),
+        (_IDENTITY, "B"),
+        (_IDENTITY, "B"),
+        (_POSITION_ERROR if profile.position_error_bytes else 0, "h"),
+        (_BIT7 if profile.bit7_bytes else 0, "B"),
+    )
+    order = [1]
+    layout = "<B"
+    for bit, code in formats:
+        present = bool(mask & bit)
+        order.append(len(layout) if present else 0)
+        layout += code if present else ""
+    return Struct(f"{layout}x"), itemgetter(*order)

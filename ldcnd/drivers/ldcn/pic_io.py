@@ -15,10 +15,9 @@ from functools import partial
 from typing_extensions import override
 
 from ldcnd.drivers.ldcn.commands import Destination
-from ldcnd.drivers.ldcn.packet import MOST_ADDRESS, Command, Packet, encode_packet
+from ldcnd.drivers.ldcn.packet import MOST_ADDRESS, Command, Packet, check_status, encode_packet
 from ldcnd.drivers.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.status import check_status
 from ldcnd.errors import BadReply, ValueOutOfRange
 from ldcnd.exchange import Exchange
 

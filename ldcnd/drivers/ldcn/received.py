@@ -16,12 +16,12 @@ from ldcnd.drivers.ldcn.packet import (
     Packet,
     PacketReader,
     ReceivedPacket,
+    StatusItem,
     decode_packet,
 )
 from ldcnd.drivers.ldcn.pic_io import DATA_BYTES, IoCommand, decode_io_command
 from ldcnd.drivers.ldcn.profiles import DeviceKind, Profile, Support
 from ldcnd.drivers.ldcn.registers import Gains, decode_gains
-from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.drivers.ldcn.trajectory import Trajectory, TrajectoryControl, decode_trajectory, trajectory_bytes
 from ldcnd.errors import BadReply
 

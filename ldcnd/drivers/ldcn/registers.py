@@ -1,21 +1,16 @@
-"""LDCN/NMC registers: codes of baud rates, the data of Set Gain, and the host's record of what it cannot read back.
+"""LDCN/NMC registers: codes of baud rates, and the data of Set Gain.
 
 Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Conditions", "Set Baud Rate" and the
 calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from types import MappingProxyType
 
-from ldcnd.drivers import driver
-from ldcnd.drivers.driver import Register
-from ldcnd.drivers.ldcn.controls import INPUTS
 from ldcnd.drivers.ldcn.packet import Field
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
-from ldcnd.model.meta import Provenance
 
 SERVO_CYCLE_S = CYCLE_CLOCKS / CLOCK_HZ
 """The servo period of a device with the usual clock at divisor 1: 0.512 ms."""
@@ -99,7 +94,7 @@ _SR = Field("SR", 1, 1, MOST_DIVISOR)
 _DEADBAND = Field("deadband compensation", 1, 0, 0xFF)
 _STEP_MULTIPLIER = Field("step multiplier", 1, 1, 0xFF)
 
-_BYTES_WITH_DEADBAND = 14
+BYTES_WITH_DEADBAND = 14
 _BYTES_WITH_STEP_MULTIPLIER = 15
 
 
@@ -140,7 +135,7 @@ def encode_gains(profile: Profile, gains: Gains) -> bytes:
         ValueOutOfRange: a value does not fit its register.
         NotSupported: the device lacks a register that is not at its default.
     """
-    if gains.deadband and profile.gain_bytes < _BYTES_WITH_DEADBAND:
+    if gains.deadband and profile.gain_bytes < BYTES_WITH_DEADBAND:
         raise NotSupported(f"{profile.title} has no deadband compensation")
     if gains.step_multiplier != 1 and profile.gain_bytes < _BYTES_WITH_STEP_MULTIPLIER:
         raise NotSupported(f"{profile.title} has no step multiplier")
@@ -176,75 +171,8 @@ def gain_fields(profile: Profile) -> tuple[Field, ...]:
         Field("EL", 2, 0, profile.most_error_limit),
         _SR,
     )
-    if profile.gain_bytes >= _BYTES_WITH_DEADBAND:
+    if profile.gain_bytes >= BYTES_WITH_DEADBAND:
         fields += (_DEADBAND,)
     if profile.gain_bytes >= _BYTES_WITH_STEP_MULTIPLIER:
         fields += (_STEP_MULTIPLIER,)
     return fields
-
-
-GAIN_NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
-TRAJECTORY_NAMES = ("position", "velocity", "acceleration", "pwm_or_target")
-LIMIT_PINS = "io_control"
-BYTES_WITH_DEADBAND = 14
-
-
-class RegisterBook:
-    """The registers of one drive, each with where its value comes from.
-
-    A register that is being written is unknown until the drive has acknowledged it.
-    """
-
-    def __init__(self, profile: Profile) -> None:
-        names = list(GAIN_NAMES)
-        if not profile.current_limit:
-            names.remove("cl")
-        if profile.gain_bytes < BYTES_WITH_DEADBAND:
-            names.remove("deadband")
-        names += TRAJECTORY_NAMES
-        if profile.limit_outputs:
-            names.append(LIMIT_PINS)
-        self._registers = {name: Register(name, None, Provenance.UNKNOWN) for name in names}
-
-    def all(self) -> tuple[Register, ...]:
-        """Return every register the drive has, in the order of the manual."""
-        return tuple(self._registers.values())
-
-    def value(self, name: str) -> int | None:
-        """Return what a register holds, or None when that is unknown or there is none of that name."""
-        register = self._registers.get(name)
-        return register.value if register else None
-
-    def written(self, name: str) -> bool:
-        """Tell whether this daemon wrote a register since the drive was reset or taken over."""
-        register = self._registers.get(name)
-        return register is not None and register.provenance is Provenance.WRITTEN_AND_ACKNOWLEDGED
-
-    def reset(self) -> None:
-        """The drive was reset: everything is 0 but the servo rate divisor and the pins, says the manual."""
-        self._set(dict.fromkeys(self._registers, 0) | {"sr": 1, LIMIT_PINS: INPUTS}, Provenance.ASSUMED)
-
-    def assume(self, values: Mapping[str, int]) -> None:
-        """The drive was taken over as it is: these values are assumed to be written, nothing else is known."""
-        self.invalidate(self._registers)
-        self._set(values, Provenance.ASSUMED)
-
-    def invalidate(self, names: Iterable[str]) -> None:
-        """Something is about to change these registers, or may have."""
-        for name in names:
-            if name in self._registers:
-                self._registers[name] = Register(name, None, Provenance.UNKNOWN)
-
-    def wrote(self, values: Mapping[str, int]) -> None:
-        """The drive has acknowledged these values."""
-        self._set(values, Provenance.WRITTEN_AND_ACKNOWLEDGED)
-
-    def _set(self, values: Mapping[str, int], provenance: Provenance) -> None:
-        for name, value in values.items():
-            if name in self._registers:
-                self._registers[name] = Register(name, int(value), provenance)
-
-
-def gain_values(gains: driver.Gains) -> dict[str, int]:
-    """Return what Set Gain writes."""
-    return asdict(gains)

@@ -1,7 +1,7 @@
 """One LDCN or NMC servo drive as a `Drive`: which packets a command takes.
 
-What its status packets mean is in faults.py, what its motions are to it in trajectory.py, what is known of its
-registers in registers.py. Versions 1 and 2 of PIC-SERVO do not stop on home by themselves: the host stops them.
+What is known of it is in record.py, what its motions are to it in trajectory.py. Versions 1 and 2 of PIC-SERVO do not
+stop on home by themselves: the host stops them.
 
 Positions are counts since the drive was reset, whatever its 32-bit counter says: where a motion would leave the range
 of the counter, Reset Position sets it back beforehand, at standstill, and the host adds what it has set back.
@@ -45,11 +45,12 @@ from ldcnd.drivers.driver import (
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
-from ldcnd.drivers.ldcn.faults import DriveState, FaultCode, sensor_lost
+from ldcnd.drivers.ldcn.faults import FaultCode, sensor_lost
+from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, LIMIT_PINS, Gains, RegisterBook, gain_values
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
+from ldcnd.drivers.ldcn.record import LIMIT_PINS, DriveState, RegisterBook, gain_values
+from ldcnd.drivers.ldcn.registers import FRACTION, Gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import (
     BadReply,

@@ -15,11 +15,12 @@ from ldcnd.drivers.driver import AnalogMotion, Motion, PwmOutput
 from ldcnd.drivers.ldcn.faults import SENSOR_BITS, SENSOR_LEAST, SENSOR_MOST
 from ldcnd.drivers.ldcn.packet import POSITION, Field
 from ldcnd.drivers.ldcn.profiles import CYCLE_CLOCKS, Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE, TRAJECTORY_NAMES
+from ldcnd.drivers.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE
 from ldcnd.errors import NotSupported, ValueOutOfRange
 
 ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
 MOST_PWM = 0xFF
+TRAJECTORY_NAMES = ("position", "velocity", "acceleration", "pwm_or_target")
 
 
 class ProfileMode(StrEnum):

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import fields
 
+from ldcnd.drivers.ldcn.packet import STATUS_BYTE_ONLY, Status, StatusFlag, StatusItem, decode_status
 from ldcnd.drivers.ldcn.pic_io import IoItem, IoStatus, decode_io_status
 from ldcnd.drivers.ldcn.profiles import LS_182AP, DeviceKind, Profile, identify
 from ldcnd.drivers.ldcn.received import DefineStatus, HardReset, PlainCommand, ReadStatus, interpret_bytes
-from ldcnd.drivers.ldcn.status import STATUS_BYTE_ONLY, Status, StatusFlag, StatusItem, decode_status
 from ldcnd.drivers.transcript import Parts
 from ldcnd.errors import BadReply
 from ldcnd.wirelog.recorder import WireEvent, WireRecord

@@ -24,10 +24,10 @@ from ldcnd.drivers.ldcn.addressing import (
     read_identity,
 )
 from ldcnd.drivers.ldcn.commands import Node, unanswered
+from ldcnd.drivers.ldcn.packet import Status, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.ldcn.status import Status, StatusFlag, StatusItem
 from ldcnd.errors import BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.families.family import TrialMove
 from ldcnd.families.ldcn.examination import Held

@@ -25,9 +25,9 @@ from ldcnd.drivers.ldcn.adoption import MOTION_ITEMS, STILL_COUNTS, WATCH_S, Fou
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.costs import price_list
 from ldcnd.drivers.ldcn.faults import Knowledge, diagnose
+from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
 from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Support
 from ldcnd.drivers.ldcn.registers import RESET_BAUD, BaudCodes
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag
 from ldcnd.errors import BusDown, BusError
 from ldcnd.families.family import ScannedDrive
 from ldcnd.families.ldcn.examination import LineAsConfigured, adapter_findings, lost_on_line, measured, polls_hz

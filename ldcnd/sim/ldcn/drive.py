@@ -25,7 +25,7 @@ from ldcnd.drivers.ldcn.controls import (
     StartUp,
     StopControl,
 )
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
 from ldcnd.drivers.ldcn.received import (
     AddPathPoints,
@@ -39,7 +39,6 @@ from ldcnd.drivers.ldcn.received import (
     StopMotor,
 )
 from ldcnd.drivers.ldcn.registers import FRACTION, Gains
-from ldcnd.drivers.ldcn.status import AuxFlag, Status, StatusFlag, StatusItem, encode_status
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage, ScPower

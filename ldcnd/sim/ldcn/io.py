@@ -12,6 +12,7 @@ Source: PIC-I/O data sheet, 2.2, 3.1.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ldcnd.drivers.ldcn.packet import StatusItem
 from ldcnd.drivers.ldcn.pic_io import (
     ALL_LINES,
     CHECKSUM_ERROR,
@@ -32,7 +33,6 @@ from ldcnd.drivers.ldcn.pic_io import (
 from ldcnd.drivers.ldcn.profiles import PIC_STEP, Profile
 from ldcnd.drivers.ldcn.received import ReceivedCommand
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 

@@ -15,7 +15,7 @@ Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface"
 import math
 from abc import abstractmethod
 
-from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader
+from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader, StatusItem
 from ldcnd.drivers.ldcn.profiles import Profile, at_clock
 from ldcnd.drivers.ldcn.received import (
     DefineStatus,
@@ -28,7 +28,6 @@ from ldcnd.drivers.ldcn.received import (
     received_command,
 )
 from ldcnd.drivers.ldcn.registers import RESET_BAUD_CODE, actual_baud, module_baud
-from ldcnd.drivers.ldcn.status import StatusItem
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings, UnknownBaud
 
