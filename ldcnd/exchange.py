@@ -5,39 +5,11 @@ state, can be prepared once and run any number of times.
 """
 
 from collections.abc import Callable
-from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeVar
 
 ReplyT = TypeVar("ReplyT")
-
-Condition = Callable[[], None]
-"""Raises what forbids a motion; returns when nothing does."""
-_condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
-
-
-class only_while:  # noqa: N801 - read as a statement
-    """Let what can move, when queued in this context, be sent only if the condition still holds when its turn comes.
-
-    A queue may be long: the condition is checked between it and the wire. Stops are not subject to any condition.
-    """
-
-    __slots__ = ("_own", "_token")
-
-    def __init__(self, condition: Condition) -> None:
-        self._own = condition
-
-    def __enter__(self) -> None:
-        self._token = _condition.set(self._own)
-
-    def __exit__(self, *_raised: object) -> None:
-        _condition.reset(self._token)
-
-
-def condition_in_force() -> Condition | None:
-    """Return the condition of the context in which this is called, if there is one."""
-    return _condition.get()
 
 
 class ReplyVerdict(Enum):
@@ -67,7 +39,7 @@ class Exchange(Generic[ReplyT]):
             exchange without a reply, the quiet time that the line needs after it.
         repeatable: may the bus send the request again after its reply was lost? Never true for what could move a
             drive twice.
-        moves: can make a motor move or change how it does; see `only_while`.
+        moves: can make a motor move or change how it does; see `only_while` of the bus.
         total_bytes: for replies whose length depends on their content: given the received bytes, the total length, or
             None when it is not known yet. When absent the length is `reply_bytes`.
     """

@@ -10,10 +10,10 @@ from ldcnd.bus.poller import Poller
 from ldcnd.bus.queue import POLL, ExchangeQueue, Lane, PhaseOrder
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.transaction import Job, StopProbe, Transaction
+from ldcnd.bus.transaction import Job, StopProbe, Transaction, condition_in_force
 from ldcnd.bus.wire import BusStatistics
 from ldcnd.errors import BadReply, BusDown, BusError, LdcndError, NotSupported, PacketRejected, TransportLost
-from ldcnd.exchange import Exchange, Timing, condition_in_force
+from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger
 from ldcnd.transport.adapter import LineErrors
 from ldcnd.transport.transport import Opener, Transport

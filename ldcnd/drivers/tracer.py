@@ -1,10 +1,10 @@
 """The contract between the daemon and whatever records a trace: a drive's own recorder, or the host that polls it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from ldcnd.errors import DriveFault, NotSupported, ValueOutOfRange
+from ldcnd.errors import DriveFault
 from ldcnd.model.traces import (
     DriveTraceInfo,
     TakeTrace,
@@ -23,47 +23,6 @@ Progress = Callable[[TracePhase, float | None], None]
 
 class TraceTimedOut(DriveFault):
     """The trigger did not come, or the samples did not, in the time allowed."""
-
-
-def require_channels(axis: str, request: TakeTrace, known: tuple[str, ...]) -> None:
-    """Check the channels of a request and of its trigger.
-
-    Raises:
-        ValueOutOfRange: there is no such channel, one is named twice, or the trigger watches one that is not recorded.
-    """
-    for name in request.channels:
-        if name not in known:
-            raise ValueOutOfRange(
-                f"axis {axis}: cannot trace {name!r}; there are {', '.join(known)}", axis=axis, value=name
-            )
-    if len(set(request.channels)) < len(request.channels):
-        raise ValueOutOfRange(f"axis {axis}: a channel is named twice: {', '.join(request.channels)}", axis=axis)
-    if request.trigger and request.trigger.channel not in request.channels:
-        raise ValueOutOfRange(
-            f"axis {axis}: the trigger watches {request.trigger.channel!r}, which is not recorded",
-            axis=axis,
-            value=request.trigger.channel,
-        )
-
-
-def require_no_full_scale(axis: str, request: TakeTrace, asked: Iterable[str]) -> None:
-    """Refuse a full scale that is not there to be set.
-
-    Args:
-        axis: the axis.
-        request: of the trace.
-        asked: the channels whose full scale cannot be set.
-
-    Raises:
-        NotSupported: there is one among them.
-    """
-    for name in asked:
-        raise NotSupported(
-            f"axis {axis}: the full scale of {name!r} cannot be set",
-            axis=axis,
-            value=request.full_scale[name],
-            remedy="leave full_scale out",
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,17 +136,19 @@ class Tracer(ABC):
     Attributes:
         source: who takes the samples.
         channels: what can be recorded.
+        full_scales: those whose full scale can be set.
     """
 
     source: TraceSource
     channels: tuple[str, ...]
+    full_scales: frozenset[str] = frozenset()
 
     @abstractmethod
     async def arm(self, request: TakeTrace) -> ArmedTrace:
-        """Begin a trace, or make it wait for its trigger; moves nothing.
+        """Begin a trace of such channels, or make it wait for its trigger; moves nothing.
 
         Raises:
-            ValueOutOfRange: there is no such channel, or no such interval; nothing was set.
+            ValueOutOfRange: there is no such interval, or a number is out of range; nothing was set.
             NotSupported: the drive has no such trigger; nothing was set.
             WrongState: the drive is not ready for it; nothing was set.
             BusyTracing: the drive's recorder is in use.

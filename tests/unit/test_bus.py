@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 
 from ldcnd.bus.queue import LANE_LIMITS, Lane
+from ldcnd.bus.transaction import only_while
 from ldcnd.errors import (
     BusBusy,
     LdcndError,
     NotSupported,
     WrongState,
 )
-from ldcnd.exchange import only_while
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.toy_family import ToyPoller

@@ -476,7 +476,7 @@ class AxisService:
             async with self._queue.at_work:
                 return await self._obey(permit, command)
         finally:
-            if not math.isinf(self._commands.deadline_s):
+            if self._commands.procedure is not None:
                 self._queue.wake()  # for the steps of what has begun
 
     async def in_turn(self, move: Move, permit: Permit, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:

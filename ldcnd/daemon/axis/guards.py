@@ -14,6 +14,7 @@ from typing import Any, NoReturn, Protocol
 
 from typing_extensions import override
 
+from ldcnd.bus.transaction import Condition, only_while
 from ldcnd.daemon.axis.state import MOTION_STATES, AxisTracker
 from ldcnd.drivers.driver import (
     AnalogMotion,
@@ -46,7 +47,7 @@ from ldcnd.errors import (
     WrongState,
     step,
 )
-from ldcnd.exchange import Condition, Exchange, only_while
+from ldcnd.exchange import Exchange
 from ldcnd.model.commands import Verb
 from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import AxisState, LinkState, TelemetryItem

@@ -1,10 +1,11 @@
 """The I/O modules of the lines: publishes their samples and carries out commands for them."""
 
+from ldcnd.bus.transaction import Condition, only_while
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.network import IoDriver, IoReading
 from ldcnd.errors import MalformedRequest
-from ldcnd.exchange import Condition, Timing, only_while
+from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
 from ldcnd.model.samples import Quality, TelemetryItem

@@ -22,8 +22,6 @@ from ldcnd.drivers.tracer import (
     Tracer,
     TraceTimedOut,
     TriggerWatch,
-    require_channels,
-    require_no_full_scale,
 )
 from ldcnd.errors import BusDown, BusError, ValueOutOfRange
 from ldcnd.exchange import Exchange, Timing
@@ -236,8 +234,6 @@ class HostTracer(Tracer):
     @override
     async def arm(self, request: TakeTrace) -> ArmedTrace:
         axis = self._driver.spec.name
-        require_channels(axis, request, self.channels)
-        require_no_full_scale(axis, request, request.full_scale)
         chosen = tuple(self._known[name] for name in request.channels)
         pre_trigger = request.pre_trigger if request.trigger else 0
         if pre_trigger >= request.samples:

@@ -10,7 +10,17 @@ from dataclasses import dataclass, field
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.tracer import ArmedTrace, Recorded, Tracer, TraceTimedOut
-from ldcnd.errors import BusyTracing, InternalError, LdcndError, NotSupported, OutcomeUnknown, Remedy, WrongState, step
+from ldcnd.errors import (
+    BusyTracing,
+    InternalError,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    Remedy,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
 from ldcnd.log import get_logger
 from ldcnd.model.commands import AxisCommand, CommandReply, Verb
 from ldcnd.model.samples import Quality
@@ -103,6 +113,7 @@ class TraceRecorder:
                 value=self._current.header.trace_id,
                 remedy=Remedy("wait for its end, or {}", step("trace_abort")),
             )
+        self._check(request)
         armed = await self._tracer.arm(request)
         granted = armed.granted
         header = TraceHeader(
@@ -136,6 +147,37 @@ class TraceRecorder:
             samples=granted.samples,
             pre_trigger=granted.pre_trigger,
         )
+
+    def _check(self, request: TakeTrace) -> None:
+        """Check the channels of a request, of its trigger and of its full scales.
+
+        Raises:
+            ValueOutOfRange: there is no such channel, one is named twice, or the trigger watches one that is not
+                recorded.
+            NotSupported: the full scale of a channel cannot be set.
+        """
+        axis, known = self._axis, self._tracer.channels
+        for name in request.channels:
+            if name not in known:
+                raise ValueOutOfRange(
+                    f"axis {axis}: cannot trace {name!r}; there are {', '.join(known)}", axis=axis, value=name
+                )
+        if len(set(request.channels)) < len(request.channels):
+            raise ValueOutOfRange(f"axis {axis}: a channel is named twice: {', '.join(request.channels)}", axis=axis)
+        if request.trigger and request.trigger.channel not in request.channels:
+            raise ValueOutOfRange(
+                f"axis {axis}: the trigger watches {request.trigger.channel!r}, which is not recorded",
+                axis=axis,
+                value=request.trigger.channel,
+            )
+        for name, full_scale in request.full_scale.items():
+            if name not in self._tracer.full_scales:
+                raise NotSupported(
+                    f"axis {axis}: the full scale of {name!r} cannot be set",
+                    axis=axis,
+                    value=full_scale,
+                    remedy="leave full_scale out",
+                )
 
     async def _abort(self, command_id: str) -> TraceAbortReply:
         trace = self._current

@@ -10,6 +10,9 @@ status byte definitions"; PIC-SERVO manual, 4.1, 5.2, 5.3.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from operator import itemgetter
+from struct import Struct
+from typing import Any
 
 from ldcnd.drivers.ldcn.profiles import Profile
 from ldcnd.errors import BadReply, ValueOutOfRange

@@ -84,8 +84,6 @@ from ldcnd.drivers.tracer import (
     Tracer,
     TraceTimedOut,
     TriggerWatch,
-    require_channels,
-    require_no_full_scale,
 )
 from ldcnd.errors import AddressRefused, DriveFault, LdcndError, NotSupported, ReplyTimeout, ValueOutOfRange
 from ldcnd.log import get_logger
@@ -151,6 +149,7 @@ class SmartStepTracer(Tracer):
 
     source = TraceSource.DRIVE
     channels = CHANNELS
+    full_scales = frozenset(FULL_SCALE_REGISTERS)
 
     def __init__(self, bus: Bus, words: Words, profile: SmartStepProfile) -> None:
         self._bus = bus
@@ -170,8 +169,6 @@ class SmartStepTracer(Tracer):
     async def arm(self, request: TakeTrace) -> ArmedTrace:
         """See `Tracer`. Checks everything that needs no reply before the first exchange with the drive."""
         words, profile = self._words, self._profile
-        require_channels(words.axis, request, self.channels)
-        require_no_full_scale(words.axis, request, [name for name in request.full_scale if not self._scales(name)])
         assignment = assign(words.axis, request.channels)
         by_host = request.trigger is not None and profile.trigger_map is None
         no_word = TriggerWordSource.HOST if by_host else TriggerWordSource.NONE
@@ -219,10 +216,6 @@ class SmartStepTracer(Tracer):
     async def disarm(self) -> bool:
         """See `Tracer`; a counter clear that was left behind ends, too, without clearing."""
         return await end_mode(self._words) is not None
-
-    @staticmethod
-    def _scales(channel: str) -> bool:
-        return channel in FULL_SCALE_REGISTERS
 
     def _require_possible(self, request: TakeTrace, *, by_host: bool) -> None:
         """Refuse what no drive of this family can do.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from typing_extensions import override
 
+from ldcnd.bus.transaction import only_while
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
@@ -19,7 +20,6 @@ from ldcnd.daemon.axis.straight import straight_line
 from ldcnd.drivers.driver import AxisReading, Motion
 from ldcnd.drivers.network import Network
 from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
-from ldcnd.exchange import only_while
 from ldcnd.model.commands import CommandReply, MoveAbsolute
 from ldcnd.model.rig_commands import MoveTogetherReply
 from ldcnd.model.samples import AxisState

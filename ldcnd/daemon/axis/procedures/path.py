@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
+from ldcnd.bus.transaction import only_while
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.guards import Permit, walking
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
@@ -29,7 +30,6 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.exchange import only_while
 from ldcnd.log import get_logger
 from ldcnd.model.commands import CommandReply, MoveAbsolute
 from ldcnd.model.rig_commands import PathReply
