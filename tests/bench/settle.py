@@ -42,7 +42,7 @@ class SettleFigures:
 
 async def settle_figures(rig: RunningRig, axis: str, distance: float) -> SettleFigures:
     """Move an axis and return how it has settled."""
-    service: AxisService = rig.daemon.rig.axis(axis)
+    service: AxisService = rig.daemon.rig.axes[axis]
     scale = abs(service.config.signed_counts_per_unit)
     await rig.until(axis, lambda state: state.link == "up")
     await rig.client.command(axis, Power(on=True))
@@ -77,7 +77,7 @@ async def table() -> None:
         print("| axis | move | profile | off at its end | done later | off then |")
         print("|---|---|---|---|---|---|")
         for axis, distance in DISTANCES.items():
-            row, unit = await settle_figures(rig, axis, distance), rig.daemon.rig.axis(axis).config.unit
+            row, unit = await settle_figures(rig, axis, distance), rig.daemon.rig.axes[axis].config.unit
             print(
                 f"| {axis} | {distance:g} {unit} | {row.profile_ms} ms | {row.off_then} counts | {row.done_ms} ms"
                 f" | {row.off} counts |"

@@ -48,7 +48,7 @@ class Bench:
     async def up(self) -> None:
         """Wait until every axis is up."""
         for _ in range(BACK_TURNS):
-            trackers = [self.rig.daemon.rig.axis(axis).tracker for axis in AXES]
+            trackers = [self.rig.daemon.rig.axes[axis].tracker for axis in AXES]
             if all(tracker.link is LinkState.UP for tracker in trackers):
                 return
             await asyncio.sleep(TURN_S)

@@ -102,7 +102,7 @@ async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_t
         await rig.until("x", lambda state: state.link is LinkState.UP)
         await rig.client.command("x", Power(on=True))
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
         bus = rig.daemon.rig.buses[0].bus
         sent_when_begun: list[int] = []
         sent_when_told: list[int] = []

@@ -53,7 +53,7 @@ async def test_the_description_of_an_axis_is_as_new_as_the_axis():
     async with running_rig() as rig:
         await rig.until("x", lambda _: True)
         (bus,) = rig.daemon.rig.buses
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
         stale = []
         for command in (
             Power(on=True),

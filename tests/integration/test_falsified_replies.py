@@ -53,7 +53,7 @@ async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_publish
 
 async def test_relative_moves_go_as_far_as_they_are_told():
     async with running_rig(rig_config(), {"line0": chain(3)}) as rig:
-        line = rig.daemon.rig.axis("x")
+        line = rig.daemon.rig.axes["x"]
         await rig.until("x", lambda _: True)
         await rig.client.command("x", Power(on=True))
         await asyncio.sleep(FALSE_FROM_S)
@@ -73,7 +73,7 @@ async def test_relative_moves_go_as_far_as_they_are_told():
 async def test_an_encoder_that_slips_on_a_standing_axis_is_a_fault_that_takes_the_reference():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.moving == "no")
-        take = rig.daemon.rig.axis("x").judged
+        take = rig.daemon.rig.axes["x"].judged
 
         def slipped(reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
             """Stands in for the encoder: the simulated one cannot slip."""

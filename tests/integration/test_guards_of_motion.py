@@ -47,7 +47,7 @@ async def test_a_halt_needs_no_lease():
 async def test_a_start_that_waits_behind_a_busy_line_is_withdrawn_by_a_stop():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
-        axis = rig.rig.daemon.rig.axis(AXIS)
+        axis = rig.rig.daemon.rig.axes[AXIS]
         start_of, stops = axis.driver.start, []
 
         async def start() -> None:
@@ -143,7 +143,7 @@ async def test_a_duty_that_replaces_another_is_refused_during_a_stop():
     async with dialect_rig(V4, pwm={"duty": 0.5, "duration_s": 5.0}, acceleration=2000) as rig:
         await rig.power_on()
         await rig.send(SetPwm(duty=0.05, duration_s=3.0))
-        axis = rig.rig.daemon.rig.axis(AXIS)
+        axis = rig.rig.daemon.rig.axes[AXIS]
         async with asyncio.TaskGroup() as group:
             group.create_task(axis.execute(Stop()))
             await asyncio.sleep(0)
@@ -154,7 +154,7 @@ async def test_a_duty_that_replaces_another_is_refused_during_a_stop():
 async def test_a_target_that_the_drive_would_wrap_is_refused():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
-        motion = rig.rig.daemon.rig.axis(AXIS)._motion
+        motion = rig.rig.daemon.rig.axes[AXIS]._motion
         motion.reading = replace(motion.latest(), position_counts=-0x70000000)
         with pytest.raises(ValueOutOfRange):
             motion.plan_to(0x60000000 / 1000, None, None)
@@ -167,7 +167,7 @@ async def test_a_buffered_move_does_not_start_after_a_loss_policy_has_stopped_th
         request = MoveAbsolute(position=15.0, buffer_mode=BufferMode.BUFFERED)
         waiting = asyncio.create_task(rig.rig.client.command(AXIS, request, 30.0))
         await asyncio.sleep(0.3)
-        axis = rig.rig.daemon.rig.axis(AXIS)
+        axis = rig.rig.daemon.rig.axes[AXIS]
         await axis.bring_to_rest(StopMode.SMOOTH)
         with pytest.raises(StopLatched):
             await waiting
@@ -192,7 +192,7 @@ async def test_a_lease_that_ran_out_while_the_daemon_was_frozen_ends_with_its_po
 async def test_a_stop_while_a_home_position_is_taken_over_sets_no_reference():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
-        axis = rig.rig.daemon.rig.axis(AXIS)
+        axis = rig.rig.daemon.rig.axes[AXIS]
         captured_of, stops = axis.driver.captured_home, []
 
         async def captured() -> int:

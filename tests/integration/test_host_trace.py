@@ -242,7 +242,7 @@ async def test_a_stop_on_the_traced_line_waits_for_the_poll_on_the_wire_only():
     async with running_rig() as rig:
         await ready(rig)
         bus, loop = rig.daemon.rig.buses[0].bus, asyncio.get_running_loop()
-        longest_s = bus.longest_s(rig.daemon.rig.axis("x").driver.reading(frozenset(TelemetryItem)))
+        longest_s = bus.longest_s(rig.daemon.rig.axes["x"].driver.reading(frozenset(TelemetryItem)))
         await rig.client.stop("y")
         began_s = loop.time()
         await rig.client.stop("y")

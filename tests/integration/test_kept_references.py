@@ -340,14 +340,14 @@ async def test_a_counter_is_not_set_back_before_the_reference_is_off_the_disk(tm
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
         await set_out(rig)
-        keeper = rig.daemon.rig.axis("x").reference
+        keeper = rig.daemon.rig.axes["x"].reference
         file = tmp_path / "references" / "x.json"
         assert file.exists()
 
         await keeper._drive.about_to_renumber()
 
         assert not file.exists()
-        assert rig.daemon.rig.axis("x").driver.about_to_renumber == keeper.forget
+        assert rig.daemon.rig.axes["x"].driver.about_to_renumber == keeper.forget
 
 
 # -- disks ------------------------

@@ -247,7 +247,7 @@ async def test_a_stop_ends_a_duty_at_once():
 async def test_whenever_a_stop_comes_nothing_moves_afterwards(command, turns):
     async with dialect_rig(LS_182AP, pwm=PWM, tracking={"step": 0.5, "rate": 50.0}, acceleration=2000) as rig:
         await rig.power_on()
-        axis = rig.rig.daemon.rig.axis(AXIS)
+        axis = rig.rig.daemon.rig.axes[AXIS]
 
         async with asyncio.TaskGroup() as group:
             group.create_task(_ignoring_refusals(axis.execute(command)))

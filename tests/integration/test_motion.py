@@ -218,7 +218,7 @@ async def test_a_stop_does_not_close_the_loop_of_a_disabled_axis():
 async def test_a_stop_overtakes_a_move_that_came_before_it():
     async with running_rig() as rig:
         await powered(rig, "x")
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
 
         async with asyncio.TaskGroup() as group:
             move = group.create_task(_outcome(axis.execute(MoveAbsolute(position=50.0))))
@@ -233,7 +233,7 @@ async def test_whenever_a_stop_comes_nothing_moves_afterwards(turns):
     """The stop arrives after so many turns of the loop or bytes of the line: between load and start, too."""
     async with running_rig() as rig:
         await powered(rig, "x")
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
 
         async with asyncio.TaskGroup() as group:
             group.create_task(_outcome(axis.execute(MoveAbsolute(position=50.0))))

@@ -121,7 +121,7 @@ async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
         await unplugged(rig, chain)
         await rig.client.stop("x")
         await asyncio.sleep(1.0)
-        rig.daemon.rig.axis("x").tracker._rest.forget(rests=True)
+        rig.daemon.rig.axes["x"].tracker._rest.forget(rests=True)
         chain.replug()
         await rig.until("x", lambda state: not state.stop_pending)
         await asyncio.sleep(0.3)
@@ -131,7 +131,7 @@ async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
 async def test_a_drive_that_was_mute_is_stopped_as_soon_as_it_answers():
     chain = chain_of_four()
     async with jogging(chain) as rig:
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
         stop_of = axis.driver.stop
 
         async def lost(_mode):
@@ -153,7 +153,7 @@ async def test_a_drive_that_was_mute_is_stopped_as_soon_as_it_answers():
 async def test_nothing_moves_and_nothing_is_reset_while_a_stop_is_not_confirmed():
     chain = chain_of_four()
     async with jogging(chain) as rig:
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
 
         async def lost(_mode):
             raise BusDown("no reply")
@@ -169,7 +169,7 @@ async def test_nothing_moves_and_nothing_is_reset_while_a_stop_is_not_confirmed(
 async def test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm():
     chain = chain_of_four()
     async with jogging(chain) as rig:
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
         axis.tracker.stop_unconfirmed(0)
         axis._pending = StopMode.SMOOTH
         axis.cannot_move()
@@ -265,7 +265,7 @@ async def test_a_moving_axis_in_error_stop_is_not_switched_off_by_a_reset():
 async def test_a_latched_axis_that_moves_when_its_line_is_back_comes_to_rest_whatever_the_policy_says():
     chain = chain_of_four()
     async with jogging(chain) as rig:
-        rig.daemon.rig.axis("x").tracker.latch_stop()  # latched and confirmed, as far as anyone knows
+        rig.daemon.rig.axes["x"].tracker.latch_stop()  # latched and confirmed, as far as anyone knows
         await unplugged(rig, chain)
         chain.replug()
         await rig.until("x", lambda state: state.link is LinkState.UP)

@@ -221,7 +221,7 @@ async def test_a_stream_of_set_points_ends_with_its_lease():
 async def test_a_stop_that_comes_while_the_loop_is_being_closed_leaves_it_open():
     async with running_rig(config(authority="open")) as rig:
         await rig.until("x", lambda state: state.link == "up")
-        axis = rig.daemon.rig.axis("x")
+        axis = rig.daemon.rig.axes["x"]
         power_of, stops = axis.driver.power, []
 
         async def power(*, on: bool) -> None:
@@ -268,9 +268,9 @@ async def test_what_is_refused_at_once_leaves_one_event():
         assert [(event.status, event.number) for event in events] == [("refused", 0)]
 
 
-MOVES = {"load", "start", "track", "power", "set_gains", "start_group"}
+MOVES = {"load", "start", "track", "power", "set_gains", "start_group", "start_path", "add_points"}
 """Calls of a driver or a network that can move a motor."""
-MAY_CALL = "permit.py"
+MAY_CALL = "guards.py"
 
 
 def test_nothing_in_the_daemon_but_a_permit_calls_what_can_move_a_drive():
@@ -294,7 +294,7 @@ BUSY = 30
 
 def busy_line_before(rig: RunningRig, monkeypatch, call: str) -> asyncio.Event:
     """Queue reads on the line of x directly before its driver queues a packet; the event says when they are there."""
-    axis, queued = rig.daemon.rig.axis("x"), asyncio.Event()
+    axis, queued = rig.daemon.rig.axes["x"], asyncio.Event()
     bus, original = rig.daemon.rig.buses[0].bus, getattr(axis.driver, call)
 
     async def behind_reads(*args: object, **options: object) -> None:

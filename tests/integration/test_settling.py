@@ -60,7 +60,7 @@ async def moved(rig: RunningRig, axis: str, distance: float) -> CommandEvent:
 async def test_a_move_is_done_within_its_window_and_says_where(axis):
     async with running_rig() as rig:
         await powered(rig, axis)
-        config = rig.daemon.rig.axis(axis).config
+        config = rig.daemon.rig.axes[axis].config
         window = window_counts(config) / config.counts_per_unit
 
         done = await moved(rig, axis, DISTANCES[axis])

@@ -287,7 +287,7 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
 )
 async def test_impossible_trace_is_refused_with_the_reason_before_anything_is_sent(request_, error, reason):
     async with trace_rig() as under_test:
-        words = under_test.rig.daemon.rig.axis("feed").driver.words
+        words = under_test.rig.daemon.rig.axes["feed"].driver.words
         asked = []
         words.ask = asked.append
 

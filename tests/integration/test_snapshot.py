@@ -25,7 +25,7 @@ async def test_a_snapshot_tells_the_position_of_a_moving_axis_within_its_bound(d
             while True:
                 rig.chain.advance(loop.time())
                 rig.drive.catch_up(loop.time())
-                seen.append((rig.rig.daemon.rig.axis(AXIS)._clock.now_ns(), rig.position_mm))
+                seen.append((rig.rig.daemon.rig.axes[AXIS]._clock.now_ns(), rig.position_mm))
                 await asyncio.sleep(0.0005)
 
         watching = asyncio.create_task(watch())

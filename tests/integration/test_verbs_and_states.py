@@ -134,7 +134,7 @@ async def outcome(send: Callable[[], Awaitable[object]]) -> object:
 async def test_each_command_is_taken_or_refused_as_the_table_says(state):
     async with dialect_rig(V4, pwm={"duty": 0.5, "duration_s": 5.0}, tracking={"step": 0.4, "rate": 50.0}) as rig:
         await rig.power_on()
-        axis = rig.rig.daemon.rig.axis(AXIS)
+        axis = rig.rig.daemon.rig.axes[AXIS]
         reading = axis._motion.latest()
         for name in ("load", "start", "track", "power", "reset", "clear_warnings", "set_gains", "set_outputs"):
             setattr(axis.driver, name, nothing)

@@ -257,7 +257,7 @@ async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witn
 
 def check_homed(witness: Witness, daemon: Daemon) -> None:
     """Hold what z says of its place against its index pulses, once it was homed."""
-    z = daemon.rig.axis("z")
+    z = daemon.rig.axes["z"]
     if not z.tracker.referenced or z.telemetry.origin_counts == 0:
         return
     drive = witness.drive("z")

@@ -101,7 +101,7 @@ class Witness:
 
     def _forbidden(self, daemon: Daemon, name: str, now_s: float) -> str | None:
         """Return why an axis must not be moved now."""
-        tracker, dispatcher = daemon.rig.axis(name).tracker, daemon._dispatcher
+        tracker, dispatcher = daemon.rig.axes[name].tracker, daemon._dispatcher
         lease = dispatcher.authority.holder(name)
         if lease is None or lease.ends_at_s <= now_s:
             return "nobody holds it"
@@ -110,7 +110,7 @@ class Witness:
         return f"there is another daemon, {dispatcher.rival}" if dispatcher.rival else None
 
     def _count(self, daemon: Daemon, name: str, now_s: float) -> None:
-        command = daemon.rig.axis(name).tracker.command
+        command = daemon.rig.axes[name].tracker.command
         if command is None:
             self.wrong.append(f"{now_s:.4f}: {name} is moved by no command")
             return

@@ -41,9 +41,6 @@ class SlowRig:
         self.axes = {"x": SimpleNamespace(tracker=Tracker(), stoppable=True, config=SimpleNamespace(name="x"))}
         self.buses = (SimpleNamespace(bus=SimpleNamespace(wire_log=self.wire_log), axes=tuple(self.axes.values())),)
 
-    def axis(self, name: str) -> SimpleNamespace:
-        return self.axes[name]
-
     def reset(self) -> None:
         self.axes["x"].tracker.stop_latched = False
 

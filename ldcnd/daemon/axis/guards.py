@@ -8,7 +8,7 @@ its turn, for the motion ahead of it, for the other members of its group, for a 
 judged by the state at its start, not by the state at its arrival.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn, Protocol
 
@@ -33,6 +33,7 @@ from ldcnd.drivers.driver import (
     Tracks,
     WalksPaths,
 )
+from ldcnd.drivers.network import Network
 from ldcnd.errors import (
     AccelerationLimit,
     AxisUnreachable,
@@ -510,3 +511,50 @@ class Gate:
         return StopLatched(
             f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
         )
+
+
+async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
+    """Start axes on their paths; every member's permission is checked directly before the packet that starts.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
+    """
+    conditions = [permit.to_move() for permit in permits]
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    with only_while(ask_all):
+        await network.start_path(names, ask_all)
+
+
+async def start_together(
+    network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
+) -> None:
+    """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
+
+    Args:
+        network: of their line.
+        motions: by axis name.
+        permits: of all members.
+        announce: called between the last check and the first packet.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.
+    """
+
+    def about_to_start() -> None:
+        ask_all()
+        for permit in permits:
+            permit.begun()
+        announce()
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    conditions = [permit.to_move() for permit in permits]
+    ask_all()
+    with only_while(ask_all):
+        await network.start_group(motions, about_to_start)

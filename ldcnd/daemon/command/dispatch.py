@@ -185,7 +185,7 @@ class Requests:
         if self._closing:
             raise ShuttingDown("the daemon is stopping", axis=address.axis)
         if address.axis != RIG_ITSELF:
-            self._rig.axis(address.axis)  # an unknown axis is refused before an unknown verb
+            _ = self._rig.axes[address.axis]  # an unknown axis is refused before an unknown verb
         kind = _command_class(address)
         command = decode(kind, query.payload, query.encoding)
         return await self._dispatcher.answer(address.axis, command, query.login)
@@ -193,7 +193,7 @@ class Requests:
     async def _stop(self, query: Query) -> Frozen:
         """Stop even if the payload is nonsense: a stop is always accepted."""
         name = self._keys.parse_stop(query.key)
-        names = tuple(self._rig.axes) if name is None else (self._rig.axis(name).config.name,)
+        names = tuple(self._rig.axes) if name is None else (self._rig.axes[name].config.name,)
         try:
             self._journal.stopped(name)
         except Exception:
@@ -213,7 +213,7 @@ class Requests:
             if self._are_latched(names):
                 return confirmed
             # a reset that was under way has taken the latch from this stop
-        for axis in (self._rig.axis(name) for name in names):
+        for axis in (self._rig.axes[name] for name in names):
             if axis.stoppable:
                 axis.tracker.latch_stop()  # at once, for requests of this same loop iteration
         own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
@@ -243,7 +243,7 @@ class Requests:
             log.exception("stop not entered into the events", key=query.key)
 
     def _are_latched(self, names: tuple[str, ...]) -> bool:
-        axes = (self._rig.axis(name) for name in names)
+        axes = (self._rig.axes[name] for name in names)
         return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
 
     def _refuse(self, query: Query, error: LdcndError) -> None:
@@ -336,7 +336,7 @@ class Dispatcher:
         Raises:
             LdcndError: as the axis refused it, or because it is not admitted.
         """
-        axis = self._rig.axis(axis_name)
+        axis = self._rig.axes[axis_name]
         if command.effect is Effect.QUESTION:
             return await axis.execute(command)
         if isinstance(command, Jog) and command.renews is not None:
@@ -396,7 +396,7 @@ class Dispatcher:
         """
         for name in names:
             status, reason = CommandStatus.DONE, None
-            if not self._rig.axis(name).stoppable:
+            if not self._rig.axes[name].stoppable:
                 status, reason = CommandStatus.REFUSED, "its drive cannot be stopped over its line"
             elif name not in confirmed:
                 status, reason = (

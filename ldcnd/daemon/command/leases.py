@@ -311,7 +311,7 @@ class LeaseWatch:
         """
         lease = self._authority.release(token, self._clock.now_s())
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
-        moving = [name for name in lease.axes if self._rig.axis(name).tracker.moving is not Moving.NO]
+        moving = [name for name in lease.axes if self._rig.axes[name].tracker.moving is not Moving.NO]
         if not leave_running:
             self._lost(lease, moving, "released while it moved", None)
         for name in sorted(moving) if leave_running else ():
@@ -320,7 +320,7 @@ class LeaseWatch:
 
     def _lost(self, lease: Lease, axes: Iterable[str], cause: str, code: ErrorCode | None) -> None:
         for name in sorted(axes):
-            axis = self._rig.axis(name)
+            axis = self._rig.axes[name]
             self._note(name, lease, CommandStatus.ABORTED, f"{cause}; policy: {axis.config.loss.client.value}", code)
             if self.group is not None:
                 self.group.create_task(

@@ -15,8 +15,7 @@ from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.leases import Authority, LeaseWatch, apply_policy
 from ldcnd.daemon.command.ledger import EventLog, Ledger
 from ldcnd.daemon.line.line import BusService
-from ldcnd.daemon.line.modules import ModuleService
-from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.line.rig import ModuleService, Rig
 from ldcnd.errors import (
     DriveFault,
     InternalError,
@@ -134,12 +133,12 @@ class RigCommands:
             case SetSpeedOverride():
                 return await self._set_speed_override(command)
             case Snapshot():
-                return await self._rig.line(command.bus).snapshot(self._clock)
+                return await self._rig.lines[command.bus].snapshot(self._clock)
             case SetIo():
-                module = self._rig.module(command.module)
+                module = self._rig.modules[command.module]
                 return await module.set_io(command, lambda: self._admit_module(module, command))
             case SetIoTimer():
-                module = self._rig.module(command.module)
+                module = self._rig.modules[command.module]
                 self._admit_module(module, command)
                 return await module.set_timer(command)
             case Rehearse():
@@ -157,10 +156,10 @@ class RigCommands:
         """Answer what moves and changes nothing."""
         match command:
             case Why():
-                return self._why(self._rig.axis(axis), command)
+                return self._why(self._rig.axes[axis], command)
             case Preview():
-                why = self._why(self._rig.axis(axis), Why(absolute=command.position is not None))
-                return self._rig.axis(axis).preview(command, tuple(cause.text for cause in why.causes))
+                why = self._why(self._rig.axes[axis], Why(absolute=command.position is not None))
+                return self._rig.axes[axis].preview(command, tuple(cause.text for cause in why.causes))
             case PreviewTogether():
                 return preview_together(self._rig, command)
             case ListHolders():
@@ -190,12 +189,12 @@ class RigCommands:
         """
         for name in module.axes:
             self._admit(name, self._own(name, command.leases) or command.lease)
-            guards.check_not_latched(self._rig.axis(name).tracker)
+            guards.check_not_latched(self._rig.axes[name].tracker)
 
     async def _set_speed_override(self, command: SetSpeedOverride) -> SpeedOverrideReply:
         """Scale the velocities of all axes; to lower them needs no right, as a stop needs none."""
         share = command.percent / 100.0
-        axes = [self._rig.axis(name) for name in self._rig.axes]
+        axes = list(self._rig.axes.values())
         if any(share > axis.tracker.speed_share for axis in axes):
             for name in self._rig.axes:
                 self._admit(name, self._own(name, command.leases))
@@ -340,7 +339,7 @@ def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply
     """
     moves = _shares(request)
     _line_of(rig, moves)
-    axes = {name: rig.axis(name).planned(move) for name, move in moves.items()}
+    axes = {name: rig.axes[name].planned(move) for name, move in moves.items()}
     plans, deviation = {name: plan for name, (_, plan) in axes.items()}, None
     if request.path is LinePath.LINEAR:
         plans, deviation = plans_on_line(axes, request.max_deviation)
@@ -372,7 +371,7 @@ def _line_of(rig: Rig, names: Iterable[str]) -> BusService:
         UnknownAxis, NotSupported: as `move_together`.
     """
     wanted = list(names)
-    lines = {bus for bus in rig.buses for name in wanted if rig.axis(name) in bus.axes}
+    lines = {bus for bus in rig.buses for name in wanted if rig.axes[name] in bus.axes}
     if len(lines) != 1:
         raise NotSupported(f"axes {', '.join(wanted)} are not on one line, so they cannot start together")
     (line,) = lines
@@ -385,10 +384,10 @@ def concerned(rig: Rig, request: Rehearse) -> tuple[str, ...]:
     Raises:
         UnknownAxis: there is no such axis.
     """
-    rig.axis(request.axis)
+    axis = rig.axes[request.axis]
     if request.kind is Rehearsal.BUS_LOSS:
-        return tuple(axis.config.name for axis in _bus_of(rig, request.axis).axes)
-    return (request.axis,)
+        return tuple(each.config.name for each in _bus_of(rig, request.axis).axes)
+    return (axis.config.name,)
 
 
 async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
@@ -397,7 +396,7 @@ async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
     Raises:
         UnknownAxis: there is no such axis.
     """
-    axis = rig.axis(request.axis)
+    axis = rig.axes[request.axis]
     log.warning("rehearsal", axis=request.axis, kind=request.kind.value)
     if request.kind is Rehearsal.DAEMON_STOP:
         await apply_policy(axis, axis.config.loss.daemon, "rehearsed end of the daemon")
@@ -475,7 +474,7 @@ def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:
     Raises:
         ValueOutOfRange: the rig has no such line.
     """
-    service = rig.line(request.bus)
+    service = rig.lines[request.bus]
     log = service.bus.wire_log
     records = log.records()
     oldest = log.added - len(records)

@@ -18,8 +18,7 @@ from ldcnd.daemon.command.dispatch import Dispatcher, EarlyStops
 from ldcnd.daemon.command.leases import Authority, random_token
 from ldcnd.daemon.command.ledger import EventLog, Ledger
 from ldcnd.daemon.line.line import BusService
-from ldcnd.daemon.line.modules import ModuleService
-from ldcnd.daemon.line.rig import Rig
+from ldcnd.daemon.line.rig import ModuleService, Rig
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.process.heartbeat import Heartbeat
 from ldcnd.daemon.publish.publisher import Publisher

@@ -6,18 +6,17 @@ others have arrived; then the line starts them together, or none of them moves.
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
 from typing_extensions import override
 
-from ldcnd.bus.transaction import only_while
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.guards import Permit
+from ldcnd.daemon.axis.guards import Permit, start_together
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.daemon.axis.straight import straight_line
-from ldcnd.drivers.driver import AxisReading, Motion
+from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.network import Network
 from ldcnd.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
 from ldcnd.model.commands import CommandReply, MoveAbsolute
@@ -247,34 +246,3 @@ def _look(started: "asyncio.Future[None]") -> None:
     """Retrieve an error that no member waits for, so that asyncio does not report it."""
     if not started.cancelled():
         started.exception()
-
-
-async def start_together(
-    network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
-) -> None:
-    """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
-
-    Args:
-        network: of their line.
-        motions: by axis name.
-        permits: of all members.
-        announce: called between the last check and the first packet.
-
-    Raises:
-        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.
-    """
-
-    def about_to_start() -> None:
-        ask_all()
-        for permit in permits:
-            permit.begun()
-        announce()
-
-    def ask_all() -> None:
-        for condition in conditions:
-            condition()
-
-    conditions = [permit.to_move() for permit in permits]
-    ask_all()
-    with only_while(ask_all):
-        await network.start_group(motions, about_to_start)

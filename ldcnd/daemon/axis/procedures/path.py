@@ -5,15 +5,14 @@ first. Permission is checked before every packet. An end of one member ends all:
 """
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
-from ldcnd.bus.transaction import only_while
 from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.guards import Permit, walking
+from ldcnd.daemon.axis.guards import Permit, start_path, walking
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan
 from ldcnd.daemon.axis.polyline import PathAxis, Walk, walk
 from ldcnd.daemon.axis.procedure import Procedure
@@ -411,19 +410,3 @@ class PathMember(Procedure):
             return
         motion.tracker.finished(error.message)
         motion.publish_state()
-
-
-async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
-    """Start axes on their paths; every member's permission is checked directly before the packet that starts.
-
-    Raises:
-        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
-    """
-    conditions = [permit.to_move() for permit in permits]
-
-    def ask_all() -> None:
-        for condition in conditions:
-            condition()
-
-    with only_while(ask_all):
-        await network.start_path(names, ask_all)
