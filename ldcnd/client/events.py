@@ -15,7 +15,7 @@ from ldcnd.messaging.keys import EVENT
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.model.events import CommandEvent, EventList, ReadEvents
 
-LOOK_PERIOD_S = 2.0
+CHECK_PERIOD_S = 2.0
 """Period of queries for a missed last event, while none comes, seconds."""
 RETRY_S = 0.5
 """Pause before the next query of a daemon out of reach, seconds."""
@@ -61,7 +61,7 @@ class Events:
             if self._behind:
                 await self._fetch()
             elif not self._take_live():
-                await self._wait(LOOK_PERIOD_S)
+                await self._wait(CHECK_PERIOD_S)
                 self._behind = not self._live
 
     def _take_live(self) -> bool:

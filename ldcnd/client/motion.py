@@ -12,7 +12,7 @@ from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Qu
 
 SILENT_S = 10.0
 """Time without samples after which the outcome of a motion is unknown, seconds."""
-LOOK_S = 0.2
+CHECK_PERIOD_S = 0.2
 """Longest time between two queries for the outcome of a command that its axis does not name any more, seconds."""
 
 
@@ -47,8 +47,8 @@ class Position:
         return self.sample.value
 
     def __str__(self) -> str:
-        doubt = "" if self.quality is Quality.GOOD else f", {self.quality}"
-        return f"{self.value:.4f} {self.unit} ({self.age_s:.2f} s old{doubt})"
+        uncertainty = "" if self.quality is Quality.GOOD else f", {self.quality}"
+        return f"{self.value:.4f} {self.unit} ({self.age_s:.2f} s old{uncertainty})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,7 @@ class Motion:
             here = self._axis.position
             left = None if self.reply.position is None else self.reply.position - here.value
             yield Progress(here.value, left, here.unit)
-            await self._axis.news(LOOK_S)
+            await self._axis.news(CHECK_PERIOD_S)
 
     async def _over(self) -> bool:
         return (await self._axis.outcome(self.command_id)).status in FINAL
@@ -226,13 +226,13 @@ class Motion:
                 ) from None
             if outcome.status in FINAL:
                 return outcome
-            await self._axis.news(LOOK_S)  # the state that names the command is still on its way
+            await self._axis.news(CHECK_PERIOD_S)  # the state that names the command is still on its way
 
     async def _arrival(self) -> None:
         """Wait, but not for long, for a position that is as new as the state after the end."""
         ended_at = self._axis.state.sample.t
         while self._axis.position.sample.t < ended_at:
-            if not await self._axis.news(LOOK_S):
+            if not await self._axis.news(CHECK_PERIOD_S):
                 return
 
     def _under_way(self) -> bool:

@@ -8,7 +8,7 @@ from ldcnd.model.samples import Moving
 
 REST_S = 5.0
 """Longest time that an axis takes to come to rest, or to be heard of, seconds."""
-LOOK_S = 0.05
+CHECK_PERIOD_S = 0.05
 
 
 async def seen(axis: Axis) -> Axis:
@@ -24,7 +24,7 @@ async def seen(axis: Axis) -> Axis:
         except SessionError:
             if asyncio.get_running_loop().time() > deadline_s:
                 raise
-            await axis.news(LOOK_S)
+            await axis.news(CHECK_PERIOD_S)
         else:
             return axis
 
@@ -38,7 +38,7 @@ async def at_rest(axis: Axis) -> None:
     try:
         async with asyncio.timeout(REST_S):
             while axis.state.moving is not Moving.NO:
-                await axis.news(LOOK_S)
+                await axis.news(CHECK_PERIOD_S)
     except TimeoutError:
         raise WrongState(
             f"axis {axis.name} does not come to rest within {REST_S:g} s",

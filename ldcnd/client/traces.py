@@ -10,7 +10,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, WrongState, step
 from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
-LOOK_S = 0.1
+CHECK_PERIOD_S = 0.1
 ARMING_S = 30.0
 """Maximum time to arm a trace, seconds: a slow drive needs some twenty exchanges before its trace begins."""
 ENDING_S = 10.0
@@ -119,7 +119,7 @@ async def wait_for_trace(
                 if header.phase not in UNDER_WAY:
                     return header
                 progress(header)
-                await asyncio.sleep(LOOK_S)
+                await asyncio.sleep(CHECK_PERIOD_S)
     except TimeoutError:
         raise OutcomeUnknown(
             f"axis {axis}: trace {trace_id} did not end within {within_s:g} s",

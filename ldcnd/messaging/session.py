@@ -59,8 +59,8 @@ PublishValue = Callable[[bytes, int], None]
 class Declaration:
     """Something that a session has made known to the network; made by its session."""
 
-    def __init__(self, take_back: Callable[[], Awaitable[None]], load: Callable[[], Load] = Load) -> None:
-        self._take_back = take_back
+    def __init__(self, undeclare: Callable[[], Awaitable[None]], load: Callable[[], Load] = Load) -> None:
+        self._undeclare = undeclare
         self._load = load
         self._closed = False
 
@@ -73,7 +73,7 @@ class Declaration:
         """Take it back; safe to call twice. No callback runs afterwards, undelivered queries are refused."""
         if not self._closed:
             self._closed = True
-            await self._take_back()
+            await self._undeclare()
 
 
 class Session(ABC):

@@ -14,7 +14,7 @@ RUNTIME = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
 all other links wait; so there are more threads than such links at a time."""
 SENDERS = "tx-"
 """Prefix of the names of Zenoh's sending threads; the first link makes them."""
-LOOK_S = 1.0
+CHECK_PERIOD_S = 1.0
 
 
 def provide_threads() -> None:
@@ -31,7 +31,7 @@ async def senders_wait() -> None:
     """
     while True:
         found = _let_senders_wait()
-        await asyncio.sleep(LOOK_S)
+        await asyncio.sleep(CHECK_PERIOD_S)
         if found:
             break
     _let_senders_wait()  # those that had just been started, and had no name yet

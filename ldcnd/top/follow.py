@@ -7,7 +7,7 @@ from ldcnd.errors import LdcndError
 from ldcnd.model.leases import ListHolders
 from ldcnd.top.rig_view import RigView, described
 
-LOOK_S = 1.0
+CHECK_PERIOD_S = 1.0
 """Period of queries for the daemon's description and the holders of leases; everything else it publishes by itself."""
 
 
@@ -27,4 +27,4 @@ async def follow(client: RigClient, view: RigView) -> None:
                 view.describe(described(daemon, await client.axes(), holders))
             except LdcndError:
                 pass  # the view shows how long the daemon has been silent
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(CHECK_PERIOD_S)

@@ -4,7 +4,7 @@ import asyncio
 from unittest.mock import Mock
 
 from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.ledger import PAGE_BYTES, TOLD_AFTER_S, UNTOLD_EVENTS, Entry, EventLog
+from ldcnd.daemon.command.ledger import PAGE_BYTES, PUBLISHED_AFTER_S, UNPUBLISHED_EVENTS, Entry, EventLog
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.errors import BusDown, SessionError
 from ldcnd.messaging.codec import to_json
@@ -34,11 +34,11 @@ class Told:
 async def test_events_are_told_together_with_the_instants_at_which_they_happened():
     told = Told()
     told.happens()
-    await asyncio.sleep(TOLD_AFTER_S / 2)
+    await asyncio.sleep(PUBLISHED_AFTER_S / 2)
     told.happens(CommandStatus.FAILED, BusDown("no line"))
     assert told.published() == []
 
-    await asyncio.sleep(TOLD_AFTER_S)
+    await asyncio.sleep(PUBLISHED_AFTER_S)
 
     assert told.published() == [(10**9, 0, 0, "accepted", None), (10**9 + 1, 1, 1, "failed", "bus_down")]
 
@@ -48,7 +48,7 @@ async def test_who_asks_is_told_at_once_and_nobody_twice():
     told.happens()
 
     page = told.log.page(ReadEvents())
-    await asyncio.sleep(2 * TOLD_AFTER_S)
+    await asyncio.sleep(2 * PUBLISHED_AFTER_S)
 
     assert [event.number for event in page.events] == [0]
     assert len(told.published()) == 1
@@ -56,16 +56,16 @@ async def test_who_asks_is_told_at_once_and_nobody_twice():
 
 async def test_a_flood_is_not_kept():
     told = Told()
-    for _ in range(UNTOLD_EVENTS):
+    for _ in range(UNPUBLISHED_EVENTS):
         told.happens()
 
-    assert [number for _, _, number, _, _ in told.published()] == list(range(UNTOLD_EVENTS))
+    assert [number for _, _, number, _, _ in told.published()] == list(range(UNPUBLISHED_EVENTS))
 
 
 async def test_at_the_end_all_is_told():
     told = Told()
     told.happens()
-    told.log.tell()
+    told.log.flush()
 
     assert len(told.published()) == 1
 
@@ -76,7 +76,7 @@ async def test_what_the_network_does_not_take_keeps_nothing_else_back():
     told.happens()
     told.happens(CommandStatus.DONE)
 
-    await asyncio.sleep(2 * TOLD_AFTER_S)
+    await asyncio.sleep(2 * PUBLISHED_AFTER_S)
 
     assert len(told.published()) == 2
     assert [event.number for event in told.log.page(ReadEvents()).events] == [0, 1]

@@ -166,7 +166,7 @@ def _no_note(_axis: str, _verb: str, _status: CommandStatus, _reason: str, _code
     pass
 
 
-LOOK_LATER_S = 0.005
+FIRST_READING_DELAY_S = 0.005
 """Delay between the start of a motion and the request for the reading at its end, seconds."""
 SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
@@ -403,9 +403,9 @@ class AxisService:
 
     def _ask_in_time(self, at_s: float) -> None:
         """Have the drive read when the motion under way should end, and while it settles, whatever the rates."""
-        look_s = self.tracker.look_at_s(at_s)
-        if look_s is not None and self.ask_at:
-            self.ask_at(look_s)
+        read_at_s = self.tracker.next_reading_s(at_s)
+        if read_at_s is not None and self.ask_at:
+            self.ask_at(read_at_s)
 
     def missed(self, _error: BusError) -> None:
         """Take note that a poll brought nothing."""
@@ -705,7 +705,7 @@ class AxisService:
             return await self._commands.carry_out(permit, command)
         finally:
             if self.tracker.settle:  # the caller that waits for the reply goes first
-                asyncio.get_running_loop().call_later(LOOK_LATER_S, self._ask_soon)
+                asyncio.get_running_loop().call_later(FIRST_READING_DELAY_S, self._ask_soon)
 
     def _require_reachable(self) -> None:
         guards.check_reachable(self.tracker)

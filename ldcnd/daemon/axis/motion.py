@@ -397,9 +397,9 @@ class AxisMotion:
 
     def publish_state(self) -> None:
         """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""
-        self._loop.call_soon(self._tell_state)
+        self._loop.call_soon(self._publish_now)
 
-    def _tell_state(self) -> None:
+    def _publish_now(self) -> None:
         self.reference.woken.set()
         self.telemetry.state(self.clock.now_ns())
 

@@ -27,7 +27,7 @@ LEAST_WINDOW_COUNTS = 5.0
 """A closed loop hunts by some counts."""
 WINDOW_OF_EL = 1 / 400
 """Settle window as a fraction of the position error limit: that is some hundred times the error at rest."""
-LEAST_LOOK_S = 0.005
+SHORTEST_READING_PAUSE_S = 0.005
 """Shortest time between two readings of an axis that settles."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
 STOP_UNCONFIRMED = Fault(
@@ -393,7 +393,7 @@ class AxisTracker:
         off = judge.settling.target_counts - reading.position_counts
         self._fail(f"{command.verb} did not settle: {off} counts off", settled=False)
 
-    def look_at_s(self, at_s: float) -> float | None:
+    def next_reading_s(self, at_s: float) -> float | None:
         """Return when to read the axis so that the end of its motion is seen in time; None when there is none soon.
 
         Args:
@@ -406,7 +406,7 @@ class AxisTracker:
             return ends_at_s
         if not judge.begun and at_s > ends_at_s + judge.settling.timeout_s:
             return None  # not as planned: the ordinary polls tell
-        return at_s + max(judge.settling.time_s / 2, LEAST_LOOK_S)
+        return at_s + max(judge.settling.time_s / 2, SHORTEST_READING_PAUSE_S)
 
     def refuse_reference(self, reason: str) -> None:
         """The reference that an earlier daemon has kept does not hold: a warning until there is another one."""

@@ -16,7 +16,7 @@ from ldcnd.errors import ValueOutOfRange
 
 SHARES = (1.0, 0.995, 0.98, 0.96, 0.93, 0.9, 0.8, 0.7, 0.6, 0.5)
 """Of an acceleration, tried one after another until the register that is nearest to it keeps the limit."""
-LOOKS = 64
+INSTANTS = 64
 """Instants between two corners of the profiles at which the deviation is worked out."""
 
 
@@ -149,8 +149,8 @@ def deviation_of(profiles: Sequence[Profile], skew_s: float = 0.0) -> float:
     )
     farthest = 0.0
     for begin_s, end_s in pairwise(corners):
-        for look in range(LOOKS + 1):
-            at_s = begin_s + (end_s - begin_s) * look / LOOKS
+        for number in range(INSTANTS + 1):
+            at_s = begin_s + (end_s - begin_s) * number / INSTANTS
             farthest = max(farthest, _off_line([profile.at(at_s) for profile in profiles], along))
     late = (
         profile.acceleration * profile.ramp_s * skew_s * math.sqrt(max(0.0, 1.0 - share * share))

@@ -12,7 +12,7 @@ from ldcnd.daemon.capture.captures import CaptureStore, Run, Snapshot, capture_o
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 
-LOOK_S = 0.2
+CHECK_PERIOD_S = 0.2
 AFTERMATH_S = 0.5
 PAUSE_S = 10.0
 
@@ -39,7 +39,7 @@ class CaptureWatch:
         """Watch until cancelled."""
         clock = self._run.clock
         while True:
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(CHECK_PERIOD_S)
             for line in self._rig.buses:
                 name = line.bus.settings.name
                 if clock.now_s() < self._last_s.get(name, -PAUSE_S) + PAUSE_S:

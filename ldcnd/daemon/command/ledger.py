@@ -230,9 +230,9 @@ def _content(command: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:
 
 log = get_logger("events")
 
-TOLD_AFTER_S = 0.005
+PUBLISHED_AFTER_S = 0.005
 """Longer than a command takes that is one exchange at 115200 baud and waits for another one."""
-UNTOLD_EVENTS = 64
+UNPUBLISHED_EVENTS = 64
 """With this many unpublished events, publish them at once."""
 KEPT_EVENTS = 1000
 PAGE_BYTES = 12_000
@@ -282,18 +282,18 @@ class EventLog:
         seq = self._sequence.get(entry.axis, 0)
         self._sequence[entry.axis] = seq + 1
         if not self._news:
-            self._loop.call_later(TOLD_AFTER_S, self.tell)
+            self._loop.call_later(PUBLISHED_AFTER_S, self.flush)
         self._news.append(_News(self._clock.now_ns(), seq, self._end, entry, error))
         self._end += 1
-        if len(self._news) >= UNTOLD_EVENTS:
-            self.tell()
+        if len(self._news) >= UNPUBLISHED_EVENTS:
+            self.flush()
 
-    def tell(self) -> None:
+    def flush(self) -> None:
         """Publish and log all unpublished events."""
         while self._news:
-            self._tell(self._news.popleft())
+            self._publish(self._news.popleft())
 
-    def _tell(self, news: _News) -> None:
+    def _publish(self, news: _News) -> None:
         entry, error, arrival = news.entry, news.error, news.entry.arrival
         event = CommandEvent(
             t=news.t,
@@ -326,7 +326,7 @@ class EventLog:
         code: str | None = None,
     ) -> None:
         """Enter what concerns an axis and is in no ledger: control that was lost or refused, a stop confirmed late."""
-        self.tell()
+        self.flush()
         seq = self._sequence.get(axis, 0)
         self._sequence[axis] = seq + 1
         event = CommandEvent(
@@ -371,7 +371,7 @@ class EventLog:
 
     def page(self, request: ReadEvents) -> EventList:
         """Return the requested events, as many as one reply takes."""
-        self.tell()
+        self.flush()
         oldest = self._end - len(self._kept)
         if request.from_number is None:
             matching = [event for event in self._kept if request.axis in (None, event.axis)]

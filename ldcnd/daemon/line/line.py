@@ -23,12 +23,12 @@ log = get_logger("bus")
 
 FIRST_RETRY_S = 0.5
 LONGEST_RETRY_S = 10.0
-FIRST_LOOK_S = 0.25
-LONGEST_LOOK_S = 2.0
+FIRST_SCAN_PAUSE_S = 0.25
+LONGEST_SCAN_PAUSE_S = 2.0
 """Longest pause between two scans for lost drives: a drive that powers up must be back within 3 s."""
 CAPTURING = frozenset({Verb.HOME, Verb.PROBE})
 """Commands that wait for a capture in the drive's home register."""
-LOOK_SHARE = 0.01
+SCAN_SHARE = 0.01
 """Share of the line's time for these scans; more where the longest pause requires it."""
 
 
@@ -181,7 +181,7 @@ class BusService:
                     await axis.recall(report)
             self.report, self._baud = report, report.baud
             self._connect(report)
-            await self._look_after()
+            await self._scan_for_lost_drives()
             self.report, self.problem = None, "the line was lost"
             self._up.clear()
             self._down.set()
@@ -211,12 +211,12 @@ class BusService:
                 return
             await self._send_pending_stops()
 
-    async def _look_after(self) -> None:
+    async def _scan_for_lost_drives(self) -> None:
         """Scan for drives that lost power and came back; return when the line is lost."""
-        pause_s = FIRST_LOOK_S
+        pause_s = FIRST_SCAN_PAUSE_S
         loop = asyncio.get_running_loop()
         while not await self._closed_within(pause_s):
-            pause_s = FIRST_LOOK_S
+            pause_s = FIRST_SCAN_PAUSE_S
             await self._send_pending_stops()
             if not self.network.incomplete():
                 continue
@@ -231,7 +231,7 @@ class BusService:
                 if axis.config.name in heard:
                     self._poll(axis, now_s)
             if not heard:
-                pause_s = min((now_s - began_s + self.bus.quarantine_s) / LOOK_SHARE, LONGEST_LOOK_S)
+                pause_s = min((now_s - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)
 
     async def _probe_stop_lane(self, period_s: float) -> None:
         """Keep measuring how long a stop would wait."""

@@ -129,7 +129,7 @@ class Daemon:
         commands are refused, what moves comes to rest, tokens go, lines close.
         """
         async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
-            declared.callback(self._dispatcher.events.tell)  # last of all
+            declared.callback(self._dispatcher.events.flush)  # last of all
             leases = self._dispatcher.leases
             leases.group = group
             requests = Requests(self.rig, self._keys, group, self._dispatcher)

@@ -33,7 +33,7 @@ from ldcnd.log import get_logger
 log = get_logger("ldcn")
 
 UNADDRESSED = 0
-LOOKS_FOR_STRAYS = 3
+STRAY_SCANS = 3
 """Number of scans for each possible stray at its rate and address."""
 MOTION_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 WATCH_S = 0.5
@@ -306,7 +306,7 @@ class Rejoin:
 
     def _suspect(self, missing: Iterable[int]) -> None:
         strays = [(self._rate.at_reset, address) for address in missing]
-        self._strays = deque([(self._rate.working, UNADDRESSED), *strays] * LOOKS_FOR_STRAYS if strays else [])
+        self._strays = deque([(self._rate.working, UNADDRESSED), *strays] * STRAY_SCANS if strays else [])
 
     async def _at_reset_baud(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
         """Address newcomers at the rate of power-up; all modules that receive are at the working rate afterwards."""

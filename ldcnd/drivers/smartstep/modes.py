@@ -30,7 +30,7 @@ LEAVE_S = 5.0
 """Leaving a mode takes no longer, whatever the line does."""
 ENTER_ATTEMPTS = 3
 EXECUTE_ATTEMPTS = 5
-CLEAR_LOOK_S = 0.05
+CLEAR_CHECK_PERIOD_S = 0.05
 CLEAR_S = 2.0
 """Longest time for a counter clear after its execute, in seconds; the manual gives none."""
 CLEAR_MODES = (OperatingMode.COMMAND_COUNTER_CLEAR, OperatingMode.FEEDBACK_COUNTER_CLEAR)
@@ -230,4 +230,4 @@ async def _wait_until_done(words: Words) -> None:
                 axis=words.axis,
                 remedy=Remedy("{} again", step("clear_counter")),
             )
-        await asyncio.sleep(CLEAR_LOOK_S)
+        await asyncio.sleep(CLEAR_CHECK_PERIOD_S)

@@ -46,7 +46,7 @@ LONGEST_BACKOFF_S = 10.0
 NEVER_S = float("inf")
 STRAY_WAIT_S = 0.3
 """A drive that received its own reply has answered by then: its longest response time and some margin."""
-HURRIED_S = 0.5
+ALARM_HISTORY_PAUSE_S = 0.5
 """Between two words of an alarm history that is wanted now: others of the line hardly notice."""
 PUT_OFF_S = 1.0
 """Longer than an exchange takes beside the drive's response; not for ever, because the bus keeps the date till then."""
@@ -341,7 +341,7 @@ class UnitPoller(Poller[int | Refusal]):
         self._history_place += 1
         if self._history_place < HISTORY_LENGTH:
             if self._hurries_history:
-                self._due_s[Basic.ALARM_HISTORY] = now_s + HURRIED_S
+                self._due_s[Basic.ALARM_HISTORY] = now_s + ALARM_HISTORY_PAUSE_S
             return
         self._history_place = 0
         self._hurries_history = False

@@ -91,9 +91,9 @@ from ldcnd.model.traces import DriveTraceInfo, TakeTrace, TracePhase, TraceSourc
 
 log = get_logger("smartstep")
 
-LOOK_S = 0.2
+CHECK_PERIOD_S = 0.2
 """Pause between two readings of the operating mode, seconds."""
-LAST_LOOK_S = 0.02
+LAST_CHECK_PERIOD_S = 0.02
 """The same when the trace is about to end: what was ended from elsewhere just before differs from it then."""
 GRACE_S = 1.0
 LAST_READING_S = 5.0
@@ -463,9 +463,9 @@ class ArmedSmartStep(ArmedTrace):
     def _pause_s(self) -> float:
         """Return the time to the next reading of the mode: short around the end, where it can be foreseen."""
         if self._setup.trigger:
-            return LOOK_S
+            return CHECK_PERIOD_S
         ends_at_s = self._execution.replied_s + POINTS * self._setup.interval_s
-        return min(LOOK_S, max(LAST_LOOK_S, ends_at_s - 3 * LAST_LOOK_S - self._loop.time()))
+        return min(CHECK_PERIOD_S, max(LAST_CHECK_PERIOD_S, ends_at_s - 3 * LAST_CHECK_PERIOD_S - self._loop.time()))
 
     def _require_complete(self, ended_at_s: float) -> None:
         """Refuse a trace that was over before its points can have been taken.

@@ -26,7 +26,7 @@ ROUNDS = 4
 
 REPORTED_EACH = 0.01
 """Least growth of the share that has been read between two reports."""
-IDLE_LOOK_S = 0.005
+IDLE_PERIOD_S = 0.005
 LONGEST_REST_S = 5.0
 """Maximum pause between two pieces on a line that is never idle, seconds; in it others send some 700 characters."""
 
@@ -114,6 +114,6 @@ class TraceUpload:
         statistics = self._bus.statistics
         while loop.time() < at_the_latest_s:
             before = statistics.exchanges
-            await asyncio.sleep(IDLE_LOOK_S)
+            await asyncio.sleep(IDLE_PERIOD_S)
             if self._bus.is_idle and statistics.exchanges == before:
                 return

@@ -39,11 +39,11 @@ MARGIN_S = 0.05
 EXCHANGES = 100
 READINGS = 20
 MOST_ADDRESS = 32
-NOBODY = 127
+UNUSED_ADDRESS = 127
 """An address that the daisy chain never gives."""
 MOST_COUNTS = 100_000
 LONGEST_MOVE_S = 10.0
-LOOK_S = 0.02
+CHECK_PERIOD_S = 0.02
 STILL_COUNTS = 2
 """Maximum deviation of a servo that holds, counts."""
 EVERYTHING = StatusItem(0xFF)
@@ -155,7 +155,7 @@ async def accept(
     line = _Line(bus)
     found = await line.find()
     if not found:
-        yield await line.nobody()
+        yield await line.silence()
         return
     for address, identity in found.items():
         drive = _Drive(bus, address, identity)
@@ -193,7 +193,7 @@ class _Line:
         await self._rate.host_to(RESET_BAUD)
         return {}
 
-    async def nobody(self) -> Finding:
+    async def silence(self) -> Finding:
         """Say why nothing can be tried."""
         try:
             await self._bus.execute(once(read_identity(UNADDRESSED.address)))
@@ -264,7 +264,7 @@ class _Drive:
         readings = []
         for _ in range(READINGS):
             readings.append(await self._bus.execute(commands.read_status(self._node, MOTION)))
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(CHECK_PERIOD_S)
         positions = [reading.position or 0 for reading in readings]
         fast = max(abs(reading.velocity or 0) for reading in readings)
         seen = f"positions {min(positions)} to {max(positions)}, velocity up to {fast} counts a tick"
@@ -284,10 +284,10 @@ class _Drive:
     async def silence(self) -> Finding:
         """See `ASSUMPTIONS`."""
         try:
-            await self._bus.execute(once(read_identity(NOBODY)))
+            await self._bus.execute(once(read_identity(UNUSED_ADDRESS)))
         except (ReplyTimeout, OutcomeUnknown):
-            return self._finding("silence", f"no drive answered at address {NOBODY}", confirmed=True)
-        return self._finding("silence", f"a drive answers at address {NOBODY}", confirmed=False)
+            return self._finding("silence", f"no drive answered at address {UNUSED_ADDRESS}", confirmed=True)
+        return self._finding("silence", f"a drive answers at address {UNUSED_ADDRESS}", confirmed=False)
 
 
 # -- moving ----------------------------------------------------------------------------------------------------------
@@ -398,7 +398,7 @@ class _Trial:
             seen.append(await self._look())
             if until(seen[-1]):
                 return seen
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(CHECK_PERIOD_S)
         raise LdcndError(f"the move took longer than {LONGEST_MOVE_S:g} s")
 
     async def _settled(self) -> list[Status]:
@@ -406,7 +406,7 @@ class _Trial:
         for _ in range(READINGS):
             self._require_held()
             seen.append(await self._look())
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(CHECK_PERIOD_S)
         return seen
 
     async def _look(self) -> Status:

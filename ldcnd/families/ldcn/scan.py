@@ -211,10 +211,10 @@ class LineScan:
             for baud in self._waiting
         ]
         if not found and not self._waiting:
-            findings.append(self._nobody())
+            findings.append(self._no_answer())
         return findings
 
-    def _nobody(self) -> Finding:
+    def _no_answer(self) -> Finding:
         received = self._bus.statistics.bytes_in
         if received:
             text = f"no module answers in words, but {received} bytes came back: two modules at one address, or noise"

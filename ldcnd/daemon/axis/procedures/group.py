@@ -78,7 +78,7 @@ class Rendezvous(ABC):
         self._asked = (names, *asked)
         self._missing = set(names)
         self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._started.add_done_callback(_look)
+        self._started.add_done_callback(_retrieve)
 
     @override
     def __eq__(self, other: object) -> bool:
@@ -242,7 +242,7 @@ class GroupMember(Procedure):
         motion.publish_state()
 
 
-def _look(started: "asyncio.Future[None]") -> None:
+def _retrieve(started: "asyncio.Future[None]") -> None:
     """Retrieve an error that no member waits for, so that asyncio does not report it."""
     if not started.cancelled():
         started.exception()
