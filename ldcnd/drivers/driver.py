@@ -11,8 +11,7 @@ from enum import Enum
 from typing import Any
 
 from ldcnd.bus.poller import Poller
-from ldcnd.drivers.monitor_value import MonitorValue
-from ldcnd.drivers.parameter_access import ParameterAccess
+from ldcnd.drivers.parameter_access import MonitorValue, ParameterAccess
 from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BusError
 from ldcnd.exchange import Exchange, Timing

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.capture.captures import lines_of
+from ldcnd.daemon.capture import lines_of
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.replay import config_of, play, published_line, virtual_time
 from ldcnd.messaging.memory_session import MemoryBroker

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drivers.driver import Fault
-from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import MoveAbsolute
 from ldcnd.model.samples import AxisState, MonitorName, Quality, TelemetryItem

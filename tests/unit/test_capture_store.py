@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from structlog.testing import capture_logs
 
-from ldcnd.daemon.capture.captures import CaptureStore
+from ldcnd.daemon.capture import CaptureStore
 from ldcnd.wirelog.capture import Capture, parse_capture
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.unit.test_capture import HEADER, RECORDS

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.reload import plan_reload
+from ldcnd.daemon.process.service import plan_reload
 from ldcnd.errors import ConfigError
 
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"

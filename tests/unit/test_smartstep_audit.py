@@ -1,6 +1,6 @@
 """What the audit of a drive's parameters takes for a change by another program."""
 
-from ldcnd.drivers.smartstep.parameter_audit import ParameterAudit
+from ldcnd.drivers.smartstep.drive import ParameterAudit
 from ldcnd.drivers.smartstep.parameters import PARAMETERS
 from ldcnd.model.parameters import Memory, ParameterValue
 

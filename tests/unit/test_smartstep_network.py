@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from ldcnd.drivers.driver import AxisReading, Fault, Homes, Moves, ReadingListeners, TakesGains, Tracks
-from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode
 from ldcnd.drivers.smartstep.commands import reference
 from ldcnd.drivers.smartstep.network import SmartStepPort

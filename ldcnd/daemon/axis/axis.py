@@ -37,8 +37,8 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
 from ldcnd.daemon.trace.recorder import TraceRecorder
 from ldcnd.drivers.driver import AxisReading, Drive, Fault, Moves, Readable, Records, StopMode, parameters_of
-from ldcnd.drivers.monitor_value import MonitorValue
 from ldcnd.drivers.network import BringUpReport
+from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests, WrongState
 from ldcnd.exchange import Timing

@@ -7,7 +7,7 @@ from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.state import NOT_SETTLED, QUALITIES, ActiveCommand, AxisTracker, StateShown
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisReading
-from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.log import get_logger
 from ldcnd.model.events import UNSETTLED, CommandStatus
 from ldcnd.model.samples import CurrentCommand, FaultEntry, LatchSample, Quality, TelemetryItem

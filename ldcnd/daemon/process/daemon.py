@@ -8,8 +8,7 @@ from typing import Any
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.daemon.capture.captures import CaptureStore, Run, capture_of, snapshot_of
-from ldcnd.daemon.capture.watch import CaptureWatch
+from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, snapshot_of
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.dispatch import Dispatcher, EarlyStops, Requests
 from ldcnd.daemon.command.leases import apply_policy

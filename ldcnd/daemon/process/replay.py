@@ -13,7 +13,7 @@ from itertools import pairwise
 from pydantic import ValidationError
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.capture.captures import of_one_line
+from ldcnd.daemon.capture import of_one_line
 from ldcnd.daemon.command.dispatch import STOP
 from ldcnd.daemon.command.leases import random_token
 from ldcnd.daemon.process.assembly import build_daemon

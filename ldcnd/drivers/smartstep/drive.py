@@ -22,8 +22,7 @@ from ldcnd.drivers.driver import (
     ReadingListeners,
     Records,
 )
-from ldcnd.drivers.monitor_value import MonitorValue
-from ldcnd.drivers.parameter_access import ParameterAccess
+from ldcnd.drivers.parameter_access import MonitorValue, ParameterAccess
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.monitors import (
     INPUT_SIGNALS,
@@ -42,8 +41,8 @@ from ldcnd.drivers.smartstep.monitors import (
     run_is_on,
     signed_word,
 )
-from ldcnd.drivers.smartstep.parameter_audit import ParameterAudit
 from ldcnd.drivers.smartstep.parameter_store import EepromRules, UnitParameters
+from ldcnd.drivers.smartstep.parameters import PARAMETERS
 from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller, UnitWords
 from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drivers.smartstep.trace import SmartStepTracer
@@ -52,7 +51,55 @@ from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model.catalogue import verbs_for
 from ldcnd.model.commands import Capability
+from ldcnd.model.parameters import Memory, ParameterValue
 from ldcnd.model.samples import MonitorName, TelemetryItem
+
+
+class ParameterAudit:
+    """The expected value of each parameter of one drive, from its first reading on: whether they are what they were.
+
+    A drive that was reset has again what its EEPROM holds; one that another program, or the handheld unit, has changed
+    has something else. Only values in use are compared: those in EEPROM act from the next power-on on, and show then.
+    """
+
+    def __init__(self) -> None:
+        self._held: dict[str, int] = {}
+        self._stored: dict[str, int] = {}  # what this host has written to EEPROM: in use after the next power-on
+        self._odd: tuple[str, int] | None = None  # not believed before it reads the same again
+        self._found: dict[str, int] = {}
+
+    @property
+    def differences(self) -> str:
+        """Say what differs; empty when nothing does."""
+        return "; ".join(
+            f"{label} is {value} and was {self._held[label]}" for label, value in sorted(self._found.items())
+        )
+
+    def read(self, place: int, value: int) -> bool:
+        """Take the value in use of `PARAMETERS[place]`; return whether it has to be read again at once."""
+        label = PARAMETERS[place].label
+        if value == self._stored.get(label):
+            self._held[label] = value
+        if value == self._held.setdefault(label, value):
+            self._found.pop(label, None)
+        elif self._found.get(label) != value:
+            if self._odd != (label, value):
+                self._odd = (label, value)
+                return True
+            self._found[label] = value
+        self._odd = None
+        return False
+
+    def wrote(self, value: ParameterValue, memory: Memory) -> None:
+        """This host has written a parameter, or found there what it was to write: that is expected from now on."""
+        label = value.parameter
+        self._held[label] = value.active
+        self._found.pop(label, None)
+        if memory is Memory.EEPROM:
+            self._stored[label] = value.stored
+        else:
+            self._stored.pop(label, None)  # a reset would undo it
+
 
 log = get_logger("smartstep")
 

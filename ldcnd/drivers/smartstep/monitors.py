@@ -17,7 +17,7 @@ from enum import Enum, IntEnum, IntFlag, StrEnum
 from types import MappingProxyType
 from typing import ClassVar
 
-from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
 from ldcnd.model.samples import MonitorName

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
-from ldcnd.drivers.monitor_value import MonitorValue
-from ldcnd.drivers.parameter_access import ClearedCounter, ParameterAccess, Written
+from ldcnd.drivers.parameter_access import ClearedCounter, MonitorValue, ParameterAccess, Written
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import write_eeprom, write_ram
 from ldcnd.drivers.smartstep.ledger import EEPROM_LIFE, WARNING_WRITES, EepromLedger

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
-from ldcnd.drivers.monitor_value import MonitorValue
+from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.drivers.smartstep.addresses import Register
 from ldcnd.drivers.smartstep.commands import Refusal, is_self_hearing, reference, with_response_time
 from ldcnd.drivers.smartstep.monitors import (

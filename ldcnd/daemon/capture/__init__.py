@@ -1,4 +1,0 @@
-"""Captures of a line on disk, and their causes.
-
-Serves operators who search for a fault. Start with `captures.py`.
-"""
