@@ -168,7 +168,21 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Registers of the position loop, as in the drive's manual."""
+    """Registers of the position loop, as in the manuals of the drives (Set Gain).
+
+    Attributes:
+        kp: position gain, 0 to 0x7FFF.
+        kd: derivative gain, 0 to 0x7FFF.
+        ki: integral gain, 0 to 0x7FFF.
+        il: integration limit, 0 to 0x7FFF; the drive multiplies it by 256.
+        ol: PWM output limit, 0 to 255; the LS-182AP manual recommends 250.
+        cl: current limit, 0 to 255, odd when the sense voltage rises with the current; 0 is off, and the only value on
+            Logosol drives.
+        el: position error limit, 0 to 0x3FFF counts; 0x7FFF on PIC-SERVO SC.
+        sr: servo rate divisor, 1 to 255.
+        deadband: amplifier deadband compensation, 0 to 255; 0 on PIC-SERVO versions 1 to 3.
+        step_multiplier: 1 to 255; 1 on everything but PIC-SERVO SC.
+    """
 
     kp: int
     kd: int
@@ -178,7 +192,8 @@ class Gains:
     cl: int
     el: int
     sr: int
-    deadband: int
+    deadband: int = 0
+    step_multiplier: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,10 @@ import pytest
 
 from ldcnd.config.begun import begun_with, write
 from ldcnd.config.rig import load_config
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.addressing import NULLS
 from ldcnd.drivers.ldcn.packet import Command, PacketReader
-from ldcnd.drivers.ldcn.registers import RESET_BAUD, Gains
+from ldcnd.drivers.ldcn.registers import RESET_BAUD
 from ldcnd.errors import ConfigError
 from ldcnd.families.known import FAMILIES
 from ldcnd.families.opened import with_line

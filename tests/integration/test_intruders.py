@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import LoadTrajectory, ResetPosition, SetGain, SetHomingMode, StopMotor
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.events import DRIVE_CHANGED, CommandEvent, ReadEvents

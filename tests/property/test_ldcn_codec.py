@@ -5,6 +5,7 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.packet import (
@@ -23,7 +24,6 @@ from ldcnd.drivers.ldcn.packet import (
 )
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile, Support
 from ldcnd.drivers.ldcn.received import LoadTrajectory, SetGain, decode_command
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.trajectory import (
     ProfileMode,
     Trajectory,

@@ -5,8 +5,8 @@ from dataclasses import replace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode
 from ldcnd.sim.ldcn.power import Condition, Trip
 from ldcnd.sim.ldcn.servo import HomeSearch, ServoLoop

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.packet import Command, Status, StatusFlag
-from ldcnd.drivers.ldcn.registers import Gains, encode_gains
+from ldcnd.drivers.ldcn.registers import encode_gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.errors import DriveFault
 from ldcnd.sim.plant import MotorPlant
 from ldcnd.tuning.ldcn.design import Proposal, duration_s, propose, stiff_gains, within_authority

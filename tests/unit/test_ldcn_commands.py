@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Group, Node
 from ldcnd.drivers.ldcn.controls import HomingControl, IoOption, LimitPins, StopControl
 from ldcnd.drivers.ldcn.packet import Status, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, actual_baud
+from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
 from ldcnd.exchange import ReplyVerdict

@@ -2,6 +2,7 @@
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
 from ldcnd.drivers.ldcn.profiles import PROFILES
@@ -20,7 +21,6 @@ from ldcnd.drivers.ldcn.received import (
     interpret,
     interpret_bytes,
 )
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply
 

@@ -2,9 +2,9 @@
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.packet import AuxFlag, StatusFlag
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, SimulatedAxis

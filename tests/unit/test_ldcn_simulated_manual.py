@@ -5,9 +5,10 @@ from itertools import pairwise
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Packet, StatusFlag, encode_packet
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, Gains
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.power import Condition, Trip

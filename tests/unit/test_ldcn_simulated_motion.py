@@ -2,9 +2,9 @@
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.drivers.ldcn.trajectory import Trajectory
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant

@@ -4,12 +4,13 @@ from itertools import pairwise
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.commands import Node, add_path_points, start_path
 from ldcnd.drivers.ldcn.controls import IoOption, StopControl
 from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
 from ldcnd.drivers.ldcn.path import PathPoint, decode_point, encode_point
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import FRACTION, Gains, encode_gains
+from ldcnd.drivers.ldcn.registers import FRACTION, encode_gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn import commands, pic_io
 from ldcnd.drivers.ldcn.commands import Group, Node
 from ldcnd.drivers.ldcn.controls import IoOption, LimitPins, StartUp
@@ -40,7 +41,7 @@ from ldcnd.drivers.ldcn.received import (
     decode_command,
     interpret_bytes,
 )
-from ldcnd.drivers.ldcn.registers import BAUD_DIVISORS, BaudCodes, Gains, baud_divisor, module_baud
+from ldcnd.drivers.ldcn.registers import BAUD_DIVISORS, BaudCodes, baud_divisor, module_baud
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, ValueOutOfRange
 

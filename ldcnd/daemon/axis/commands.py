@@ -480,7 +480,7 @@ class AxisCommands:
     async def _set_gains(self, permit: Permit, request: SetGains) -> CommandReply:
         tracker = self._tracker
         guards.check_reachable(tracker)
-        asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name)) is not None}
+        asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
         if self._gains is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
                 f"axis {self._config.name} has no gains yet",
@@ -488,7 +488,7 @@ class AxisCommands:
                 remedy=Remedy("{}", step("set_gains", "send at least kp and el")),
             )
         gains = self._gains or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
-        changed = Gains(**{name: asked.get(name, getattr(gains, name)) for name in Gains.__slots__})
+        changed = replace(gains, **asked)
         if changed.sr != gains.sr:
             guards.check_stands(tracker)
         self._check_tracking_step(changed)

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Generic, TypeVar
 
 from ldcnd.bus.settings import HOST_LATE_S
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import (
     HomingControl,
     IoOption,
@@ -44,7 +45,7 @@ from ldcnd.drivers.ldcn.packet import (
 )
 from ldcnd.drivers.ldcn.path import PathPoint, encode_points
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, Gains, baud_divisor, encode_gains
+from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, baud_divisor, encode_gains
 from ldcnd.drivers.ldcn.trajectory import Trajectory, encode_trajectory
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.exchange import Exchange, ReplyVerdict

@@ -8,13 +8,14 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import NULLS, NULLS_SETTLE_S, read_identity
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
 from ldcnd.drivers.ldcn.packet import StatusItem
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PROFILES, Support, at_clock
-from ldcnd.drivers.ldcn.registers import BaudCodes, Gains, actual_baud, baud_divisor
+from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_divisor
 from ldcnd.drivers.ldcn.servo import reading_items
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.drivers.price_list import PriceList

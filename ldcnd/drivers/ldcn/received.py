@@ -7,6 +7,7 @@ Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-
 
 from dataclasses import dataclass, field
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.commands import COMMON_COMMANDS
 from ldcnd.drivers.ldcn.controls import HomingControl, PositionReset, StopControl
 from ldcnd.drivers.ldcn.packet import (
@@ -21,7 +22,7 @@ from ldcnd.drivers.ldcn.packet import (
 )
 from ldcnd.drivers.ldcn.pic_io import DATA_BYTES, IoCommand, decode_io_command
 from ldcnd.drivers.ldcn.profiles import DeviceKind, Profile, Support
-from ldcnd.drivers.ldcn.registers import Gains, decode_gains
+from ldcnd.drivers.ldcn.registers import decode_gains
 from ldcnd.drivers.ldcn.trajectory import Trajectory, TrajectoryControl, decode_trajectory, trajectory_bytes
 from ldcnd.errors import BadReply
 

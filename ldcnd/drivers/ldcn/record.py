@@ -6,7 +6,7 @@ Sources: LS-182AP manual, "Power-up and Reset Conditions", "Set Gain", "Load Tra
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 from ldcnd.drivers import driver
 from ldcnd.drivers.driver import AxisReading, Register
@@ -283,8 +283,3 @@ class RegisterBook:
         for name, value in values.items():
             if name in self._registers:
                 self._registers[name] = Register(name, int(value), provenance)
-
-
-def gain_values(gains: driver.Gains) -> dict[str, int]:
-    """Return what Set Gain writes."""
-    return asdict(gains)

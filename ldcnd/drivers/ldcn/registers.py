@@ -4,10 +4,10 @@ Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Condi
 calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
-from dataclasses import dataclass
 from enum import Enum
 from types import MappingProxyType
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.packet import Field
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
@@ -96,36 +96,6 @@ _STEP_MULTIPLIER = Field("step multiplier", 1, 1, 0xFF)
 
 BYTES_WITH_DEADBAND = 14
 _BYTES_WITH_STEP_MULTIPLIER = 15
-
-
-@dataclass(frozen=True, slots=True)
-class Gains:
-    """The registers of Set Gain.
-
-    Attributes:
-        kp: position gain, 0 to 0x7FFF.
-        kd: derivative gain, 0 to 0x7FFF.
-        ki: integral gain, 0 to 0x7FFF.
-        il: integration limit, 0 to 0x7FFF; the drive multiplies it by 256.
-        ol: PWM output limit, 0 to 255; the LS-182AP manual recommends 250.
-        cl: current limit, 0 to 255, odd when the sense voltage rises with the current; 0 is off, and the only value on
-            Logosol drives.
-        el: position error limit, 0 to 0x3FFF counts; 0x7FFF on PIC-SERVO SC.
-        sr: servo rate divisor, 1 to 255.
-        deadband: amplifier deadband compensation, 0 to 255; 0 on PIC-SERVO versions 1 to 3.
-        step_multiplier: 1 to 255; 1 on everything but PIC-SERVO SC.
-    """
-
-    kp: int
-    kd: int
-    ki: int
-    il: int
-    ol: int
-    cl: int
-    el: int
-    sr: int
-    deadband: int = 0
-    step_multiplier: int = 1
 
 
 def encode_gains(profile: Profile, gains: Gains) -> bytes:

@@ -19,13 +19,13 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
-from ldcnd.drivers import driver
 from ldcnd.drivers.driver import (
     LARGEST_COUNT,
     AnalogMotion,
     AxisReading,
     AxisSpec,
     Evidence,
+    Gains,
     HasOutputs,
     HomeCapture,
     Homes,
@@ -49,8 +49,8 @@ from ldcnd.drivers.ldcn.faults import FaultCode, sensor_lost
 from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
-from ldcnd.drivers.ldcn.record import LIMIT_PINS, DriveState, RegisterBook, gain_values
-from ldcnd.drivers.ldcn.registers import FRACTION, Gains
+from ldcnd.drivers.ldcn.record import LIMIT_PINS, DriveState, RegisterBook
+from ldcnd.drivers.ldcn.registers import FRACTION
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
 from ldcnd.errors import (
     BadReply,
@@ -224,7 +224,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         else:
             self.state.taken_over(status)
             self._path_option_known = False
-        self._book.assume(gain_values(self._gains) if self._gains else {})
+        self._book.assume(asdict(self._gains) if self._gains else {})
         if self._gains:
             self.state.servo_divisor = self._gains.sr
         self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
@@ -720,9 +720,9 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
     # -- registers ---------------------------------------------------------------------------------------------------
 
     @override
-    async def set_gains(self, gains: driver.Gains) -> None:
-        exchange = commands.set_gain(self._node, Gains(**asdict(gains)))
-        values = gain_values(gains)
+    async def set_gains(self, gains: Gains) -> None:
+        exchange = commands.set_gain(self._node, gains)
+        values = asdict(gains)
         self._book.invalidate(values)
         await self._bus.execute(exchange)
         self._book.wrote(values)

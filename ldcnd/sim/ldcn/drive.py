@@ -17,6 +17,7 @@ Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3; PIC
 
 from dataclasses import dataclass, replace
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.controls import (
     EXCLUSIVE_OPTIONS,
     HomingControl,
@@ -38,7 +39,7 @@ from ldcnd.drivers.ldcn.received import (
     SetHomingMode,
     StopMotor,
 )
-from ldcnd.drivers.ldcn.registers import FRACTION, Gains
+from ldcnd.drivers.ldcn.registers import FRACTION
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage, ScPower

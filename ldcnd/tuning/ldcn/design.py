@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.tuning.ldcn.identify import Identified
 from ldcnd.tuning.ldcn.plant import FULL_PWM, Plant

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.tuning.ldcn.plant import Plant
 
 REST_S = 0.1

@@ -16,8 +16,8 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.errors import DriveFault, ValueOutOfRange
 from ldcnd.tuning.ldcn.plant import FULL_PWM
 from ldcnd.tuning.ldcn.response import Move, Start

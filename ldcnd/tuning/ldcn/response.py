@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, Gains
+from ldcnd.drivers.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.power import PicServoPower
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.ldcn.servo import ServoLoop

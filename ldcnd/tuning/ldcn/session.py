@@ -27,8 +27,8 @@ from ldcnd.client.kept_gains import (
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.errors import (
     DriveFault,
     LdcndError,

@@ -10,8 +10,8 @@ import pydantic
 from ldcnd import durable
 from ldcnd.client.kept_gains import gains_in
 from ldcnd.client.rig_client import RigClient
+from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
-from ldcnd.drivers.ldcn.registers import Gains
 from ldcnd.errors import ConfigError, NotSupported, WrongState
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
