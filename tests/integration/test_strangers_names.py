@@ -6,7 +6,7 @@ import pytest
 import structlog
 from structlog.testing import capture_logs
 
-from ldcnd.daemon.command import requests
+from ldcnd.daemon.command import dispatch as requests
 from ldcnd.errors import ErrorCode
 from ldcnd.model.events import ReadEvents
 from ldcnd.printable import is_printable
