@@ -10,7 +10,7 @@ from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
 from ldcnd.drivers.ldcn.commands import spaced
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.line import GroupSpec, LineSpec, StartPolicy
+from ldcnd.drivers.network import GroupSpec, LineSpec, StartPolicy
 from ldcnd.errors import (
     BusError,
     ConfigError,

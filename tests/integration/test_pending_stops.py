@@ -13,7 +13,7 @@ from ldcnd.daemon.axis.state import STOP_UNCONFIRMED
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.drivers.driver import StopMode
 from ldcnd.drivers.ldcn.packet import Command, PacketReader
-from ldcnd.drivers.line import AdoptFallback, StartPolicy
+from ldcnd.drivers.network import AdoptFallback, StartPolicy
 from ldcnd.errors import BusDown, StopLatched, WrongState
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset

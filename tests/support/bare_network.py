@@ -11,7 +11,7 @@ from ldcnd.drivers.driver import AxisSpec, Gains
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.packet import Packet, PacketReader
 from ldcnd.drivers.ldcn.registers import RESET_BAUD
-from ldcnd.drivers.line import LineSpec
+from ldcnd.drivers.network import LineSpec
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.transport.transport import Transport

@@ -8,8 +8,7 @@ from ldcnd.bus.settings import BusSettings
 from ldcnd.drivers.driver import AxisSpec
 from ldcnd.drivers.ldcn.network import LdcnNetwork
 from ldcnd.drivers.ldcn.profiles import Support
-from ldcnd.drivers.line import LineSpec, ModuleEntry
-from ldcnd.drivers.network import BringUpReport
+from ldcnd.drivers.network import BringUpReport, LineSpec, ModuleEntry
 from ldcnd.errors import NetworkMismatch
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.module import SimulatedModule

@@ -10,7 +10,7 @@ from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.profiles import PIC_SERVO_V4
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.line import GroupSpec
+from ldcnd.drivers.network import GroupSpec
 from ldcnd.errors import DriveFault, NotSupported, OutcomeUnknown, ReplyTimeout, StopLatched, WrongState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.direct_bus import DirectBus

@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn.commands import Node, read_status
 from ldcnd.drivers.ldcn.packet import Command, StatusItem
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import actual_baud
-from ldcnd.drivers.line import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
+from ldcnd.drivers.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
 from ldcnd.errors import NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
 from ldcnd.model.commands import HomeMethod
 from ldcnd.sim.chain import Chain

@@ -18,7 +18,7 @@ from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drivers.ldcn.packet import Status, StatusItem, decode_status
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
 from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset
-from ldcnd.drivers.line import GroupSpec
+from ldcnd.drivers.network import GroupSpec
 from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.exchange import Exchange
 

@@ -27,8 +27,7 @@ from ldcnd.drivers.ldcn.pic_io import (
     read_io_status,
     send_io_command,
 )
-from ldcnd.drivers.line import ModuleEntry
-from ldcnd.drivers.network import IoDriver, IoReading
+from ldcnd.drivers.network import IoDriver, IoReading, ModuleEntry
 from ldcnd.errors import BusError, ValueOutOfRange, WrongState
 from ldcnd.exchange import Exchange, Timing
 

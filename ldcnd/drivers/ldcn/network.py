@@ -37,8 +37,16 @@ from ldcnd.drivers.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, Status, StatusI
 from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Support, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.line import AdoptFallback, FoundModule, LineSpec, StartPolicy
-from ldcnd.drivers.network import BringUpReport, Instant, IoDriver, Network
+from ldcnd.drivers.network import (
+    AdoptFallback,
+    BringUpReport,
+    FoundModule,
+    Instant,
+    IoDriver,
+    LineSpec,
+    Network,
+    StartPolicy,
+)
 from ldcnd.errors import BusError, NetworkMismatch
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.log import get_logger

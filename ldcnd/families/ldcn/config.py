@@ -11,7 +11,7 @@ from ldcnd.config.toml import DeviceIdentity, Name
 from ldcnd.drivers.driver import AxisSpec, Gains
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
 from ldcnd.drivers.ldcn.registers import baud_divisor
-from ldcnd.drivers.line import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
+from ldcnd.drivers.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.frozen import Frozen
 
