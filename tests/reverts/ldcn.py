@@ -201,8 +201,8 @@ REVERTS = (
     ),
     revert(
         LDCN + "packet.py",
-        "        velocity = profile.velocity_sign * int.from_bytes(",
-        "        velocity = -int.from_bytes(",
+        "            None if velocity is None else sign * velocity,\n",
+        "            None if velocity is None else -velocity,\n",
         ("tests/integration/test_dialects.py::test_pic_servo_sc",),
     ),
     revert(
