@@ -1,32 +1,54 @@
-"""`ldcnd tune`: identify an axis, propose gains, apply and verify them when a person agrees."""
+"""`ldcnd tune`: gains for an axis, as the family of its drive finds them."""
 
-import sys
-from importlib.util import find_spec
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.figure import save_figure, stacked_rows
-from ldcnd.cli.output import FAILED
-from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError, WrongState
-from ldcnd.person import Left
+from ldcnd.errors import NotSupported, WrongState
+from ldcnd.families.known import FAMILIES
+from ldcnd.model.meta import AxisInfo
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
-    from ldcnd.client.kept_gains import KeptGains
-    from ldcnd.tuning.ldcn.guided import Tuned
+@dataclass(frozen=True, slots=True)
+class TuneOptions:
+    """What was typed; a family refuses what means nothing to its drives.
 
-ROWS = 2
-"""Of the picture: positions above, following errors below."""
-STYLES = {"new gains, predicted": "--", "command": ":k"}
+    Attributes:
+        bandwidth_hz: wanted crossover of the loop.
+        within: distance from where the axis stands, in its unit.
+        values: parameters to try, as `NAME=VALUE`.
+        record_s: duration of a record of a motion, seconds.
+        plot: picture to be drawn.
+        dry_run: only say what would be done.
+        yes: do not ask.
+    """
+
+    bandwidth_hz: float | None
+    within: float | None
+    values: tuple[str, ...]
+    record_s: float | None
+    plot: Path | None
+    dry_run: bool
+    yes: bool
+
+    def refuse(self, why: str, *names: str) -> None:
+        """Refuse options that were typed.
+
+        Raises:
+            click.BadParameter: one of them was; says why it means nothing.
+        """
+        options = {"bandwidth_hz": "--bandwidth", "within": "--within", "values": "--set", "record_s": "--record"}
+        for name in names:
+            if getattr(self, name):
+                raise click.BadParameter(why, param_hint=options.get(name, f"--{name}"))
 
 
 @click.command()
@@ -42,6 +64,19 @@ STYLES = {"new gains, predicted": "--", "command": ":k"}
     type=Finite(0, min_open=True),
     help="Stay within this distance of where the axis stands, in its unit; 2000 counts when missing.",
 )
+@click.option(
+    "--set",
+    "values",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Try this value of a parameter (drives whose gains are parameters).",
+)
+@click.option(
+    "--record",
+    "record_s",
+    type=Finite(0.5, 60),
+    help="Duration of a record of a motion, seconds (drives whose gains are parameters); 2 when missing.",
+)
 @click.option("--dry-run", is_flag=True, help="Say what it would do, and do nothing.")
 @click.option("--yes", is_flag=True, help="Do not ask before moving, nor before applying.")
 @click.option(
@@ -56,72 +91,55 @@ def command(
     axis: str,
     bandwidth_hz: float | None,
     within: float | None,
+    values: tuple[str, ...],
+    record_s: float | None,
     plot: Path | None,
     *,
     dry_run: bool,
     yes: bool,
     put_back: bool,
 ) -> None:
-    """Find gains for AXIS (LDCN and NMC drives): move it a little, identify it, propose, apply, verify.
+    """Find gains for AXIS: move it a little, identify it, propose, apply, verify.
 
-    The axis must be off and stay where it is then. It is off afterwards. What it will do is said before it moves; it
-    moves within the stated distance only. The old gains come back at Ctrl-C, on any fault, and when the new ones are
-    not better; if this program or its host dies, --put-back restores them. Needs the extra `tune`.
+    An axis whose gains are registers must be off and stay where it is then. It is off afterwards. What it will do is
+    said before it moves; it moves within the stated distance only. The old gains come back at Ctrl-C, on any fault, and
+    when the new ones are not better; if this program or its host dies, --put-back restores them. It needs the extra
+    `tune`.
+
+    A drive that tunes itself shows its auto-tuning and its gains. Those of --set are tried in its RAM, with a record of
+    a move before and after; the moves come from the machine.
     """
+    info = target.run(lambda client: axis_of(client, axis))
+    tuning = _of_family(info)
     if put_back:
-        kept = target.run(lambda client: _put_back(client, axis))
-        gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
-        target.show(kept, f"{axis}: off, with its old gains: {gains}")
+        kept = target.run(lambda client: _kept(client, axis))
+        tuning.put_back(target, kept)
         return
-    _require_numpy()
-    from ldcnd.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
-    from ldcnd.tuning.ldcn import plan as plans  # noqa: PLC0415 - likewise
-    from ldcnd.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
-
-    figure = stacked_rows(ROWS)[0] if plot else None  # missing matplotlib is said before anything moves
-    if dry_run:
-        plan = target.run(lambda client: plans.plan(client, axis, within))
-        target.show(reports.plan_reported(plan), *plan.lines, "Nothing was sent to the drive.")
-        return
-
-    async def tuned(client: RigClient) -> "Tuned | None":
-        await axis_of(client, axis)
-        person = AssentingPerson(None) if yes else TerminalPerson(None)
-        try:
-            return await guided.tune(client, person, axis, within, bandwidth_hz)
-        except Left:
-            return None
-
-    end_as_interrupted()
-    outcome = target.run(tuned)
-    if outcome is None:
-        raise click.Abort
-    report = outcome.report
-    if report.after is None and report.objection is None:
-        target.show(report)
-        raise click.Abort
-    if figure and plot:
-        _draw(figure, outcome)
-        save_figure(figure, plot)
-    target.show(report, *guided.table(report), *guided.ending(report))
-    if not report.applied:
-        sys.exit(FAILED)
+    tuning.tune(target, info, TuneOptions(bandwidth_hz, within, values, record_s, plot, dry_run, yes))
 
 
-def _require_numpy() -> None:
-    """Refuse to begin without the optional package.
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """What a family offers to this command.
 
-    Raises:
-        ConfigError: it is missing.
+    Attributes:
+        tune: all of it.
+        put_back: puts back gains that a tuning has left behind.
     """
-    if find_spec("numpy") is None:
-        raise ConfigError("tuning needs numpy; install it with: pip install 'ldcnd[tune]'")
+
+    tune: Callable[[Target, AxisInfo, TuneOptions], None]
+    put_back: Callable[[Target, KeptGains], None]
 
 
-async def _put_back(client: RigClient, axis: str) -> "KeptGains":
-    from ldcnd.client.kept_gains import file_of, kept_for, put_back  # noqa: PLC0415 - nothing else needs it
+def _of_family(info: AxisInfo) -> Tuning:
+    family = FAMILIES.get(info.family)
+    if family is None or not family.tuning:
+        raise NotSupported(f"axis {info.axis}: nothing is known here of tuning a {info.model}", axis=info.axis)
+    tuning = import_module(family.tuning)
+    return Tuning(tuning.tune, tuning.put_back)
 
-    await axis_of(client, axis)
+
+async def _kept(client: RigClient, axis: str) -> KeptGains:
     rig = Rig(client, await client.daemon())
     kept = kept_for(rig.name, axis)
     if kept is None:
@@ -130,21 +148,4 @@ async def _put_back(client: RigClient, axis: str) -> "KeptGains":
             axis=axis,
             remedy="type it on the host that tuned; or restart the daemon, which loads the configured gains",
         )
-    await put_back(rig, kept, "ldcnd tune")
     return kept
-
-
-def _draw(figure: "Figure", tuned: "Tuned") -> None:
-    """Draw the test moves: positions, and what they are behind the command."""
-    above, below = figure.axes
-    for curve in tuned.curves:
-        times_ms = [each * 1e3 for each in curve.times_s]
-        style = STYLES.get(curve.label, "-")
-        above.plot(times_ms, curve.positions, style, label=curve.label)
-        below.plot(times_ms, curve.following_errors, style, label=curve.label)
-    unit = tuned.report.unit
-    above.set_ylabel(f"position\n[{unit}]")
-    below.set_ylabel(f"following error\n[{unit}]")
-    below.set_xlabel("ms")
-    above.legend(fontsize="small")
-    figure.suptitle(f"{tuned.report.axis}: test move")

@@ -176,6 +176,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
         simulated_line: reads a `[[sim]]` table.
         simulated_key: the key of such a table that no other family has: its drives.
         bauds: rates that its lines may run at; none when the rate is fixed.
+        tuning: module of the command line that tunes its axes, with `tune` and `put_back`; empty without one.
     """
 
     name: str
@@ -183,6 +184,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
     simulated_line: type[SimulatedT]
     simulated_key: str
     bauds: tuple[int, ...] = ()
+    tuning: str = ""
 
     @abstractmethod
     def open_lines(self, state_dir: Path | None) -> OpenLine[BusT]:

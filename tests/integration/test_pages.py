@@ -92,6 +92,10 @@ NOT_RUN = {
     ("docs/how-to/watch-an-axis.md", "ldcnd shadow x.json"): (
         "test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_observer"
     ),
+    ("docs/how-to/tune.md", "ldcnd tune feed"): "test_the_command_shows_tries_and_puts_back",
+    ("docs/how-to/tune.md", "ldcnd tune feed --set Pn102=45 --record 2 --yes"): (
+        "test_the_command_shows_tries_and_puts_back"
+    ),
     ("docs/how-to/tune.md", "ldcnd tune x --put-back"): "test_gains_of_a_tuning_that_was_killed_are_put_back_by_hand",
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",

@@ -21,7 +21,6 @@ from ldcnd.errors import (
     DriveFault,
     LeaseExpired,
     NotReferenced,
-    NotSupported,
     PositionLimit,
     StopLatched,
     ValueOutOfRange,
@@ -313,11 +312,3 @@ async def test_an_axis_without_gains_is_told_to_get_some():
         await rig.client.command("x", SetGains(kp=350, el=4000))
 
         assert not file_of("sim", "x").exists()
-
-
-async def test_a_smartstep_says_what_it_has_instead():
-    async with running_rig(load_config(SIMULATED.with_name("mixed.toml"))) as rig:
-        with pytest.raises(NotSupported, match="tunes itself") as refused:
-            await plan(rig.client, "feed", None)
-
-    assert "Pn110" in refused.value.remedy

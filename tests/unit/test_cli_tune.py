@@ -2,7 +2,8 @@
 
 import pytest
 
-from ldcnd.cli import tune
+from ldcnd.cli.ldcn import tune
+from ldcnd.cli.tune import TuneOptions
 from ldcnd.errors import ConfigError
 from ldcnd.tuning.ldcn import guided
 from ldcnd.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
@@ -28,7 +29,7 @@ def test_without_numpy_one_line_names_the_extra(monkeypatch):
     monkeypatch.setattr(tune, "find_spec", lambda _: None)
 
     with pytest.raises(ConfigError, match=r"pip install 'ldcnd\[tune\]'$"):
-        tune.command.main(["x", "--yes"], standalone_mode=False)
+        tune.tune(None, None, TuneOptions(None, None, (), None, None, dry_run=False, yes=True))
 
 
 def test_predicted_stands_beside_measured():

@@ -65,6 +65,7 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
     bus_config = LdcnBusConfig
     simulated_line = SimulatedLdcnLineConfig
     simulated_key = "module"
+    tuning = "ldcnd.cli.ldcn.tune"
     bauds = (9600, 19_200, 57_600, 115_200, 230_400)
     examination = (
         "Examine adapter, drives and timing of an LDCN or NMC line; exits with 1 when something must be put right."

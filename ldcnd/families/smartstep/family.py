@@ -90,6 +90,7 @@ class SmartStepFamily(
     bus_config = SmartStepBusConfig
     simulated_line = SimulatedSmartStepLineConfig
     simulated_key = "unit"
+    tuning = "ldcnd.cli.smartstep.tune"
     examination = (
         "Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."
     )

@@ -28,8 +28,8 @@ LEAST_PHASE_DEG = 20.0
 MOST_LEAD_DEG = 78.0
 """More phase than this is made of nearly nothing but the derivative, and holds no position."""
 GAIN_MARGIN_DB = 6.0
-INTEGRAL_SHARES = (0.1, 0.25, 0.7)
-"""The integral acts below this share of the crossover."""
+INTEGRAL_SHARES = (0.03, 0.25, 0.7)
+"""The integral acts below this share of the crossover; a slow one leaves the end of a move to friction."""
 BANDWIDTHS_HZ = tuple(4.0 * 1.35**n for n in range(12))
 """Tried where none is wanted: 4 to 109 Hz."""
 STIFF_PHASE_DEG = 35.0

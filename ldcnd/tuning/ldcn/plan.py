@@ -89,13 +89,6 @@ async def plan(client: RigClient, name: str, within: float | None) -> Plan:
 
 
 def _profile_of(info: AxisInfo) -> Profile:
-    if info.family == "smartstep":
-        raise NotSupported(
-            f"axis {info.axis}: a {info.model} tunes itself; its gains are parameters of the drive",
-            axis=info.axis,
-            remedy=f"choose online auto-tuning with Pn110 (`ldcnd params get {info.axis} Pn110`), and save its result"
-            " with the drive's own function Fn007",
-        )
     profile = PROFILES.get(info.model)
     if profile is None:
         raise NotSupported(f"axis {info.axis}: a {info.model} has no law that is known here", axis=info.axis)
