@@ -10,6 +10,7 @@ status byte definitions"; PIC-SERVO manual, 4.1, 5.2, 5.3.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from functools import cache
 from operator import itemgetter
 from struct import Struct
 from typing import Any
@@ -361,7 +362,7 @@ def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
 def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Status]:
     """Return `decode_status` for many packets of one kind."""
     mask, expected, sign = int(items), status_bytes(profile, items), profile.velocity_sign
-    layout, pick = _layout(profile, mask)
+    layout, pick = _layout(mask, profile.adc_bytes, profile.position_error_bytes, profile.bit7_bytes)
     unpack = layout.unpack
 
     def decode(data: bytes) -> Status:
@@ -387,18 +388,21 @@ def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Sta
     return decode
 
 
-def _layout(profile: Profile, mask: int) -> tuple[Struct, Callable[[tuple[Any, ...]], tuple[Any, ...]]]:
+@cache
+def _layout(
+    mask: int, adc_bytes: int, position_error_bytes: int, bit7_bytes: int
+) -> tuple[Struct, Callable[[tuple[Any, ...]], tuple[Any, ...]]]:
     """Return how the bytes are read, and what picks the fields of a `Status` from None and what was read."""
     formats = (
         (_POSITION, "i"),
-        (_ADC, "B" if profile.adc_bytes == 1 else "H"),
+        (_ADC, "B" if adc_bytes == 1 else "H"),
         (_VELOCITY, "h"),
         (_AUX, "B"),
         (_HOME, "i"),
         (_IDENTITY, "B"),
         (_IDENTITY, "B"),
-        (_POSITION_ERROR if profile.position_error_bytes else 0, "h"),
-        (_BIT7 if profile.bit7_bytes else 0, "B"),
+        (_POSITION_ERROR if position_error_bytes else 0, "h"),
+        (_BIT7 if bit7_bytes else 0, "B"),
     )
     order = [1]
     layout = "<B"
