@@ -4,6 +4,7 @@ Source: Foxglove's message schemas, `foxglove.Log`; a viewer finds it by its nam
 """
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from enum import IntEnum
 from functools import cache, lru_cache
 from types import MappingProxyType
@@ -46,6 +47,13 @@ def model_of(key: str) -> type[Published] | None:
         case "meta", ["health", _]:
             return BusHealth
     return None
+
+
+@lru_cache(maxsize=4096)
+def _expected(key: str) -> tuple[type[Published] | None, AbstractSet[str]]:
+    """Return the content type of a key, and the names of its fields."""
+    model = model_of(key)
+    return model, frozenset(model.model_fields if model else ())
 
 
 def axis_of(key: str) -> str | None:
@@ -142,12 +150,12 @@ def entry_of(sample: Sample) -> Entry | None:
     Raises:
         LdcndError: the payload is not what the key carries.
     """
-    model = model_of(sample.key)
+    model, fields = _expected(sample.key)
     if model is None:
         return None
     if model is not CommandEvent:
         value, text = read_received(sample.payload, sample.encoding)
-        if isinstance(value, dict) and value.keys() == model.model_fields.keys():
+        if isinstance(value, dict) and value.keys() == fields:
             t, seq = value["t"], value["seq"]
             if type(t) is int and type(seq) is int:
                 return Entry(model, text, t, seq)
