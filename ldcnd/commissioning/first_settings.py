@@ -22,8 +22,8 @@ MARKS = {
     "forward_limit": "the forward limit switch",
     "reverse_limit": "the reverse limit switch",
 }
-HOME_COUNTS_PER_S = 100
-"""Speed of a search for the reference, counts a second: slow enough for any index."""
+HOME_COUNTS_PER_S = 500
+"""Speed of a search for the reference, counts a second: a quarter of a count in a servo cycle, slow for any index."""
 
 
 class FirstSettings(Step):

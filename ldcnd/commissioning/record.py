@@ -1,5 +1,6 @@
 """What is known of commissioning an axis: one JSON file beside the configuration, written whole after every step."""
 
+import json
 from enum import StrEnum
 from pathlib import Path
 
@@ -64,7 +65,7 @@ class Proposal(Frozen):
     @property
     def literal(self) -> str:
         """The value as TOML writes it."""
-        return f'"{self.value}"' if isinstance(self.value, str) else repr(self.value)
+        return json.dumps(self.value, ensure_ascii=False) if isinstance(self.value, str) else repr(self.value)
 
 
 class Result(Frozen):

@@ -19,8 +19,8 @@ from ldcnd.errors import UnknownVerb
 TUNING = "gains"
 """The step that a page carries out by tuning."""
 ABOUT_TUNING = (
-    "The axis is moved a little and identified, gains are proposed and tried, and kept when you agree. The steps"
-    " `settings` and `motor` come before; no other is needed."
+    "The axis is moved a little and identified, gains are proposed and tried, and kept when you agree. It needs two"
+    f" steps before: {STEPS['settings'].title}, and {STEPS['motor'].title}."
 )
 
 

@@ -137,4 +137,14 @@ class Conversation(ABC):
             return error_reply(OutcomeUnknown("the drive or the daemon took too long", remedy="look at the axis"))
         except Left as left:
             self.person.tell(str(left))
+        except ExceptionGroup as errors:  # control was lost in the middle of what failed by that
+            known, unknown = errors.split(LdcndError)
+            if known is None or unknown is not None:
+                raise
+            return error_reply(_first(known))
         return None
+
+
+def _first(errors: ExceptionGroup[LdcndError]) -> LdcndError:
+    first = errors.exceptions[0]
+    return _first(first) if isinstance(first, ExceptionGroup) else first

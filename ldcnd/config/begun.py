@@ -1,6 +1,7 @@
 """Beginning a configuration with what a scan of a port has found; what is in a file already stays as it is."""
 
 import re
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -126,10 +127,20 @@ def _free(stem: str, taken: Sequence[str], first: int = 0) -> str:
 def _end_of(text: str, port: str) -> int:
     """Return where the tables of a line end: at the next one that is not about it; remarks before that are its own."""
     lines = text.splitlines(keepends=True)
-    wanted = f'port="{port}"'
-    begin = next(n for n, line in enumerate(lines) if line.split("#")[0].replace(" ", "").strip() == wanted)
+    begin = next((n for n, line in enumerate(lines) if _names_port(line, port)), None)
+    if begin is None:
+        raise ConfigError(f"the line on {port} was not found in the file", remedy="put the drives in by hand")
     others = (n for n in range(begin + 1, len(lines)) if re.match(r"\[(?!\[?bus\.)", lines[n]))
     end = next(others, len(lines))
     while end > begin and (not lines[end - 1].strip() or lines[end - 1].startswith("#")):
         end -= 1
     return sum(map(len, lines[:end]))
+
+
+def _names_port(line: str, port: str) -> bool:
+    if not re.match(r"\s*port\s*=", line):
+        return False
+    try:
+        return tomllib.loads(line).get("port") == port
+    except tomllib.TOMLDecodeError:
+        return False

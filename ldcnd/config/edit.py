@@ -1,5 +1,6 @@
 """Writing settings of one axis into a configuration, its comments and its order left as they are."""
 
+import json
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -137,7 +138,7 @@ def _literal(value: object) -> str:
         case dict():
             return _inline({key: _literal(each) for key, each in value.items()})
         case str():
-            return f'"{value}"'
+            return json.dumps(value, ensure_ascii=False)
         case _:
             return str(value)
 

@@ -12,6 +12,17 @@ OPEN_TIME_S = 5.0
 ResultT = TypeVar("ResultT")
 
 
+async def _opened(bus: Bus, port: str) -> None:
+    """Wait until a line is open."""
+    try:
+        async with asyncio.timeout(OPEN_TIME_S):
+            await bus.wait_opened()
+    except TimeoutError:
+        why = bus.loss_reason or f"{port} did not open within {OPEN_TIME_S:g} s"
+        remedy = "end the daemon that has it, or correct the port"
+        raise BusDown(f"bus {bus.settings.name}: {why}", remedy=remedy) from None
+
+
 async def with_line(bus: Bus, port: str, use: Callable[[], Awaitable[ResultT]]) -> ResultT:
     """Open a line, use it, and close it.
 
@@ -19,18 +30,18 @@ async def with_line(bus: Bus, port: str, use: Callable[[], Awaitable[ResultT]]) 
         BusDown: the port does not open.
     """
     name = bus.settings.name
-    async with asyncio.TaskGroup() as group:
-        owner = group.create_task(bus.run(), name=f"bus {name}")
-        try:
+    try:
+        async with asyncio.TaskGroup() as group:
+            owner = group.create_task(bus.run(), name=f"bus {name}")
             try:
-                async with asyncio.timeout(OPEN_TIME_S):
-                    await bus.wait_opened()
-            except TimeoutError:
-                why = bus.loss_reason or f"{port} did not open within {OPEN_TIME_S:g} s"
-                raise BusDown(f"bus {name}: {why}", remedy="end the daemon that has it, or correct the port") from None
-            return await use()
-        finally:
-            owner.cancel()
+                await _opened(bus, port)
+                return await use()
+            finally:
+                owner.cancel()
+    except BaseExceptionGroup as errors:  # what `use` raises is no group to its caller
+        if len(errors.exceptions) > 1:
+            raise
+        raise errors.exceptions[0] from None
 
 
 async def show_findings(bus: Bus, port: str, findings: AsyncIterator[Finding], show: Callable[[Finding], None]) -> None:

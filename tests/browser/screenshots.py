@@ -76,11 +76,20 @@ async def tuning(house: House, desk: Desk) -> None:
     await expect(desk.page.get_by_role("row", name="Run 2")).to_be_visible()
 
 
+async def commissioning(house: House, desk: Desk) -> None:
+    """Show what a step will do, before it is agreed to."""
+    await house.sim.quiet("x")
+    await desk.open("commissioning/sim/x")
+    await desk.button("Begin: Motor against encoder").click()
+    await expect(desk.button("Run it")).to_be_visible()
+
+
 PICTURES = (
     ("rig", rig, "dark", 960),
     ("axis", axis, "light", 1000),
     ("scope", scope, "dark", 860),
     ("tuning", tuning, "light", 900),
+    ("commissioning", commissioning, "light", 960),
 )
 
 

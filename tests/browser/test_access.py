@@ -5,7 +5,7 @@ import re
 import pytest
 import pytest_asyncio
 
-axe = pytest.importorskip("axe_playwright_python.async_playwright", reason="needs axe-playwright-python")
+access = pytest.importorskip("tests.browser.access", reason="needs axe-playwright-python and playwright")
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
@@ -27,37 +27,10 @@ PAGES = {
     "parameters/mixed/feed": "Alarms and assumptions",
     "network": "sim · line0",
     "events": "Commands and how they ended",
+    "commissioning": "3. The axes",
+    "commissioning/sim/x": "Checklist",
 }
 """Each page with a heading that tells that it is there."""
-
-
-SCREENS = {"phone": (390, 844), "zoomed to 200 %": (640, 400), "laptop": (1280, 800), "large": (1920, 1080)}
-"""Widths and heights in pixels of the page; a laptop's screen has half as many at a zoom of 200 %."""
-FITS = """
-(width) => {
-  const wrong = [];
-  const page = document.documentElement.scrollWidth;
-  if (page > width) wrong.push(`the page is ${page} wide`);
-  for (const field of document.querySelectorAll("input[type=number], select"))
-    if (field.clientWidth < 60) wrong.push(`${field.ariaLabel ?? field.id} is ${field.clientWidth} wide`);
-  for (const link of document.querySelectorAll("nav a")) {
-    const box = link.getBoundingClientRect();
-    if (box.left < 0 || box.right > width) wrong.push(`the link ${link.textContent} is off the screen`);
-  }
-  const stop = [...document.querySelectorAll("button")].find((button) => button.textContent.includes("Stop all axes"));
-  const box = stop?.getBoundingClientRect();
-  if (!box || box.left < 0 || box.top < 0 || box.right > width || box.bottom > innerHeight)
-    wrong.push("Stop all axes is off the screen");
-  return wrong;
-}
-"""
-EVERYTHING = {"resultTypes": ["violations"], "preload": False, "iframes": False, "elementRef": False}
-COLOURS = EVERYTHING | {"runOnly": {"type": "rule", "values": ["color-contrast", "link-in-text-block"]}}
-"""Only colours depend on the scheme."""
-FOUND = """
-async (rules) => (await axe.run(rules)).violations.map(
-  (each) => `${each.id}: ${each.help}: ${each.nodes.slice(0, 3).map((node) => node.target.join(" ")).join(", ")}`)
-"""
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="package")
@@ -66,7 +39,7 @@ async def desk(house):
     await house.sim.rig.stop("c")
     async with house.desk() as desk:
         await desk.open("rig")
-        await desk.page.evaluate(axe.Axe().axe_script)
+        await access.examine(desk.page)
         yield desk
 
 
@@ -78,14 +51,8 @@ async def go(desk, place):
 
 @pytest.mark.parametrize("place", PAGES)
 async def test_a_page_fits_on_every_screen_and_axe_finds_nothing(desk, place):
-    wrong = []
     await go(desk, place)
-    for scheme, rules in (("dark", EVERYTHING), ("light", COLOURS)):
-        await desk.page.emulate_media(color_scheme=scheme)
-        wrong += [f"{scheme}: {found}" for found in await desk.page.evaluate(FOUND, rules)]
-    for screen, (width, height) in SCREENS.items():
-        await desk.page.set_viewport_size({"width": width, "height": height})
-        wrong += [f"{screen}: {found}" for found in await desk.page.evaluate(FITS, width)]
+    wrong = await access.found_wrong(desk.page, access.SCREENS)
 
     await desk.page.set_viewport_size({"width": 1400, "height": 900})
     assert not wrong, "\n".join(wrong)

@@ -528,7 +528,7 @@ async def test_a_configuration_that_a_scan_has_begun_gets_unit_scale_and_soft_ga
     axis = load_config(rig.config).bus[0].axis[0]
     assert (axis.unit, axis.counts_per_unit, axis.velocity, axis.acceleration) == ("mm", 1000, 1, 5)
     assert axis.gains.model_dump(include=set(SOFT_GAINS)) == SOFT_GAINS
-    assert (axis.home.method.value, axis.home.velocity) == ("index", 0.1)
+    assert (axis.home.method.value, axis.home.velocity) == ("index", 0.5)
     assert told == []
     assert checklist.record.of("motor").result.state is StepState.OPEN
 

@@ -2,19 +2,24 @@
 
 import asyncio
 import json
+import os
 import re
+import select
 
 import pytest
+import serial
 
 from ldcnd.commissioning.record import Record, StepState
 from ldcnd.commissioning_page import tuning
+from ldcnd.commissioning_page.messages import Answer, FromPage
 from ldcnd.commissioning_page.page_person import HELD_S
+from ldcnd.commissioning_page.scan_conversation import ScanConversation
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ErrorCode
 from ldcnd.model.leases import ListHolders
 from ldcnd.model.samples import Moving
 from tests.support.commissioning import AXIS, GAINS, commissioning_rig, rig_text
-from tests.support.commissioning_page import commissioning_console, commissioning_page, told_to
+from tests.support.commissioning_page import COMMAND, ViewerSession, commissioning_console, commissioning_page, told_to
 from tests.support.console_rig import page, running_console
 
 
@@ -276,6 +281,22 @@ async def test_the_report_is_a_download(rig, console):
     assert b"Commissioning of axis x of rig bench" in answer.body
 
 
+async def test_a_console_whose_login_may_only_look_moves_nothing(rig):
+    async with commissioning_console(rig, ViewerSession) as console, commissioning_page(console) as opened:
+        before = rig.drive.shaft.position_counts
+        await opened.until(lambda view: not view.running and view.steps)
+        opened.say(begin="scale")
+        if not (await opened.until(lambda view: view.problem or view.question)).problem:
+            await opened.answer("run it", "yes")
+        view = await opened.until(lambda view: view.problem)
+
+    assert view.problem.message
+    assert await holder(rig) is None
+    assert rig.drive.shaft.position_counts == before
+    assert not (await rig.running.client.state(AXIS)).enabled
+    assert opened.state("scale") in ("open", "failed")
+
+
 async def test_a_daemon_that_runs_with_another_file_is_to_be_restarted(rig, console):
     rig.config.write_text(rig_text(counts_per_unit=2000))
     async with commissioning_page(console) as opened:
@@ -284,3 +305,44 @@ async def test_a_daemon_that_runs_with_another_file_is_to_be_restarted(rig, cons
         view = await opened.until(lambda view: view.problem)
 
     assert "another counts_per_unit than the file" in view.problem.message
+
+
+async def test_before_there_is_a_file_the_overview_offers_the_search_alone(tmp_path):
+    async with commissioning_rig(tmp_path) as rig:
+        rig.config = tmp_path / "none.toml"
+        async with commissioning_console(rig) as console:
+            overview = (await console.browser.get("/api/commissioning")).document
+            async with page(console.app, console.browser, path=f"/api/commissioning/axes/{AXIS}") as socket:
+                refused = (await told_to(socket)).refused
+
+    assert (overview["rig"], overview["axes"], overview["connected"]) == (None, [], False)
+    assert overview["command"] == COMMAND
+    assert refused.code == ErrorCode.CONFIG_INVALID
+
+
+@pytest.mark.real_time
+async def test_a_port_that_another_program_has_is_not_scanned(tmp_path):
+    master, slave = os.openpty()
+    port = os.ttyname(slave)
+    said = []
+    with serial.Serial(port, exclusive=True):
+        search = ScanConversation(tmp_path / "rig.toml")
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(search.run())
+            search.heard(FromPage(begin="scan"))
+            for text in (port, "ldcn"):
+                view = await search.view()
+                while view.question is None or view.question.number in said:
+                    view = await search.view()
+                said.append(view.question.number)
+                search.heard(FromPage(answer=Answer(number=view.question.number, text=text)))
+            while (view := await search.view()).problem is None:
+                pass
+            running.cancel()
+    written, _, _ = select.select([master], [], [], 0)
+    os.close(slave)
+    os.close(master)
+
+    assert view.problem.code == ErrorCode.BUS_DOWN
+    assert not written
+    assert not (tmp_path / "rig.toml").exists()

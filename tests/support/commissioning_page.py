@@ -5,25 +5,50 @@ import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import Any
+
+from typing_extensions import override
 
 from ldcnd.commissioning_page.messages import ToPage, View
 from ldcnd.commissioning_page.routes import Commissioning
+from ldcnd.messaging.memory_session import MemorySession
+from ldcnd.messaging.session import Answer
 from tests.support.browser import Browser
 from tests.support.commissioning import AXIS, CommissioningRig
 from tests.support.console_rig import PageSocket, RunningConsole, console_of, page
 
 HELD_EACH_S = 0.1
+COMMANDS = "@cmd"
 COMMAND = "ldcnd run --config rig.toml"
 
 
+class ViewerSession(MemorySession):
+    """The session of a login that may look, and command nothing: access control drops what it asks."""
+
+    @override
+    async def query(self, key: str, payload: bytes = b"", **more: Any) -> list[Answer]:
+        return [] if f"/{COMMANDS}/" in key else await super().query(key, payload, **more)
+
+
 @asynccontextmanager
-async def commissioning_console(rig: CommissioningRig) -> AsyncIterator[RunningConsole]:
+async def commissioning_console(
+    rig: CommissioningRig, session_class: type[MemorySession] = MemorySession
+) -> AsyncIterator[RunningConsole]:
     """Run a console that commissions an axis of a daemon."""
     async with (
-        rig.running.broker.session() as session,
+        closing(session_class(rig.running.broker)) as session,
         console_of(rig.running, session, lambda rigs: Commissioning(rigs, rig.config, COMMAND).routes()) as console,
     ):
         yield console
+
+
+@asynccontextmanager
+async def closing(session: MemorySession) -> AsyncIterator[MemorySession]:
+    """Close a session at the end of the context."""
+    try:
+        yield session
+    finally:
+        await session.close()
 
 
 @dataclass

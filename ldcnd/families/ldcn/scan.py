@@ -5,6 +5,7 @@ request, a line on which nothing can be moving is reset and addressed.
 """
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -286,7 +287,7 @@ def configured_line(name: str, port: str, drives: Sequence[ScannedDrive]) -> str
     return f"""
 [[bus]]
 name = "{name}"
-port = "{port}"
+port = {json.dumps(port)}
 baud = {baud}  # the drives are brought to it; they were found at {seen}
 # adapter_latency_ms = 1.0  # as the scan measured it
 {margin if simulated else "# margin_ms = 25"}

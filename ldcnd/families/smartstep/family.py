@@ -1,5 +1,6 @@
 """The family of SmartSteps: from the configuration of a line to its bus, its plan, its simulator, its tools."""
 
+import json
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -152,7 +153,7 @@ class SmartStepFamily(
         return f"""
 [[bus]]
 name = "{name}"
-port = "{port}"
+port = {json.dumps(port)}
 family = "smartstep"
 smartstep = {{ framing = "8n1-soft-parity" }}  # as the scan used it; "7e1" where the adapter makes parity itself
 """

@@ -73,7 +73,7 @@ function Daemon({ overview }) {
     ? `The daemon of rig ${overview.rig} runs.`
     : `No daemon serves rig ${overview.rig} yet. Start it in a terminal of the machine that has the port; this page notices by itself.`;
   return html`<${Panel} title="2. The daemon" note="Nothing moves when it starts. After a change of the file that it does not read while it runs, end it and start it again with the same command.">
-    <p role="status"><${Mark} level=${overview.connected ? "" : "warn"}>${text}<//></p>
+    <p role="status" class="mark" data-level=${overview.connected ? null : "warn"}>${text}</p>
     <${CopiedCommand} command=${overview.command} />
   <//>`;
 }
@@ -137,7 +137,7 @@ function Activity({ talk, title, overview }) {
     ${view.running && html`<p class="row"><button type="button" onClick=${() => talk.leave()}>End this step</button>
       <span class="quiet">What moves is halted; the step stays open.</span></p>`}
     <${RefusalText} refusal=${view.problem} />
-    ${!view.running && !view.problem && html`<p role="status">It has ended.</p>`}
+    ${!view.running && html`<p role="status">It has ended.</p>`}
     ${!view.running && overview && html`<${CopiedCommand} command=${overview.command} />`}
   <//>`;
 }
