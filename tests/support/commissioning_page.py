@@ -11,8 +11,8 @@ from typing_extensions import override
 
 from ldcnd.commissioning_page.messages import ToPage, View
 from ldcnd.commissioning_page.routes import Commissioning
+from ldcnd.messaging.hand_over import Answer
 from ldcnd.messaging.memory_session import MemorySession
-from ldcnd.messaging.session import Answer
 from tests.support.browser import Browser
 from tests.support.commissioning import AXIS, CommissioningRig
 from tests.support.console_rig import PageSocket, RunningConsole, console_of, page
