@@ -2,8 +2,10 @@
 
 import asyncio
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial, wraps
 from pathlib import Path
 from typing import TypeVar
@@ -13,9 +15,8 @@ from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
 from ldcnd.cli.output import show_lines
-from ldcnd.client.connecting import open_rig
-from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError
+from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.errors import LdcndError, SessionError, UnknownAxis
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
@@ -161,3 +162,35 @@ def with_target(work: Callable[..., None]) -> Callable[..., None]:
         work(target, **options)
 
     return command
+
+
+@asynccontextmanager
+async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIterator[RigClient]:
+    """Join the network and use one rig for as long as the context lasts.
+
+    Args:
+        settings: where to connect, and with which login.
+        rig: which one; not needed when only one can be reached.
+
+    Raises:
+        SessionError: no connection, or no daemon answers.
+        UnknownAxis: several rigs can be reached and none was named.
+    """
+    async with open_zenoh_session(settings) as session:
+        rigs = sorted({daemon.rig for daemon in await find_rigs(session)})
+        if rig not in rigs:
+            if not rigs:
+                raise SessionError(
+                    f"no daemon answers at {', '.join(settings.connect) or 'the configured endpoints'}",
+                    remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role"
+                    " sees none either",
+                )
+            there = f"there are: {', '.join(rigs)}"
+            if rig is not None:
+                near = next(iter(get_close_matches(rig, rigs, 1)), None)
+                meant = f"; did you mean {near!r}?" if near else ""
+                raise SessionError(f"no rig {rig!r} answers{meant}", value=rig, remedy=there)
+            if len(rigs) > 1:
+                raise UnknownAxis(f"several rigs answer; {there}", remedy="choose one with --rig")
+            rig = rigs[0]
+        yield RigClient(session, rig)

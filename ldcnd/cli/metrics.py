@@ -27,8 +27,7 @@ async def _serve(client: RigClient, address: ListenAddress) -> None:
     try:
         from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
 
-        from ldcnd.metrics.exposition import HealthCollector  # noqa: PLC0415
-        from ldcnd.metrics.server import metrics_server  # noqa: PLC0415
+        from ldcnd.metrics import HealthCollector, metrics_server  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError("prometheus-client is not installed", remedy="pip install 'ldcnd[metrics]'") from error
     loop = asyncio.get_running_loop()

@@ -11,8 +11,6 @@ from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, WrongSt
 from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 CHECK_PERIOD_S = 0.1
-ARMING_S = 30.0
-"""Maximum time to arm a trace, seconds: a slow drive needs some twenty exchanges before its trace begins."""
 ENDING_S = 10.0
 UNDER_WAY = frozenset({TracePhase.FILLING, TracePhase.WAITING, TracePhase.RECORDING, TracePhase.UPLOADING})
 

@@ -52,12 +52,12 @@ threading.Event().wait()
 TYPED = f"""{REPORTS}
 import asyncio
 from ldcnd.client.axis import Axis
-from ldcnd.client.connecting import at
+from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 
 async def main():
-    async with open_zenoh_session(at(sys.argv[1])) as session:
+    async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:
         async with Axis("x", RigClient(session, "bench"), asyncio.get_running_loop()).watched() as x:
             print("ready", flush=True)
             async for sample in x.positions():

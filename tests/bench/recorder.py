@@ -43,7 +43,7 @@ FIELDS = {
 RECORDING = """
 import asyncio, sys, threading, time
 from pathlib import Path
-from ldcnd.client.connecting import at
+from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder
@@ -57,7 +57,7 @@ async def main():
                 print(time.process_time(), recorder.messages, flush=True)
             loop.call_soon_threadsafe(recorder.end)
 
-        async with open_zenoh_session(at(sys.argv[1])) as session:
+        async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:
             async with RigClient(session, "bench").published(recorder.take, KEPT_SAMPLES, LINGER_S) as gave_way:
                 threading.Thread(target=report, daemon=True).start()
                 print("ready", flush=True)

@@ -31,11 +31,11 @@ STOP_MOTOR = 0x7
 """Command code in the low half of the third byte: what `power off` sends."""
 CLIENT = """
 import asyncio, json, sys, time
-from ldcnd.client.connecting import at
+from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 
 async def main():
-    async with open_zenoh_session(at(sys.argv[1])) as session:
+    async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:
         times = {key: [] for key in sys.argv[3:]}
         for _ in range(int(sys.argv[2])):
             for key, taken in times.items():

@@ -42,12 +42,13 @@ sys.stdin.read()
 """
 CLIENT = """
 import asyncio, sys
-from ldcnd.client.connecting import at
+from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 
 async def main():
-    async with open_zenoh_session(at(sys.argv[1])) as session, RigClient(session, "bench").samples() as samples:
+    settings = ZenohSettings(mode="client", connect=(sys.argv[1],))
+    async with open_zenoh_session(settings) as session, RigClient(session, "bench").samples() as samples:
         print("ready", flush=True)
         async for _ in samples:
             pass

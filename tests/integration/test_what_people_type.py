@@ -33,7 +33,7 @@ def nobody_there(monkeypatch, tmp_path):
             yield session
 
     monkeypatch.setattr(connection, "open_zenoh_session", empty_network)
-    monkeypatch.setattr("ldcnd.client.connecting.open_zenoh_session", empty_network)
+    monkeypatch.setattr("ldcnd.cli.connection.open_zenoh_session", empty_network)
     monkeypatch.chdir(tmp_path)
 
 

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import pytest
 
 from ldcnd.cli import connection
+from ldcnd.cli import connection as connecting
 from ldcnd.cli.main import main
-from ldcnd.client import connecting
 from ldcnd.config.rig import RigConfig
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_settings import ZenohSettings

@@ -1,15 +1,23 @@
 import pytest
 
+from ldcnd.daemon.axis.state import ActiveCommand, Completion
 from ldcnd.daemon.command.ledger import ANSWERS_PER_SENDER, SENDERS, Entry, Ledger
 from ldcnd.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
-from ldcnd.model.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute
+from ldcnd.model.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute, Verb
 from ldcnd.model.events import CommandStatus
+from ldcnd.model.samples import AxisState
 
 MOVE = MoveAbsolute(position=1.0)
 
 
 def entry(command_id="c1", command=MOVE) -> Entry:
     return Entry(command_id, "x", command, "ann")
+
+
+def reached(ledger: Ledger, command_id: str, status: CommandStatus, reason: str | None = None) -> None:
+    """Say that a command has got so far, as its axis does."""
+    state, completion = AxisState.DISCRETE_MOTION, Completion.PROFILE
+    ledger.ended(ActiveCommand(command_id, Verb.MOVE_ABSOLUTE, 0, state, completion), status, reason, None)
 
 
 @pytest.fixture
@@ -28,9 +36,9 @@ def ledger(heard) -> Ledger:
 def test_a_command_passes_through_its_states_once(ledger, heard):
     ledger.open(entry())
     ledger.answered("c1", CommandReply(command_id="c1", axis="x", verb="move_absolute"), CommandStatus.EXECUTING)
-    ledger.reached("c1", CommandStatus.EXECUTING)
-    ledger.reached("c1", CommandStatus.DONE)
-    ledger.reached("c1", CommandStatus.ABORTED, "too late")
+    reached(ledger, "c1", CommandStatus.EXECUTING)
+    reached(ledger, "c1", CommandStatus.DONE)
+    reached(ledger, "c1", CommandStatus.ABORTED, "too late")
 
     assert heard == [("accepted", None), ("executing", None), ("done", None)]
     assert ledger.get("c1").status is CommandStatus.DONE
@@ -78,14 +86,14 @@ def test_an_unknown_id_says_so(ledger):
 def done(ledger, command_id, client="ann", **fields):
     command = MoveAbsolute(position=1.0, command_id=command_id, client=client, **fields)
     ledger.open(Entry(command_id, "x", command, client))
-    ledger.reached(command_id, CommandStatus.DONE)
+    reached(ledger, command_id, CommandStatus.DONE)
 
 
 def test_what_is_not_over_is_never_forgotten(ledger):
     ledger.open(entry("running"))
     for number in range(ANSWERS_PER_SENDER + 10):
         ledger.open(entry(f"done-{number}"))
-        ledger.reached(f"done-{number}", CommandStatus.DONE)
+        reached(ledger, f"done-{number}", CommandStatus.DONE)
 
     assert ledger.get("running").status is CommandStatus.ACCEPTED
     with pytest.raises(UnknownCommand):
@@ -108,7 +116,7 @@ def test_nobody_elses_commands_push_an_answer_out(ledger):
         done(ledger, f"b{number}", client="bob")
         halt = Halt(command_id=f"h{number}", client="ann")
         ledger.open(Entry(f"h{number}", "x", halt, "ann"))
-        ledger.reached(f"h{number}", CommandStatus.DONE)
+        reached(ledger, f"h{number}", CommandStatus.DONE)
 
     assert ledger.get("mine").status is CommandStatus.DONE
 
@@ -156,7 +164,7 @@ def test_an_id_under_a_lease_with_a_sequence_takes_no_memory(ledger):
 def test_an_entry_keeps_whose_it_is_through_all_its_states(ledger):
     ledger.open(Entry("c1", "x", MOVE, "ann", "operator"))
     ledger.answered("c1", CommandReply(command_id="c1", axis="x", verb="move_absolute"), CommandStatus.EXECUTING)
-    ledger.reached("c1", CommandStatus.DONE)
+    reached(ledger, "c1", CommandStatus.DONE)
 
     kept = ledger.get("c1")
     assert (kept.command_id, kept.axis, kept.command, kept.client, kept.login) == ("c1", "x", MOVE, "ann", "operator")
@@ -167,7 +175,7 @@ def test_a_sender_with_a_login_is_known_by_it():
     for number in range(2 * SENDERS):
         command = MoveAbsolute(position=1.0, command_id=f"c{number}")
         ledger.open(Entry(f"c{number}", "x", command, f"client{number}", "operator"))
-        ledger.reached(f"c{number}", CommandStatus.DONE)
+        reached(ledger, f"c{number}", CommandStatus.DONE)
 
     assert ledger.get("c0").login == "operator"  # all are of one sender
 

@@ -8,7 +8,7 @@ import promql_parser
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ldcnd.metrics.exposition import FRESH_S, HealthCollector
+from ldcnd.metrics import FRESH_S, HealthCollector
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
 from ldcnd.model.samples import LinkState
 

@@ -144,15 +144,8 @@ class Ledger:
         error = answer if isinstance(answer, LdcndError) else None
         self._reached(entry, answer, status, error.message if error else None, error)
 
-    def reached(
-        self, command_id: str, status: CommandStatus, reason: str | None = None, error: LdcndError | None = None
-    ) -> None:
-        """Note how far a command has got; a final status is kept."""
-        if entry := self._entries.get(command_id):
-            self._reached(entry, entry.answer, status, reason, error)
-
     def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, arrival: Arrival | None) -> None:
-        """Take from an axis that a command is over."""
+        """Take from an axis that a command is over; a final status is kept."""
         if entry := self._entries.get(command.command_id):
             self._reached(entry, entry.answer, status, reason, None, arrival)
 
