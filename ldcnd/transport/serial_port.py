@@ -21,7 +21,6 @@ from typing import Literal
 
 import serial
 import serial_asyncio
-import structlog
 from typing_extensions import override
 
 from ldcnd.errors import TransportLost
@@ -37,8 +36,6 @@ from ldcnd.transport.line_discipline import (
     switch_direction,
 )
 from ldcnd.transport.transport import Receiver, Transport
-
-log: structlog.typing.FilteringBoundLogger = structlog.get_logger("ldcnd.serial_port")
 
 OPEN_TIME_S = 5.0
 DRAIN_TIME_S = 1.0
@@ -377,11 +374,8 @@ def _is_pseudo_terminal(path: str) -> bool:
 
 
 def _ask_for_low_latency(port: _Serial) -> None:
-    try:
+    with contextlib.suppress(ValueError, NotImplementedError):  # pseudo-terminals and several drivers have no such mode
         port.set_low_latency_mode(True)
-    except (ValueError, NotImplementedError) as error:
-        # pseudo-terminals and several drivers have no such mode
-        log.debug("no low-latency mode", port=port.port, reason=str(error))
 
 
 def _close_unwanted(opening: "asyncio.Future[_Serial]") -> None:
