@@ -24,7 +24,7 @@ from tests.bench import (
 from tests.bench.bus_efficiency import FLOOR, FLOORS, MINIMAL, Conditions, Result
 from tests.bench.machine_speed import MachineSpeed
 from tests.bench.processes import build_programs
-from tests.bench.report import Row, table
+from tests.bench.report import Row, paired, table
 from tests.bench.sources import NoCompiler
 
 BUSY, BUSY_US = f"{FLOOR}: turn-around, 99 %", 1000
@@ -48,8 +48,11 @@ CONSOLE_S, CONSOLE_ROUNDS = 5.0, 3
 def main() -> None:
     """Run the whole bench, or the parts of it that the options leave."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=9, help="interleaved rounds for each rate")
-    parser.add_argument("--virtual-seconds", type=float, default=60.0, help="length of a run on the jumping clock")
+    parser.add_argument(
+        "--rounds", type=int, default=9, help="interleaved rounds at the full rate, half of them elsewhere"
+    )
+    parser.add_argument("--virtual-seconds", type=float, default=30.0, help="length of a run on the jumping clock")
+    parser.add_argument("--before", type=Path, help="another checkout, whose daemon is measured in the same rounds")
     parser.add_argument("--no-processes", action="store_true", help="only what runs on the jumping clock")
     parser.add_argument("--json", type=Path, help="keep the figures here")
     options = parser.parse_args()
@@ -59,7 +62,7 @@ def main() -> None:
     speed = MachineSpeed()
     speed.look()
     if not options.no_processes:
-        rows += _processes(options.rounds, speed)
+        rows += _processes(options.rounds, options.before, speed)
         rows += round_trip.rows()
         speed.look()
         rows += stops_under_load.rows()
@@ -79,7 +82,8 @@ def main() -> None:
         options.json.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=2))
 
 
-def _processes(rounds: int, speed: MachineSpeed) -> list[Row]:
+def _processes(rounds: int, before: Path | None, speed: MachineSpeed) -> list[Row]:
+    fewer = max(2, rounds // 2 + 1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
@@ -89,12 +93,13 @@ def _processes(rounds: int, speed: MachineSpeed) -> list[Row]:
             return []
         rows = console.rows(folder, CONSOLE_S, CONSOLE_ROUNDS)
         for conditions in (FAST, SLOW, *MORE):
-            for result in bus_efficiency.measure(programs, folder, conditions, rounds):
+            each = rounds if conditions is FAST else fewer
+            for result in bus_efficiency.measure(programs, folder, conditions, each, before):
                 rows += _efficiency_rows(result)
             speed.look()
         rows += system_calls.rows(programs[0], folder)
         rows += saturated_command.rows(programs[0], folder)
-        rows += scaling.rows(programs[0], folder, rounds)
+        rows += scaling.rows(programs[0], folder, fewer)
         speed.look()
         return rows
 
@@ -116,9 +121,9 @@ def _efficiency_rows(result: Result) -> list[Row]:
     loop = result.subject.rpartition(" ")[2]
     return [
         *rows,
-        Row(f"{what}: bus efficiency / floor", result.efficiency_ratio, "", EFFICIENCY.get((conditions, loop))),
+        paired(f"{what}: bus efficiency / floor", result.efficiency_ratios, EFFICIENCY.get((conditions, loop))),
         Row(f"{what}: the same by the wall clock", result.wall_ratio),
-        Row(f"{what}: processor time / {MINIMAL}", result.cpu_ratio, "", CPU_RATIO.get(conditions), at_most=True),
+        paired(f"{what}: processor time / {MINIMAL}", result.cpu_ratios, CPU_RATIO.get(conditions), at_most=True),
         Row(f"{what}: share of one processor", result.core),
         Row(f"{what}: processor time for each sample", result.cpu_us_per_sample, "us"),
     ]

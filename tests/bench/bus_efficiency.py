@@ -11,11 +11,13 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from ldcnd.daemon.process.service import held_awake
 from tests.bench.processes import (
     PIC_SERVO,
+    ROOT,
     SUBJECT_CPU,
     Subject,
     config_text,
@@ -81,30 +83,32 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Medians over all rounds; ratios are medians of the ratios within a round.
+    """Medians over all rounds, and the ratios within each round.
 
     Attributes:
-        efficiency_ratio: to the floor in C.
-        cpu_ratio: to the minimal master in Python.
+        efficiency_ratios: to the floor in C.
+        cpu_ratios: to the minimal master in Python.
     """
 
     conditions: Conditions
     subject: str
     exchanges_per_s: float
     efficiency: float
-    efficiency_ratio: float
+    efficiency_ratios: list[float]
     wall_ratio: float
     turnaround_p50_us: float
     turnaround_p99_us: float
     cpu_us: float
-    cpu_ratio: float
+    cpu_ratios: list[float]
     cpu_us_per_sample: float
     core: float
     line_late_p99_us: float
 
 
-def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, rounds: int) -> list[Result]:
-    """Run both floors, daemon on asyncio and daemon on uvloop side by side."""
+def measure(
+    programs: tuple[Path, Path], folder: Path, conditions: Conditions, rounds: int, before: Path | None
+) -> list[Result]:
+    """Run both floors, daemon on asyncio and daemon on uvloop side by side; and the daemon of another checkout."""
     line_program, floor_program = programs
     baud = conditions.baud
     new_line = partial(
@@ -124,15 +128,17 @@ def measure(programs: tuple[Path, Path], folder: Path, conditions: Conditions, r
         listeners = {MINIMAL: stack.enter_context(subscriber(endpoint))}
         for subject in subjects:
             subject.stop()
-        for name, uvloop in (("ldcnd, asyncio", False), ("ldcnd, uvloop", True)):
+        checkouts = [("ldcnd", ROOT), *([("before", before)] if before else [])]
+        for number, ((code, root), loop) in enumerate(product(checkouts, ("asyncio", "uvloop"))):
+            name, uvloop = f"{code}, {loop}", loop == "uvloop"
             line = stack.enter_context(new_line())
-            config = folder / f"bench-{baud}-{uvloop}.toml"
+            config = folder / f"bench-{baud}-{number}.toml"
             rig = config_text(
                 *line.terminals, uvloop=uvloop, modules=MODULES, baud=baud, hz=2000.0, items=ITEMS, drive=PIC_SERVO
             )
             config.write_text(rig)
             endpoint = free_endpoint()
-            running = stack.enter_context(daemon(config, endpoint))
+            running = stack.enter_context(daemon(config, endpoint, root))
             listeners[name] = stack.enter_context(subscriber(endpoint))
             subjects.append(Subject(name, running, line))
             subjects[-1].stop()
@@ -194,12 +200,12 @@ def _summary(conditions: Conditions, rounds: list[dict[str, Round]]) -> list[Res
                 subject=name,
                 exchanges_per_s=_median(each.exchanges_per_s for each in own),
                 efficiency=_median(each.efficiency for each in own),
-                efficiency_ratio=_median(each.efficiency / base.efficiency for each, base in pairs),
+                efficiency_ratios=[each.efficiency / base.efficiency for each, base in pairs],
                 wall_ratio=_median(each.wall_efficiency / base.wall_efficiency for each, base in pairs),
                 turnaround_p50_us=_median(each.turnaround_p50_us for each in own),
                 turnaround_p99_us=_median(each.turnaround_p99_us for each in own),
                 cpu_us=_median(each.cpu_us for each in own),
-                cpu_ratio=_median(each[name].cpu_us / each[MINIMAL].cpu_us for each in rounds),
+                cpu_ratios=[each[name].cpu_us / each[MINIMAL].cpu_us for each in rounds],
                 cpu_us_per_sample=_median(each.cpu_us / (each.samples or 1) for each in own),
                 core=_median(each.core for each in own),
                 line_late_p99_us=_median(each.line_late_p99_us for each in own),

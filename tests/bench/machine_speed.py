@@ -1,7 +1,8 @@
 """How fast this machine is while the bench runs: two fixed loops, one of Python and one of system calls.
 
 Figures of time are compared within a run only. A machine whose own speed changes during the run, because others use it
-or because it throttles, spoils that too: then the bench prints such rows and judges none of them.
+or because it throttles, spoils that too: then the bench prints such rows and judges none of them. Ratios of paired
+rounds are judged by how far the rounds scatter.
 """
 
 import os
@@ -62,8 +63,13 @@ class MachineSpeed:
         ]
 
     def judged(self, rows: Sequence[Row]) -> list[Row]:
-        """Return the rows as they may be judged: those of time only if the machine kept its speed."""
-        if self.variation <= MOST_VARIATION:
-            return list(rows)
-        doubt = f"the machine's speed varied by {self.variation:.0%} during the run"
-        return [row if row.exact or row.doubt else replace(row, doubt=doubt) for row in rows]
+        """Return the rows as they may be judged: times if the machine kept its speed, paired ratios if they agree."""
+        return [replace(row, doubt=row.doubt or self._doubt(row)) for row in rows]
+
+    def _doubt(self, row: Row) -> str:
+        if row.exact:
+            return ""
+        if row.spread is not None:
+            return f"the rounds scatter by {row.spread:.0%}" if row.spread > MOST_VARIATION else ""
+        varied = self.variation > MOST_VARIATION
+        return f"the machine's speed varied by {self.variation:.0%} during the run" if varied else ""

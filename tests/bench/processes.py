@@ -46,8 +46,10 @@ class LineFigures:
 
 
 @contextmanager
-def process(command: Sequence[str | Path], *, cpu: int, nice: int, pipe: bool = False) -> Iterator[subprocess.Popen]:
-    """Run a program on one processor until the context ends."""
+def process(
+    command: Sequence[str | Path], *, cpu: int, nice: int, pipe: bool = False, root: Path = ROOT
+) -> Iterator[subprocess.Popen]:
+    """Run a program on one processor until the context ends; modules are found in `root` first."""
     cpus = sorted(os.sched_getaffinity(0))
 
     def place() -> None:
@@ -61,7 +63,7 @@ def process(command: Sequence[str | Path], *, cpu: int, nice: int, pipe: bool = 
         command,
         stdout=subprocess.PIPE if pipe else None,
         text=True,
-        cwd=ROOT,
+        cwd=root,
         start_new_session=True,
         preexec_fn=place,  # noqa: PLW1509 - one thread
     )
@@ -181,10 +183,10 @@ def config_text(
 
 
 @contextmanager
-def daemon(config: Path, endpoint: str) -> Iterator[subprocess.Popen]:
-    """Run a daemon."""
+def daemon(config: Path, endpoint: str, root: Path = ROOT) -> Iterator[subprocess.Popen]:
+    """Run a daemon of this checkout, or of another one."""
     command = (sys.executable, "-m", "ldcnd", "run", "--log-level", "error", "--config", config, "--listen", endpoint)
-    with process(command, cpu=SUBJECT_CPU, nice=-10) as running:
+    with process(command, cpu=SUBJECT_CPU, nice=-10, root=root) as running:
         yield running
 
 
