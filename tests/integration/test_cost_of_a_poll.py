@@ -12,7 +12,7 @@ ITEMS = ("position", "velocity", "adc", "state")
 AXES = (1, 8, 31)
 HZ = 1000.0
 """More than the line carries."""
-COUNTED_S = 1.0
+COUNTED_S = 0.4
 CALLS_OF_A_CHOICE = 4
 MORE_WITH_AXES = 8
 """Calls: what is done for each axis once a second falls upon the polls of that second."""

@@ -112,7 +112,7 @@ async def test_a_mute_node_that_rejects_a_packet_is_mute_no_longer():
 
 async def test_half_a_line_that_falls_mute_costs_the_other_half_little_and_is_back_at_once():
     rig = Rig(lambda packet: toy.answer(packet) if packet == toy.FLUSH or toy.node_of(packet) > 15 else [])
-    greedy = ToyPoller(31, 0.0001)
+    healthy = ToyPoller(31, 0.002)
     mute = [ToyPoller(node, 0.05) for node in range(1, 16)]
     found_s = [0.0]
 
@@ -120,7 +120,7 @@ async def test_half_a_line_that_falls_mute_costs_the_other_half_little_and_is_ba
         rig.line.script = toy.answer
         found_s[0] = asyncio.get_running_loop().time()
 
-    await polled(rig, [greedy, *mute], 30.0, switch_on)
+    await polled(rig, [healthy, *mute], 30.0, switch_on)
 
     settled = [at_s for poller in mute for at_s in poller.asked_at_s if 15.0 <= at_s < 30.0]
     lost_s = 0.0152  # of one poll that nobody answers, resynchronisation included
