@@ -12,8 +12,8 @@ from pytest_asyncio import is_async_test
 
 from ldcnd.sim.jumping_loop import JumpingLoop
 
-# one run is like the other, so more examples find nothing new; `make soak` looks at what was never tried, and prints how
-# to repeat what it finds
+# one run is like the other, so more examples find nothing new; `make soak` looks at what was never tried, and prints
+# how to repeat what it finds
 settings.register_profile("same", derandomize=True, deadline=None, print_blob=True, max_examples=50)
 settings.register_profile("new", deadline=None, print_blob=True)
 settings.load_profile("same")
