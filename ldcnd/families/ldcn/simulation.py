@@ -307,7 +307,7 @@ class SimulatedEventConfig(Frozen):
     """or a line of a PIC-I/O, which is driven to `level`,"""
     adc: int | None = Field(default=None, ge=1, le=3)
     """or an A/D input of a PIC-I/O, which takes `value`."""
-    level: Literal["low", "high"] | None = None
+    level: Literal["high", "low"] | None = None
     """With `line`: the level from outside."""
     value: Byte | None = None
     """With `adc`: 0 to 255 for 0 to 5 V."""
