@@ -62,10 +62,10 @@ async def survey(session: Session, rig: str | None = None) -> tuple[RigReport, .
     """
     alive: set[tuple[str, str]] = set()
 
-    def told(name: str, instance: str, there: bool) -> None:  # noqa: FBT001 - as `presence.daemons` calls it
+    def on_daemon(name: str, instance: str, there: bool) -> None:  # noqa: FBT001 - as `presence.daemons` calls it
         (alive.add if there else alive.discard)((name, instance))
 
-    async with presence.daemons(session, told):
+    async with presence.daemons(session, on_daemon):
         daemons = await _daemons(session)
     runs = [daemon.rig for daemon in daemons]
     silent = alive - {(daemon.rig, daemon.instance) for daemon in daemons}

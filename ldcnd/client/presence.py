@@ -11,14 +11,14 @@ OnDaemon = Callable[[str, str, bool], None]
 
 
 @asynccontextmanager
-async def daemons(session: Session, told: OnDaemon) -> AsyncIterator[None]:
+async def daemons(session: Session, on_daemon: OnDaemon) -> AsyncIterator[None]:
     """Tell of every daemon that can be reached, first of those that are there, for the time of the context."""
 
-    def tell(key: str, alive: bool) -> None:  # noqa: FBT001 - a callback of the session
+    def changed(key: str, alive: bool) -> None:  # noqa: FBT001 - a callback of the session
         keys = Keys.of(key)
-        told(keys.rig, keys.parse_alive(key).instance, alive)
+        on_daemon(keys.rig, keys.parse_alive(key).instance, alive)
 
-    declaration = await session.watch_tokens(ALL_RUNS, tell)
+    declaration = await session.watch_tokens(ALL_RUNS, changed)
     try:
         yield
     finally:

@@ -121,7 +121,7 @@ def read_received(payload: bytes, encoding: str) -> tuple[object, bytes]:
         PayloadTooLarge: the payload is too long.
         MalformedRequest: it cannot be read.
     """
-    if _told(payload, encoding) is Encoding.MSGPACK and 0 < len(payload) <= MAX_RECEIVED_BYTES:
+    if _encoding_of(payload, encoding) is Encoding.MSGPACK and 0 < len(payload) <= MAX_RECEIVED_BYTES:
         value, text = _from_msgpack(payload)
     else:
         text = as_json(payload, encoding)
@@ -168,10 +168,10 @@ def remedy_steps(error: LdcndError) -> tuple[RemedyStep, ...]:
     return tuple(RemedyStep(verb=each.verb, said=each.said, arguments=dict(each.arguments)) for each in steps)
 
 
-def remedy_of(told: ReceivedError | Cause) -> Remedy | None:
+def remedy_of(reply: ReceivedError | Cause) -> Remedy | None:
     """Return the remedy that a reply tells of."""
-    steps = tuple(Step(each.verb, each.said, each.arguments) for each in told.steps)
-    return None if told.remedy is None else Remedy.of(told.remedy, steps)
+    steps = tuple(Step(each.verb, each.said, each.arguments) for each in reply.steps)
+    return None if reply.remedy is None else Remedy.of(reply.remedy, steps)
 
 
 def rebuild_error(reply: ReceivedError) -> LdcndError:
@@ -265,7 +265,7 @@ def as_json(payload: bytes, encoding: str, longest: int = MAX_RECEIVED_BYTES) ->
         )
     if not payload:
         return b"{}"
-    return _from_msgpack(payload)[1] if _told(payload, encoding) is Encoding.MSGPACK else payload
+    return _from_msgpack(payload)[1] if _encoding_of(payload, encoding) is Encoding.MSGPACK else payload
 
 
 @lru_cache(maxsize=64)
@@ -276,7 +276,7 @@ def _named(encoding: str) -> Encoding | None:
         return None
 
 
-def _told(payload: bytes, encoding: str) -> Encoding:
+def _encoding_of(payload: bytes, encoding: str) -> Encoding:
     """Detect the encoding from the payload when it is not named: clients often send bytes and say no more."""
     if named := _named(encoding):
         return named

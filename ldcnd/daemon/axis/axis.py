@@ -31,7 +31,7 @@ from ldcnd.daemon.axis.state import (
     AxisTracker,
     ObservedTracker,
 )
-from ldcnd.daemon.axis.telemetry import Arrivals, AxisTelemetry, EndTold, Note
+from ldcnd.daemon.axis.telemetry import Arrivals, AxisTelemetry, Note, OnEnded
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.daemon.trace.host_tracer import HostTracer, host_channels
@@ -192,7 +192,7 @@ class AxisService:
         publisher: Publisher,
         clock: Clock,
         next_command_id: Callable[[], str],
-        ended: EndTold,
+        ended: OnEnded,
         note: Note = _no_note,
         *,
         kept: KeptFiles | None = None,
@@ -367,7 +367,7 @@ class AxisService:
             asked |= END_ITEMS
         self.telemetry.reading(reading, asked, t, t_error_ns)
         if arrivals.reading:
-            arrivals.tell()
+            arrivals.report()
             self._ask_in_time(timing.sent_at_s)
             self.reference.woken.set()
 

@@ -395,6 +395,20 @@ class AxisMotion:
             self.begin(command_id, verb, state, completion)
             self.tracker.started(self.clock.now_s())
 
+    async def end(self, permit: Permit, failure: str = "") -> None:
+        """Bring the motion of a command to rest; an axis that has lost its loop meanwhile is switched off instead.
+
+        Args:
+            permit: of the command.
+            failure: why the command has failed; empty when it has not.
+        """
+        ours = self.tracker.command is not None
+        await self.driver.stop(StopMode.SMOOTH if self.tracker.enabled else StopMode.OFF)
+        if ours:
+            self.stopping(permit.command_id, permit.verb)
+            if failure:
+                self.tracker.failing(failure)
+
     def publish_state(self) -> None:
         """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""
         self._loop.call_soon(self._publish_now)

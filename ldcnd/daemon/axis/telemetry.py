@@ -248,7 +248,7 @@ class Arrival:
     settled: bool | None
 
 
-EndTold = Callable[[ActiveCommand, CommandStatus, str | None, Arrival | None], None]
+OnEnded = Callable[[ActiveCommand, CommandStatus, str | None, Arrival | None], None]
 """Takes a command that is over, how it ended, why when it was not done, and where; None where no reading shows it."""
 
 
@@ -260,20 +260,20 @@ class Arrivals:
         over: the commands that it has ended.
     """
 
-    def __init__(self, config: AxisConfig, shown: Callable[[int], float], told: EndTold, note: Note) -> None:
+    def __init__(self, config: AxisConfig, shown: Callable[[int], float], on_ended: OnEnded, note: Note) -> None:
         self.reading: AxisReading | None = None
         self._config = config
         self._counts_per_unit = config.signed_counts_per_unit
         self._shown = shown
-        self._told = told
+        self._on_ended = on_ended
         self._note = note
         self.over: list[tuple[ActiveCommand, CommandStatus, str | None, Arrival]] = []
 
-    def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, settled: bool | None) -> None:  # noqa: FBT001 - as the tracker tells it
+    def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, settled: bool | None) -> None:  # noqa: FBT001 - as the tracker calls it
         """Take from the tracker that a command is over; without a reading nothing shows where."""
         reading = self.reading
         if reading is None:
-            self._told(command, status, reason, None)
+            self._on_ended(command, status, reason, None)
             return
         lag = reading.following_error_counts
         if command.settling:
@@ -282,12 +282,12 @@ class Arrivals:
         arrival = Arrival(self._shown(reading.position_counts), following_error, settled)
         self.over.append((command, status, reason, arrival))
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Tell of what has ended: the reading is published."""
         self.reading = None
         while self.over:
             command, status, reason, arrival = self.over.pop(0)
-            self._told(command, status, reason, arrival)
+            self._on_ended(command, status, reason, arrival)
             if arrival.settled is False and command.settling:
                 settling, unit = command.settling, self._config.unit
                 window = abs(settling.window_counts / self._counts_per_unit)

@@ -10,7 +10,7 @@ from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import AxisTracker, Completion
-from ldcnd.drivers.driver import AnalogMotion, AxisReading, StopMode
+from ldcnd.drivers.driver import AnalogMotion, AxisReading
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.commands import CommandReply, MoveAnalog
 from ldcnd.model.samples import AxisState
@@ -72,12 +72,7 @@ class AnalogMove(Procedure):
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
-        motion = self._motion
-        ours = motion.tracker.command is not None
-        await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
-        if ours:
-            motion.stopping(self.permit.command_id, self.permit.verb)
-            motion.tracker.failing(self._failure)
+        await self._motion.end(self.permit, self._failure)
         return False
 
     def outlived(self, tracker: AxisTracker) -> bool:

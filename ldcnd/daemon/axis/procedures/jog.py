@@ -243,11 +243,8 @@ class HeldJog(Procedure):
         self._phase = _Phase.SLOWS
 
     async def _stop(self, reason: str) -> bool:
-        motion = self._motion
         self._over()
-        await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
-        motion.stopping(self.permit.command_id, self.permit.verb)
-        motion.tracker.failing(reason)
+        await self._motion.end(self.permit, reason)
         return False
 
     def _over(self) -> None:

@@ -11,7 +11,7 @@ from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
 from ldcnd.daemon.axis.procedure import Procedure
 from ldcnd.daemon.axis.state import AxisTracker, Completion
-from ldcnd.drivers.driver import AxisReading, StopMode
+from ldcnd.drivers.driver import AxisReading
 from ldcnd.errors import PositionLimit, Remedy, step
 from ldcnd.model.commands import CommandReply, MoveVelocity, Verb
 from ldcnd.model.samples import AxisState
@@ -75,13 +75,7 @@ class VelocityChange(Procedure):
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
-        motion = self._motion
-        reading, ours = motion.latest(), motion.tracker.command is not None
-        await motion.driver.stop(StopMode.SMOOTH if motion.tracker.enabled else StopMode.OFF)
-        if ours:
-            motion.stopping(self.permit.command_id, self.permit.verb)
-            if reading.cut_short:
-                motion.tracker.failing(reading.cut_short)
+        await self._motion.end(self.permit, self._motion.latest().cut_short)
         return False
 
     def outlived(self, tracker: AxisTracker) -> bool:
