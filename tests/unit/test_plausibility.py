@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.plausibility import NOISE_COUNTS, ROUNDS, PlausibilityGate, Verdict, agree
+from ldcnd.daemon.axis.polling import NOISE_COUNTS, ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 

@@ -20,7 +20,7 @@ from ldcnd.daemon.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.daemon.axis.parameters import Parameters
-from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Verdict, agree
+from ldcnd.daemon.axis.polling import ROUNDS, PlausibilityGate, Verdict, agree
 from ldcnd.daemon.axis.procedures.jog import Hold
 from ldcnd.daemon.axis.reference import ReferenceKeeper
 from ldcnd.daemon.axis.state import (
