@@ -16,12 +16,14 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
 from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.samples import LinkState
+from ldcnd.model.samples import LinkState, ShadowSample
 
 SHORTEST_LATENCY_S = 64e-6
 """Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""
 FRESH_S = 5.0
 """Maximum age of a report that counts, seconds."""
+SHADOW_FRESH_S = 60.0
+"""Likewise of what an observer says of an axis; it does so every 10 s."""
 ERRORS = ("timeouts", "corrupt_replies", "rejected_packets", "resynchronisations", "stray_bytes", "losses")
 
 
@@ -38,6 +40,7 @@ class HealthCollector(Collector):
         self._now_s = now_s
         self._daemon: tuple[float, DaemonHealth] | None = None
         self._buses: dict[str, tuple[float, BusHealth]] = {}
+        self._shadows: dict[str, tuple[float, ShadowSample]] = {}
 
     def take(self, report: DaemonHealth | BusHealth) -> None:
         """Replace the report that came before."""
@@ -45,6 +48,10 @@ class HealthCollector(Collector):
             self._daemon = (self._now_s(), report)
         else:
             self._buses = {**self._buses, report.bus: (self._now_s(), report)}  # a reader keeps the dict it has
+
+    def take_shadow(self, axis: str, sample: ShadowSample) -> None:
+        """Replace what an observer has said of an axis."""
+        self._shadows = {**self._shadows, axis: (self._now_s(), sample)}
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics; those of reports that have stopped coming are left out."""
@@ -58,6 +65,7 @@ class HealthCollector(Collector):
         yield from self._of_buses(buses)
         yield from self._of_lanes(buses)
         yield from self._of_axes(buses)
+        yield from self._of_shadows()
 
     def _of_daemon(self, daemon: DaemonHealth | None) -> Iterator[Metric]:
         lag = GaugeMetricFamily("ldcnd_loop_lag_seconds", "Longest that a timer came too late lately", labels=["rig"])
@@ -124,6 +132,25 @@ class HealthCollector(Collector):
                 if axis.eeprom_writes is not None:
                     wear.add_metric(values, axis.eeprom_writes)
         yield from (up, age, wanted, rate, faults, wear)
+
+    def _of_shadows(self) -> Iterator[Metric]:
+        labels = ["rig", "axis", "figure"]
+        value = GaugeMetricFamily("ldcnd_shadow_value", "Mean of a figure over the last motions", labels=labels)
+        usual = GaugeMetricFamily("ldcnd_shadow_usual", "What the axis had taught", labels=labels)
+        high = GaugeMetricFamily("ldcnd_shadow_high", "Above this mean there is an alarm", labels=labels)
+        low = GaugeMetricFamily("ldcnd_shadow_low", "Below this mean there is an alarm", labels=labels)
+        alarm = GaugeMetricFamily("ldcnd_shadow_alarm", "1 while an alarm stands", labels=labels)
+        since_s = self._now_s() - SHADOW_FRESH_S
+        for axis, (at_s, sample) in self._shadows.items():
+            for figure in sample.figures if at_s >= since_s else ():
+                values = [self._rig, axis, figure.figure]
+                value.add_metric(values, figure.value)
+                usual.add_metric(values, figure.usual)
+                high.add_metric(values, figure.high)
+                if figure.low is not None:
+                    low.add_metric(values, figure.low)
+                alarm.add_metric(values, float(figure.alarm))
+        yield from (value, usual, high, low, alarm)
 
 
 def _buckets(counts: Sequence[int]) -> list[tuple[str, float]]:

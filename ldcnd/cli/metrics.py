@@ -1,6 +1,7 @@
 """`ldcnd metrics`: the health of a running daemon for Prometheus, from a process of its own."""
 
 import asyncio
+from typing import TYPE_CHECKING
 
 import click
 
@@ -8,9 +9,13 @@ from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.cli.typed import address_option
 from ldcnd.client.health import health_reports
-from ldcnd.client.rig_client import RigClient
+from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
+from ldcnd.model.samples import ShadowSample, TelemetryItem
+
+if TYPE_CHECKING:
+    from ldcnd.metrics.exposition import HealthCollector
 
 DEFAULT_ADDRESS = "127.0.0.1:9464"
 
@@ -37,9 +42,22 @@ async def _serve(client: RigClient, address: ListenAddress) -> None:
     ending = asyncio.Event()
     on_end(ending.set)
     try:
-        async with health_reports(client, collector.take), metrics_server(registry, address.host, address.port) as port:
+        async with (
+            health_reports(client, collector.take),
+            client.samples(item=TelemetryItem.SHADOW) as shadows,
+            metrics_server(registry, address.host, address.port) as port,
+            asyncio.TaskGroup() as group,
+        ):
+            following = group.create_task(_follow(shadows, collector), name="shadows")
             click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
             await ending.wait()
+            following.cancel()
     except OSError as error:
         where = f"{address.in_url}:{address.port}"
         raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+
+
+async def _follow(shadows: Samples, collector: "HealthCollector") -> None:
+    async for axis, sample in shadows:
+        if isinstance(sample, ShadowSample):
+            collector.take_shadow(axis, sample)

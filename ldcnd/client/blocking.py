@@ -111,6 +111,7 @@ class Axis(Facade[asynchronous.Axis]):
     abort_trace = _waiting(asynchronous.Axis.abort_trace)
     why = _waiting(asynchronous.Axis.why)
     preview = _waiting(asynchronous.Axis.preview)
+    report_shadow = _waiting(asynchronous.Axis.report_shadow)
 
     # made by `ldcnd schema client`: end
 

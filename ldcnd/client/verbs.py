@@ -1,9 +1,10 @@
 """The verbs of an axis as methods; made from the command classes by `ldcnd schema client`, not edited."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TypeVar
 
+from collections.abc import Mapping
 from ldcnd.client.motion import Motion
 from ldcnd.model.commands import (
     AxisCommand,
@@ -28,11 +29,13 @@ from ldcnd.model.commands import (
     ProbeSource,
     ProbeStop,
     QuickStop,
+    ReportShadow,
     Reset,
     SetGains,
     SetOutputs,
     SetPosition,
     SetPwm,
+    ShadowReply,
     Track,
     Why,
     WhyReply,
@@ -61,7 +64,7 @@ from ldcnd.model.parameters import (
     RestartEepromCount,
     WriteParameter,
 )
-from ldcnd.model.samples import MonitorName
+from ldcnd.model.samples import MonitorName, ShadowFigure
 from ldcnd.model.traces import AbortTrace, TraceAbortReply
 
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -488,3 +491,16 @@ class AxisVerbs(ABC):
                 position=position, direction=direction, distance=distance, velocity=velocity, acceleration=acceleration
             )
         )
+
+    async def report_shadow(
+        self, t: int, judged: int, *, learning: bool, figures: tuple[ShadowFigure, ...] = ()
+    ) -> ShadowReply:
+        """Publish what an observer has found in the motions of an axis, on `tele/<axis>/shadow`; it stops nothing.
+
+        Args:
+            t: Of the last position that the observer has seen, UTC in ns since 1970.
+            learning: It still learns what is usual.
+            judged: Motions that have taught or were judged since the observer began.
+            figures: Those of which enough is known.
+        """
+        return await self._ask(lambda: ReportShadow(t=t, learning=learning, judged=judged, figures=figures))

@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field
 
 from ldcnd.errors import ErrorCode
 from ldcnd.model.frozen import Frozen
+from ldcnd.model.samples import MOST_SHADOW_FIGURES, ShadowFigure
 
 LARGEST_INTEGER = 2**53 - 1
 """The largest integer that every reader of JSON keeps exactly."""
@@ -692,6 +693,30 @@ class Preview(Command[PreviewReply]):
     """Units a second squared; the axis default when missing."""
 
 
+class ShadowReply(Frozen):
+    """What an observer says was published: the reply to `@cmd/<axis>/report_shadow`."""
+
+    axis: str
+    """The axis."""
+
+
+class ReportShadow(Command[ShadowReply]):
+    """Publish what an observer has found in the motions of an axis, on `tele/<axis>/shadow`; it stops nothing."""
+
+    verb = "report_shadow"
+    about = About.AXIS
+    effect = Effect.QUESTION
+
+    t: int = Field(ge=0)
+    """Of the last position that the observer has seen, UTC in ns since 1970."""
+    learning: bool
+    """It still learns what is usual."""
+    judged: int = Field(ge=0)
+    """Motions that have taught or were judged since the observer began."""
+    figures: tuple[ShadowFigure, ...] = Field(default=(), max_length=MOST_SHADOW_FIGURES)
+    """Those of which enough is known."""
+
+
 COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Power,
     MoveAbsolute,
@@ -712,5 +737,6 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     SetOutputs,
     Why,
     Preview,
+    ReportShadow,
 )
 """The commands of this file."""

@@ -57,6 +57,7 @@ class TelemetryItem(StrEnum):
     IO = "io"
     FAULT = "fault"
     STATE = "state"
+    SHADOW = "shadow"
 
 
 class Sample(Frozen):
@@ -185,6 +186,44 @@ class FaultSample(Sample):
     """The fault that came first since the last reset: the likely cause of the others."""
 
 
+MOST_SHADOW_FIGURES = 8
+"""One observer tells no more of an axis."""
+
+
+class ShadowFigure(Frozen):
+    """One figure of an axis, as an observer finds it in its motions."""
+
+    figure: str = Field(pattern="^[a-z_]{1,20}$")
+    """Which one: friction, inertia or misfit of `ldcnd shadow`."""
+    value: float
+    """Mean of the last motions."""
+    usual: float
+    """What the axis had taught for motions of this speed."""
+    low: float | None
+    """Below this mean there is an alarm; null without a lower limit."""
+    high: float
+    """Above this mean likewise."""
+    unit: str
+    """Unit of these values."""
+    motions: int = Field(ge=1)
+    """So many motions are in the mean."""
+    alarm: bool
+    """An alarm stands."""
+    meaning: str | None = None
+    """What may be behind it; null without an alarm."""
+
+
+class ShadowSample(Sample):
+    """What an observer, such as `ldcnd shadow`, says of an axis; the daemon passes it on and judges nothing."""
+
+    learning: bool
+    """It still learns what is usual."""
+    judged: int = Field(ge=0)
+    """Motions that have taught or were judged since the observer began."""
+    figures: tuple[ShadowFigure, ...]
+    """Those of which enough is known."""
+
+
 class CurrentCommand(Frozen):
     """The command that the axis carries out."""
 
@@ -272,6 +311,7 @@ SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {
     TelemetryItem.IO: IoSample,
     TelemetryItem.FAULT: FaultSample,
     TelemetryItem.STATE: StateSample,
+    TelemetryItem.SHADOW: ShadowSample,
 }
 
 _ITEMS = frozenset(item.value for item in TelemetryItem)

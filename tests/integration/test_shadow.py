@@ -12,12 +12,14 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.axis import RatesConfig
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError, NotSupported
+from ldcnd.model.commands import ReportShadow
+from ldcnd.model.samples import TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant, Shaft
 from ldcnd.tuning.ldcn import shadow
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.report import Estimate
-from ldcnd.tuning.ldcn.watching import WatchedAxis, memory_file, watch
+from ldcnd.tuning.ldcn.watching import LOOK_S, WatchedAxis, memory_file, watch
 from tests.support.rig import SIMULATED, running_rig
 from tests.unit.test_cli_tune import REPORT
 
@@ -49,10 +51,11 @@ async def working_rig(**changes):
 
 
 class Observer(RigClient):
-    """A client that cannot command."""
+    """A client that cannot command; it may have published what it finds."""
 
-    async def _answer(self, *_args):
-        raise AssertionError("the shadow has sent a command")
+    async def _answer(self, axis, command, timeout_s):
+        assert isinstance(command, ReportShadow), "the shadow has sent a command"
+        return await super()._answer(axis, command, timeout_s)
 
 
 @asynccontextmanager
@@ -91,6 +94,8 @@ async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_obse
             async with watched(rig, alarms, said):
                 await move(axis, 6)
                 healthy_gains = kept()["gains"]
+                await asyncio.sleep(LOOK_S + 1)
+                published = await rig.client.last("x", TelemetryItem.SHADOW)
                 await axis.set_gains(kp=300)
                 await asyncio.sleep(15)
 
@@ -101,6 +106,10 @@ async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_obse
     assert heavier.value > heavier.high
     assert heavier.meaning.startswith("a heavier load")
     assert not any(alarm.over for alarm in alarms)
+    (shown,) = [figure for figure in published.figures if figure.figure == "inertia"]
+    assert (shown.alarm, shown.meaning) == (True, heavier.meaning)
+    assert shown.value > shown.high > shown.usual
+    assert not published.learning
     assert ["learnt before" in line for line in said if "with these gains" in line] == [False, True, False]
     assert kept()["learnt"] == {}
     assert kept()["gains"] == {**healthy_gains, "kp": 300}

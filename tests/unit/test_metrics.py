@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from ldcnd.metrics import FRESH_S, HealthCollector
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
-from ldcnd.model.samples import LinkState
+from ldcnd.model.samples import LinkState, Quality, ShadowFigure, ShadowSample
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9)
@@ -44,11 +44,27 @@ def clock() -> Clock:
     return Clock()
 
 
+SHADOW = ShadowSample(
+    t=0,
+    t_error_ns=0,
+    seq=0,
+    quality=Quality.GOOD,
+    learning=False,
+    judged=120,
+    figures=(
+        ShadowFigure(
+            figure="friction", value=3.2, usual=2.0, low=None, high=2.5, unit="PWM steps", motions=20, alarm=True
+        ),
+    ),
+)
+
+
 @pytest.fixture
 def registry(clock) -> CollectorRegistry:
     collector = HealthCollector("sim", clock)
     collector.take(DAEMON)
     collector.take(BUS)
+    collector.take_shadow("x", SHADOW)
     registry = CollectorRegistry()
     registry.register(collector)
     return registry
@@ -84,6 +100,11 @@ def registry(clock) -> CollectorRegistry:
         ("ldcnd_axis_sample_age_seconds", {"bus": "line0", "axis": "y"}, None),
         ("ldcnd_axis_rate_hertz", {"bus": "line0", "axis": "x"}, 19.5),
         ("ldcnd_axis_faults", {"bus": "line0", "axis": "x"}, 2.0),
+        ("ldcnd_shadow_value", {"axis": "x", "figure": "friction"}, 3.2),
+        ("ldcnd_shadow_usual", {"axis": "x", "figure": "friction"}, 2.0),
+        ("ldcnd_shadow_high", {"axis": "x", "figure": "friction"}, 2.5),
+        ("ldcnd_shadow_low", {"axis": "x", "figure": "friction"}, None),
+        ("ldcnd_shadow_alarm", {"axis": "x", "figure": "friction"}, 1.0),
     ],
 )
 def test_a_report_is_read_back_from_the_metrics(registry, name, labels, value):

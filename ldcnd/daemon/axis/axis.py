@@ -55,6 +55,8 @@ from ldcnd.model.commands import (
     Preview,
     PreviewReply,
     QuickStop,
+    ReportShadow,
+    ShadowReply,
     Stop,
     Verb,
 )
@@ -547,6 +549,11 @@ class AxisService:
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""
         return preview(self._motion, self._bus, request, obstacles)
+
+    def report_shadow(self, report: ReportShadow) -> ShadowReply:
+        """Publish what an observer says of this axis; no effect."""
+        self.telemetry.shadow(report)
+        return ShadowReply(axis=self.config.name)
 
     async def stop(self, mode: StopMode) -> bool:
         """Stop at once, whatever the state, and latch; return whether the drive confirmed it.

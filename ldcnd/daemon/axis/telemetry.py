@@ -9,8 +9,9 @@ from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.log import get_logger
+from ldcnd.model.commands import ReportShadow
 from ldcnd.model.events import UNSETTLED, CommandStatus
-from ldcnd.model.samples import CurrentCommand, FaultEntry, LatchSample, Quality, TelemetryItem
+from ldcnd.model.samples import CurrentCommand, FaultEntry, LatchSample, Quality, ShadowSample, TelemetryItem
 
 log = get_logger("axis")
 
@@ -210,6 +211,19 @@ class AxisTelemetry:
     def latched(self, sample: LatchSample) -> None:
         """Publish what a probe has latched, with the next number of its topic."""
         self._publisher.item(self._tracker.name, TelemetryItem.LATCH).publish_sample(sample)
+
+    def shadow(self, report: ReportShadow) -> None:
+        """Publish what an observer says."""
+        sample = ShadowSample(
+            t=report.t,
+            t_error_ns=0,
+            seq=0,
+            quality=Quality.GOOD,
+            learning=report.learning,
+            judged=report.judged,
+            figures=report.figures,
+        )
+        self._publisher.item(self._tracker.name, TelemetryItem.SHADOW).publish_sample(sample)
 
     def stale(self, t: int) -> None:
         """Publish the last values once more as what they are now: not measurements any more."""

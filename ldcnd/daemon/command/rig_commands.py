@@ -34,6 +34,7 @@ from ldcnd.model.commands import (
     CommandReply,
     MoveAbsolute,
     Preview,
+    ReportShadow,
     Why,
     WhyReply,
 )
@@ -160,6 +161,8 @@ class RigCommands:
             case Preview():
                 why = self._why(self._rig.axes[axis], Why(absolute=command.position is not None))
                 return self._rig.axes[axis].preview(command, tuple(cause.text for cause in why.causes))
+            case ReportShadow():
+                return self._rig.axes[axis].report_shadow(command)
             case PreviewTogether():
                 return preview_together(self._rig, command)
             case ListHolders():

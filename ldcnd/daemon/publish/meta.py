@@ -241,8 +241,8 @@ def _publishes(driver: Drive, item: TelemetryItem) -> bool:
             return driver.shows_inputs
         case TelemetryItem.LATCH:
             return Verb.PROBE in driver.capabilities
-        case TelemetryItem.IO:
-            return False  # of modules, which are no axes
+        case TelemetryItem.IO | TelemetryItem.SHADOW:
+            return False  # of modules, which are no axes; of observers
         case _:
             return True
 

@@ -151,7 +151,7 @@ class Shadow:
         motions: so many were judged or have taught.
         unlike: so many were not, because nothing like them had taught.
         standing: alarms that are not over.
-        means: of each figure over the shorter window, against what is usual.
+        trend: the mean of each figure over the shorter window, with its limits.
     """
 
     def __init__(self, profile: Profile, plant: Plant, gains: Gains, memory: Memory | None = None) -> None:
@@ -159,7 +159,7 @@ class Shadow:
         self.motions = 0
         self.unlike = 0
         self.standing: dict[FigureName, Alarm] = {}
-        self.means: dict[FigureName, float] = {}
+        self.trend: dict[FigureName, Alarm] = {}
         self._meter = EffortMeter(profile, plant, gains)
         self._friction_pwm = plant.friction_pwm
         self._before: Effort | None = None
@@ -218,7 +218,7 @@ class Shadow:
         found = [self._mean(name, learnt, window, t_s) for window in WINDOWS if len(self._off[name]) >= window]
         if not found:
             return None
-        self.means[name] = found[0].value - found[0].usual
+        self.trend[name] = found[0]
         standing = self.standing.get(name)
         outside = [alarm for alarm in found if not alarm.low <= alarm.value <= alarm.high]
         if standing is None and outside:

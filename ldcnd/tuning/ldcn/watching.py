@@ -1,6 +1,7 @@
 """Following axes of a running rig by what it publishes: no lease, no command; what was learnt stays on this host."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,17 +13,18 @@ from ldcnd.client.kept_gains import gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
-from ldcnd.errors import ConfigError, NotSupported, WrongState
+from ldcnd.errors import ConfigError, LdcndError, NotSupported, WrongState
+from ldcnd.model.commands import ReportShadow
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import PositionSample, Quality, StateSample
+from ldcnd.model.samples import PositionSample, Quality, ShadowFigure, StateSample
 from ldcnd.tuning.ldcn.effort import FEWEST_SAMPLES, Seen
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.report import TuningReport
 from ldcnd.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Learnt, Memory, Shadow, Shown
 
 LOOK_S = 10.0
-"""The gains in force are read so often, seconds."""
+"""The gains in force are read, and what was found is published, so often, seconds."""
 KEEP_MOTIONS = 20
 """While an axis teaches, what it has taught is written down after so many motions."""
 RATE_SAMPLES = 20
@@ -153,7 +155,7 @@ class WatchedAxis:
         self._shadow: Shadow | None = None
         self._closed = False
         self._kept_at = 0
-        self._taken, self._first_t = 0, 0
+        self._taken, self._first_t, self._latest_t = 0, 0, 0
         self.described(info)
         if self._shadow is None:
             tell(f"{self.name}: waits until its loop has been closed once: its gains are not known")
@@ -228,6 +230,7 @@ class WatchedAxis:
             return
         was_learning = shadow.is_learning
         error_counts = sample.following_error * self._counts_per_unit
+        self._latest_t = sample.t
         for alarm in shadow.take(Seen(sample.t / 1e9, sample.counts, error_counts)):
             self._show(self._reported(alarm, sample.t))
         if was_learning and (not shadow.is_learning or shadow.motions >= self._kept_at + KEEP_MOTIONS):
@@ -248,6 +251,32 @@ class WatchedAxis:
                     f"{self.name}: its position comes every {every_s * 1e3:.0f} ms: motions shorter than"
                     f" {every_s * FEWEST_SAMPLES:.1f} s are not judged; configure rates.position of 50 Hz or more"
                 )
+
+    def report(self) -> ReportShadow | None:
+        """Return what is to be published of it; None before it was seen with its loop closed."""
+        shadow = self._shadow
+        if shadow is None or not self._latest_t:
+            return None
+        figures = []
+        for name, mean in shadow.trend.items():
+            standing = shadow.standing.get(name)
+            more = mean.latest >= mean.usual
+            figures.append(
+                ShadowFigure(
+                    figure=name.value,
+                    value=mean.value,
+                    usual=mean.usual,
+                    low=mean.low if math.isfinite(mean.low) else None,
+                    high=mean.high,
+                    unit=mean.unit,
+                    motions=mean.motions,
+                    alarm=standing is not None,
+                    meaning=meaning(name, more=more) if standing else None,
+                )
+            )
+        return ReportShadow(
+            t=self._latest_t, learning=shadow.is_learning, judged=shadow.motions, figures=tuple(figures)
+        )
 
     def _reported(self, alarm: Alarm, t: int) -> ShadowAlarm:
         values = asdict(alarm)
@@ -270,7 +299,7 @@ def _profile_of(info: AxisInfo) -> Profile:
 
 
 async def watch(client: RigClient, reports: Sequence[TuningReport], show: Show, tell: Tell, end: asyncio.Event) -> None:
-    """Follow axes until the end; sends nothing that any drive notices.
+    """Follow axes until the end; sends nothing to any drive, and to the daemon only what it is to publish.
 
     Args:
         client: of the rig.
@@ -294,6 +323,7 @@ async def watch(client: RigClient, reports: Sequence[TuningReport], show: Show, 
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(_follow(client, axis), name=f"shadow of {axis.name}") for axis in axes]
             tasks.append(group.create_task(_look(client, axes), name="gains in force"))
+            tasks.append(group.create_task(_publish(client, axes, tell), name="trend"))
             await end.wait()
             for task in tasks:
                 task.cancel()
@@ -312,6 +342,23 @@ async def _follow(client: RigClient, axis: WatchedAxis) -> None:
                 axis.state(sample)
             elif isinstance(sample, PositionSample):
                 axis.position(sample)
+
+
+async def _publish(client: RigClient, axes: Sequence[WatchedAxis], tell: Tell) -> None:
+    """Have the daemon publish what is found, now and then; a refusal is said once."""
+    said = False
+    while True:
+        await asyncio.sleep(LOOK_S)
+        for axis in axes:
+            report = axis.report()
+            if report is None:
+                continue
+            try:
+                await client.ask(report, axis.name)
+            except LdcndError as error:  # this login may not command, the daemon is older or away
+                if not said:
+                    tell(f"its trend is not published: {error.message}")
+                said = True
 
 
 async def _look(client: RigClient, axes: Sequence[WatchedAxis]) -> None:

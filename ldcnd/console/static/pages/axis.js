@@ -11,6 +11,7 @@ import { JogPanel } from "./axis_jog.js";
 import { MovePanel } from "./axis_motion.js";
 import { NowPanel } from "./axis_now.js";
 import { OutputsPanel } from "./axis_outputs.js";
+import { ShadowPanel } from "./axis_shadow.js";
 
 const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog", "probe"];
 
@@ -32,6 +33,7 @@ export function AxisPage({ at }) {
     <div class="columns">
       <div class="column">
         <${NowPanel} axis=${axis} />
+        <${ShadowPanel} axis=${axis} />
         ${axis.can("power") && html`<${WhyPanel} axis=${axis} />`}
         <${LimitsPanel} axis=${axis} />
         ${axis.can("set_gains") && html`<${GainsPanel} axis=${axis} />`}

@@ -68,6 +68,9 @@ function* ofAxis(rig, axis) {
   if (state?.link === "degraded") yield { ...at, level: "warn", text: "The drive missed its latest polls." };
   if (quality.level && state?.link !== "down")
     yield { ...at, level: quality.level, text: `Its values are ${quality.word}.` };
+  for (const { figure, value, usual, unit, meaning, alarm } of axis.samples.shadow?.figures ?? []) {
+    if (alarm) yield { ...at, level: "warn", text: `Motions take another ${figure} than usual: ${meaning}`, detail: `${number(value, 2)}, usual ${number(usual, 2)} ${unit}` };
+  }
   const asked = health?.items.find(({ item }) => item === "position")?.asked_hz ?? health?.rate_wanted_hz;
   if (state?.link === "up" && health && health.rate_hz + EDGE_HZ < ENOUGH * asked) {
     yield { ...at, level: "warn", text: "Fewer samples a second than asked for:", detail: `${number(health.rate_hz, 0)} of ${number(asked, 0)}` };

@@ -16,6 +16,8 @@ const SLOW_SHARE = 0.1;
 const SLOPE_S = 1;
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
+/** An observer speaks every ten seconds: an hour and a half. */
+const SHADOWS_KEPT = 540;
 
 /** One axis: its description and its latest samples. */
 export class Axis {
@@ -23,6 +25,7 @@ export class Axis {
   monitors = {};
   trace = null;
   holder = null;
+  shadows = [];
   #positions = [];
   #arrived = new Map();
 
@@ -68,6 +71,7 @@ export class Axis {
     else if (item === "trace") this.trace = sample;
     else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
     if (item === "position") this.#remember(sample);
+    if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
     if (sample) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
   }
 
