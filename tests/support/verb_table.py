@@ -48,6 +48,8 @@ EXPLAINED = {
     ("renew", "command line"): "a command that holds control renews it by itself",
     ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
     ("rehearse", "command line"): "`ldcnd drill`",
+    ("report_shadow", "command line"): "`ldcnd shadow`",
+    ("report_shadow", "console"): "the page of the axis shows what was reported",
 }
 """Why a verb is not in a place; everything else is there."""
 PLAIN_WORDS = {"path"}

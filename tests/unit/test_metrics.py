@@ -8,7 +8,7 @@ import promql_parser
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ldcnd.metrics import FRESH_S, HealthCollector
+from ldcnd.metrics import SHADOW_FRESH_S, HealthCollector
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
 from ldcnd.model.samples import LinkState, Quality, ShadowFigure, ShadowSample
 
@@ -112,7 +112,7 @@ def test_a_report_is_read_back_from_the_metrics(registry, name, labels, value):
 
 
 def test_reports_that_stop_coming_are_not_shown_as_if_they_were_true(registry, clock):
-    clock.now_s += FRESH_S + 1.0
+    clock.now_s += SHADOW_FRESH_S + 1.0
 
     samples = [line for line in generate_latest(registry).decode().splitlines() if not line.startswith("#")]
 

@@ -48,6 +48,9 @@ LEAST_SOFT_LEVEL = 5.0
 SOFT_STEP = 1.5
 SOFT_SHARE = 0.6
 """A soft move has arrived with this share of its distance: friction holds it there."""
+SOFT_AUTHORITY = 1.5
+"""The output limit of a soft move is so many times what friction and load hold at rest, at least: with less, the way
+tells by how much the output exceeds friction, and not the inertia."""
 FRACTION_OF_GAIN = 256
 """The drive divides what its gains make by this."""
 SOFT_S = 0.6
@@ -293,7 +296,7 @@ class Excitation:
                 if not rests:
                     break  # only the way in which it comes to rest distinguishes friction from inertia
                 left = reach - abs(shown.rest_counts)
-                if left > (1 - SOFT_SHARE) * reach or kp * left >= FRACTION_OF_GAIN * gains.ol:
+                if left > (1 - SOFT_SHARE) * reach or SOFT_AUTHORITY * kp * left >= FRACTION_OF_GAIN * gains.ol:
                     break  # at its limit all the way, the output tells only by how much it exceeds friction
                 records.append(shown.record)
             if len(records) == BOTH_WAYS:

@@ -30,7 +30,7 @@ MOST_CYCLES = 40.0
 MOST_STEP = (1.0, 1.5, 20.0, 20.0, 3.0, 20.0)
 """Largest change of each value of a plant in one step of the fit."""
 GOOD_COUNTS = 1.0
-GOOD_SHARE = 0.003
+GOOD_SHARE = 0.001
 """A fit that leaves no more than this share of the distance, or `GOOD_COUNTS`, is not begun again elsewhere."""
 STARTS = ((1.0, 1.0, 1.0), (0.6, 1.0, 0.5), (1.6, 1.0, 1.0), (1.0, 4.0, 0.3))
 """Factors of acceleration, damping and friction where fits begin."""
