@@ -15,7 +15,7 @@ from ldcnd.listen_address import ListenAddress
 from ldcnd.model.samples import ShadowSample, TelemetryItem
 
 if TYPE_CHECKING:
-    from ldcnd.metrics.exposition import HealthCollector
+    from ldcnd.metrics import HealthCollector
 
 DEFAULT_ADDRESS = "127.0.0.1:9464"
 
