@@ -146,10 +146,11 @@ class McapWriter:
         self._write(MCAP0_MAGIC)
 
     def _end_chunk(self) -> None:
-        used = {channel: entries for channel, entries in self._indexes.items() if entries}
+        used = [(channel, entries) for channel, entries in self._indexes.items() if entries]
         if not used:
             return
-        instants = [at for entries in used.values() for at, _ in entries]
+        used.sort(key=lambda index: index[1][0][1])  # by the first message of each
+        instants = [at for _, entries in used for at, _ in entries]
         first_ns, last_ns = min(instants), max(instants)
         self._first_ns = min(self._first_ns, first_ns) if self._chunks else first_ns
         self._last_ns = max(self._last_ns, last_ns)
@@ -166,7 +167,7 @@ class McapWriter:
             )
         )
         places, indexes_at = {}, self.size_bytes
-        for channel, entries in used.items():
+        for channel, entries in used:
             places[channel] = self.size_bytes
             count = len(entries)
             self._write(pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + 16 * count, channel, 16 * count))
