@@ -73,7 +73,7 @@ SIGN_OF_LIFE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class Subscription:
     """A page's subscription.
 
     Attributes:
@@ -91,7 +91,7 @@ class Wish:
         return not self.rigs or path.partition("/")[0] in self.rigs or path in self.streams
 
 
-def parse_wish(rigs: str, rate: str, stream: str) -> Wish:
+def parse_subscription(rigs: str, rate: str, stream: str) -> Subscription:
     """Return the subscription of a query.
 
     Raises:
@@ -111,7 +111,7 @@ def parse_wish(rigs: str, rate: str, stream: str) -> Wish:
     if any(len(parts) < 3 for parts in streams):  # noqa: PLR2004 - a rig, an axis and an item
         raise MalformedRequest("stream names RIG/AXIS/ITEM, separated by commas", value=stream[:80])
     paths = frozenset(f"{rig}/tele/{axis}/{item}" for rig, axis, item in streams)
-    return Wish(frozenset(name for name in rigs.split(",") if name), rate_hz, paths)
+    return Subscription(frozenset(name for name in rigs.split(",") if name), rate_hz, paths)
 
 
 class Page:
@@ -152,30 +152,30 @@ class Page:
 class Channel:
     """Sends the frames to all pages with one subscription."""
 
-    def __init__(self, values: LatestValues, wish: Wish) -> None:
+    def __init__(self, values: LatestValues, subscription: Subscription) -> None:
         self.pages: list[Page] = []
         self._values = values
-        self._wish = wish
+        self._subscription = subscription
         self._changed: set[str] = set()
         self._news: deque[bytes] = deque(maxlen=MOST_NEWS)
         self._stream: deque[bytes] = deque(maxlen=STREAMED_SAMPLES)
 
     def changed(self, path: str, entry: bytes) -> None:
         """Learn of a value."""
-        if path in self._wish.streams:
+        if path in self._subscription.streams:
             self._stream.append(entry)
-        elif self._wish.covers(path):
+        elif self._subscription.covers(path):
             self._changed.add(path)
 
     def happened(self, path: str, entry: bytes) -> None:
         """Learn of an event."""
-        if self._wish.covers(path):
+        if self._subscription.covers(path):
             self._news.append(entry)
 
     async def run(self) -> None:
         """Tell the pages until cancelled."""
         loop = asyncio.get_running_loop()
-        period_s = 1.0 / (STREAM_HZ if self._wish.streams else self._wish.rate_hz)
+        period_s = 1.0 / (STREAM_HZ if self._subscription.streams else self._subscription.rate_hz)
         due_s = values_due_s = told_s = loop.time()
         while True:
             # a late turn is no reason for a burst of frames
@@ -184,7 +184,7 @@ class Channel:
             now_s = loop.time()
             paths: frozenset[str] = frozenset()
             if now_s >= values_due_s:
-                values_due_s = max(values_due_s + 1.0 / self._wish.rate_hz, now_s)
+                values_due_s = max(values_due_s + 1.0 / self._subscription.rate_hz, now_s)
                 paths = frozenset(self._changed)
                 self._changed.clear()
             if paths or self._news or self._stream or now_s >= told_s + SIGN_OF_LIFE_S:
@@ -209,7 +209,7 @@ class Feed:
     def __init__(self, values: LatestValues, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
         self._values = values
-        self._channels: dict[Wish, tuple[Channel, asyncio.Task[None]]] = {}
+        self._channels: dict[Subscription, tuple[Channel, asyncio.Task[None]]] = {}
         self._group = asyncio.TaskGroup()
 
     async def __aenter__(self) -> Self:
@@ -222,7 +222,7 @@ class Feed:
         await self._group.__aexit__(None, None, None)
 
     @contextmanager
-    def open_page(self, wish: Wish) -> Iterator[Page]:
+    def open_page(self, subscription: Subscription) -> Iterator[Page]:
         """Serve a page for as long as the context lasts.
 
         Raises:
@@ -230,21 +230,21 @@ class Feed:
         """
         if sum(len(channel.pages) for channel, _ in self._channels.values()) >= MOST_PAGES:
             raise TooManyRequests(f"{MOST_PAGES} pages are open", limit=MOST_PAGES, remedy="close some of them")
-        channel, task = self._channels.get(wish) or self._new_channel(wish)
-        page = Page(self._values.entry, Batch(self._values.names(wish.covers)), self._now_ns)
+        channel, task = self._channels.get(subscription) or self._new_channel(subscription)
+        page = Page(self._values.entry, Batch(self._values.names(subscription.covers)), self._now_ns)
         channel.pages.append(page)
         try:
             yield page
         finally:
             channel.pages.remove(page)
             if not channel.pages:
-                del self._channels[wish]
+                del self._channels[subscription]
                 self._values.watchers.remove(channel)
                 task.cancel()
 
-    def _new_channel(self, wish: Wish) -> tuple[Channel, asyncio.Task[None]]:
-        channel = Channel(self._values, wish)
-        task = self._group.create_task(channel.run(), name=f"channel at {wish.rate_hz:g} Hz")
+    def _new_channel(self, subscription: Subscription) -> tuple[Channel, asyncio.Task[None]]:
+        channel = Channel(self._values, subscription)
+        task = self._group.create_task(channel.run(), name=f"channel at {subscription.rate_hz:g} Hz")
         self._values.watchers.append(channel)
-        self._channels[wish] = (channel, task)
+        self._channels[subscription] = (channel, task)
         return channel, task

@@ -16,7 +16,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from ldcnd.client.trace_file import trace_as_csv, trace_as_json
 from ldcnd.client.traces import Trace, fetch_trace
 from ldcnd.console.errors import Answer, answering_errors, error_response
-from ldcnd.console.feed import Feed, Page, parse_wish
+from ldcnd.console.feed import Feed, Page, parse_subscription
 from ldcnd.console.replies import RigsReply
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitors
@@ -70,8 +70,8 @@ def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors, *, commissions: b
     async def telemetry(socket: WebSocket) -> None:
         query = socket.query_params
         try:
-            wish = parse_wish(query.get("rigs", ""), query.get("rate", ""), query.get("stream", ""))
-            with feed.open_page(wish) as page:
+            subscription = parse_subscription(query.get("rigs", ""), query.get("rate", ""), query.get("stream", ""))
+            with feed.open_page(subscription) as page:
                 await socket.accept()
                 await _serve(socket, page, partial(visitors.see, socket.state.visitor))
         except LdcndError as error:

@@ -67,7 +67,7 @@ async def test_a_page_that_says_anything_is_closed(console):
 
 
 @pytest.mark.parametrize(("query", "status"), [("?rate=fast", 400), ("?rate=1000", 409), ("?stream=x", 400)])
-async def test_a_wish_that_cannot_be_met_is_refused_before_the_socket_opens(console, query, status):
+async def test_a_subscription_that_cannot_be_met_is_refused_before_the_socket_opens(console, query, status):
     async with page(console.app, console.browser, query) as socket:
         pass
 
@@ -78,7 +78,9 @@ async def test_a_page_that_takes_nothing_for_long_is_given_up_and_leaves_nothing
     opened = []
     open_page = Feed.open_page
     monkeypatch.setattr(reading, "SEND_TIME_S", 2.0)
-    monkeypatch.setattr(Feed, "open_page", lambda feed, wish: opened.append(feed) or open_page(feed, wish))
+    monkeypatch.setattr(
+        Feed, "open_page", lambda feed, subscription: opened.append(feed) or open_page(feed, subscription)
+    )
     async with page(console.app, console.browser) as socket:
         socket.stop_reading()
         await asyncio.sleep(5)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import msgpack
 import pytest
 
-from ldcnd.console.feed import MOST_PAGES, Feed, parse_wish
+from ldcnd.console.feed import MOST_PAGES, Feed, parse_subscription
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
 from ldcnd.messaging.session import Sample, SampleKind
@@ -37,7 +37,7 @@ class Rig:
 
     @asynccontextmanager
     async def page(self, rigs="", rate="", stream=""):
-        with self.feed.open_page(parse_wish(rigs, rate, stream)) as page:
+        with self.feed.open_page(parse_subscription(rigs, rate, stream)) as page:
             frames = page.frames()
             try:
                 yield page, frames
@@ -221,7 +221,7 @@ async def test_values_never_go_back_on_a_page_that_reads_now_and_then(rig):
     assert loop.time() < 60
 
 
-async def test_pages_with_the_same_wish_share_the_work(rig):
+async def test_pages_with_the_same_subscription_share_the_work(rig):
     encoded = []
     entry = rig.values.entry
     rig.values.entry = lambda name: encoded.append(name) or entry(name)
@@ -256,16 +256,16 @@ async def test_values_of_a_rig_that_comes_back_are_put_in_order(rig):
 
 
 async def test_there_is_a_limit_to_pages_and_it_is_told(rig):
-    wish = parse_wish("", "", "")
-    opened = [rig.feed.open_page(wish) for _ in range(MOST_PAGES)]
+    subscription = parse_subscription("", "", "")
+    opened = [rig.feed.open_page(subscription) for _ in range(MOST_PAGES)]
     for one in opened:
         one.__enter__()
 
     with pytest.raises(TooManyRequests, match="pages are open"):
-        rig.feed.open_page(wish).__enter__()
+        rig.feed.open_page(subscription).__enter__()
 
     opened.pop().__exit__(None, None, None)
-    with rig.feed.open_page(wish):
+    with rig.feed.open_page(subscription):
         pass
     for one in opened:
         one.__exit__(None, None, None)
@@ -274,15 +274,15 @@ async def test_there_is_a_limit_to_pages_and_it_is_told(rig):
 @pytest.mark.parametrize("rate", ["0", "0.5", "61", "inf", "nan", "-1"])
 def test_a_rate_that_is_not_served_is_refused(rate):
     with pytest.raises(ValueOutOfRange, match="1 to 60"):
-        parse_wish("", rate, "")
+        parse_subscription("", rate, "")
 
 
 @pytest.mark.parametrize(("rate", "stream"), [("fast", ""), ("", "sim/x"), ("", "position")])
-def test_a_wish_that_cannot_be_read_is_refused(rate, stream):
+def test_a_subscription_that_cannot_be_read_is_refused(rate, stream):
     with pytest.raises(MalformedRequest):
-        parse_wish("", rate, stream)
+        parse_subscription("", rate, stream)
 
 
 def test_too_many_streams_are_refused():
     with pytest.raises(ValueOutOfRange, match="streams"):
-        parse_wish("", "", ",".join(f"sim/a{number}/position" for number in range(65)))
+        parse_subscription("", "", ",".join(f"sim/a{number}/position" for number in range(65)))
