@@ -85,4 +85,4 @@ class ScanConversation(Conversation):
         before, after = begun.before.splitlines(), begun.text.splitlines()
         if await self.person.approve(file, list(difflib.unified_diff(before, after, file, file, lineterm="", n=2))):
             write(begun)
-            self.person.tell(f"{file} is written: {len(drives)} drives. Start its daemon with the command above")
+            self.person.tell(f"{file} is written: {len(drives)} drives. Start its daemon with the command on this page")
