@@ -101,7 +101,14 @@ def _line_rows(line_program: Path, folder: Path, rounds: int, *, in_one_piece: b
         doubt = f"the lines themselves were late by {late_us:.0f} us" if late_us > LATE_US else ""
         found += [
             Row(f"{what}: processor time of a poll", _median(load.cpu_us for load in own), "us"),
-            Row(f"{what}: share of one processor", _median(load.core for load in own), "", core, at_most=True),
+            Row(
+                f"{what}: share of one processor",
+                _median(load.core for load in own),
+                "",
+                core,
+                at_most=True,
+                doubt=doubt,
+            ),
             replace(paired(f"{what}: efficiency / that of 1 line", efficiencies, efficiency), doubt=doubt),
             paired(f"{what}: processor time of a poll / that of 1 line", costs, cost, at_most=True),
             Row(f"{what}: the lines' own lateness, 99 %", late_us, "us"),

@@ -1,6 +1,7 @@
 """System calls of the main thread for each poll, counted by strace; what timers wake it for is told apart."""
 
 import shutil
+import statistics
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -42,12 +43,12 @@ def rows(line_program: Path, folder: Path) -> list[Row]:
     for burst in (True, False):
         how = "in one piece" if burst else "byte by byte"
         with paced_lines(line_program, modules=MODULES, ready_baud=BAUD, burst=burst) as line, _bare_bus(line) as it:
-            found.append(_row(f"system calls of a poll, nothing published, replies {how}", strace, it, folder, 3.1))
+            found.append(_row(f"system calls of a poll, nothing published, replies {how}", strace, it, folder, 3))
         with (
             paced_lines(line_program, modules=MODULES, ready_baud=0, burst=burst) as line,
             _daemon(line, folder) as it,
         ):
-            found.append(_row(f"system calls of a poll, whole daemon, replies {how}", strace, it, folder))
+            found.append(_row(f"system calls of a poll, whole daemon, replies {how}", strace, it, folder, 4))
     return found
 
 
@@ -76,16 +77,21 @@ def _row(name: str, strace: str, running: subprocess.Popen, folder: Path, target
     return Row(name, calls, "", target, at_most=True, exact=True)
 
 
-def _calls_of_a_poll(strace: str, running: subprocess.Popen, trace: Path) -> float:
+def _calls_of_a_poll(strace: str, running: subprocess.Popen, trace: Path) -> int:
+    """Return how many calls lie from one request to the next, in the median: a poll that is held up has more."""
     tracing = subprocess.Popen(  # noqa: S603
         (strace, "-s", "1", "-o", trace, "-p", str(running.pid)), stderr=subprocess.DEVNULL
     )
     settle(COUNT_S)
     tracing.terminate()
     tracing.wait()
-    calls = trace.read_text().splitlines()
-    polls = sum(1 for call in calls if call.startswith("write(") and REQUEST in call)
-    waits = [call for call in calls if call.startswith("epoll_wait(")]
-    timers = sum(1 for call in waits if call.rstrip().endswith("= 0"))
-    others = sum(1 for call in calls if call.startswith(OF_THE_LINE))
-    return (polls + len(waits) - timers + others) / polls
+    polls, count = [], 0
+    for call in trace.read_text().splitlines():
+        if call.startswith("write(") and REQUEST in call:
+            polls.append(count + 1)
+            count = 0
+        elif call.startswith("epoll_wait("):
+            count += not call.rstrip().endswith("= 0")  # a timer's
+        else:
+            count += call.startswith(OF_THE_LINE)
+    return statistics.median_low(polls)
