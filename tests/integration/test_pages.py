@@ -28,6 +28,7 @@ ELSEWHERE = {
     "deploy/INSTALL.md": "test_every_command_of_the_guide_works",
     "docs/how-to/replay-a-capture.md": "test_what_the_page_does_with_a_capture_can_be_done",
     "docs/how-to/take-a-trace.md": "test_a_move_is_traced_to_a_file_shown_and_drawn",
+    "docs/how-to/watch-an-axis.md": "test_the_blocks_of_the_page_tune_an_axis_and_watch_it",
 }
 """Pages whose commands another test runs."""
 NOT_RUN = {
@@ -85,12 +86,6 @@ NOT_RUN = {
     ),
     ("docs/how-to/tune.md", "ldcnd tune x --bandwidth 25 --yes --plot tune.png"): (
         "test_the_command_tunes_draws_and_prints_its_report_as_json"
-    ),
-    ("docs/how-to/watch-an-axis.md", "ldcnd tune x --yes --json | tee x.json"): (
-        "test_the_command_tunes_draws_and_prints_its_report_as_json"
-    ),
-    ("docs/how-to/watch-an-axis.md", "ldcnd shadow x.json"): (
-        "test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_observer"
     ),
     ("docs/how-to/tune.md", "ldcnd tune feed"): "test_the_command_shows_tries_and_puts_back",
     ("docs/how-to/tune.md", "ldcnd tune feed --set Pn102=45 --record 2 --yes"): (

@@ -20,9 +20,12 @@ from ldcnd.tuning.ldcn import shadow
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.report import Estimate
 from ldcnd.tuning.ldcn.watching import LOOK_S, WatchedAxis, memory_file, watch
+from tests.support.command_line import virtual_rig
+from tests.support.pages import ROOT, blocks_of
 from tests.support.rig import SIMULATED, running_rig
 from tests.unit.test_cli_tune import REPORT
 
+PAGE = ROOT / "docs" / "how-to" / "watch-an-axis.md"
 MACHINE = MotorPlant(inertia_kg_m2=2e-4, friction_nm=0.02)
 TUNED = REPORT.model_copy(
     update={
@@ -128,3 +131,23 @@ async def test_what_cannot_be_watched_is_refused_and_slow_positions_are_said():
 
     assert said[0] == "x: waits until its loop has been closed once: its gains are not known"
     assert "x: its position comes every 100 ms: motions shorter than 1.2 s are not judged" in said[-1]
+
+
+@pytest.mark.system  # a whole tuning takes half a minute of processor time
+@pytest.mark.timeout(300)
+def test_the_blocks_of_the_page_tune_an_axis_and_watch_it(monkeypatch, tmp_path):
+    typed = [line for block in blocks_of(PAGE) for line in block.text.splitlines() if line.startswith("ldcnd ")]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ldcnd.cli.shadow.on_end", lambda told: asyncio.get_running_loop().call_later(2 * LOOK_S, told))
+
+    with virtual_rig(monkeypatch) as rig:
+        tunes, watches = (line.removeprefix("ldcnd ").partition(" | tee ") for line in typed)
+        for before in ("axis power x on", "axis home x --wait", "axis power x off"):
+            assert rig.run(before).code == 0, before
+        tuned = rig.run(tunes[0])
+        assert tuned.code == 0, tuned.errors
+        (tmp_path / tunes[2]).write_text(tuned.printed.splitlines()[-1])
+        watched = rig.run(watches[0])
+
+    assert watched.code == 0, watched.errors
+    assert "x: learns from its first" in watched.errors
