@@ -142,8 +142,7 @@ def test_the_blocks_of_the_page_tune_an_axis_and_watch_it(monkeypatch, tmp_path)
 
     with virtual_rig(monkeypatch) as rig:
         tunes, watches = (line.removeprefix("ldcnd ").partition(" | tee ") for line in typed)
-        for before in ("axis power x on", "axis home x --wait", "axis power x off"):
-            assert rig.run(before).code == 0, before
+        rig.wait(rig.rig.until("x", lambda state: state.link == "up"))
         tuned = rig.run(tunes[0])
         assert tuned.code == 0, tuned.errors
         (tmp_path / tunes[2]).write_text(tuned.printed.splitlines()[-1])
