@@ -10,11 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap.writer import CompressionType, Writer
+
 from ldcnd.errors import ConfigError
 from ldcnd.model.frozen import Frozen
-from ldcnd.recording.mcap_writer import McapWriter
 from ldcnd.recording.messages import Entry, schema_of
 
+CHUNK_BYTES = 1024 * 1024
+"""Maximum size that is compressed and written together; `McapFile.flush` ends a chunk earlier."""
 PART = ".part"
 FACTS = "ldcnd.recording"
 """Name of the metadata that tell what is missing."""
@@ -32,14 +35,14 @@ class McapFile:
         self.path = path
         self._part = part_of(path)
         self._stream: BinaryIO = self._part.open("xb")
-        self._writer = McapWriter(self._stream)
+        self._writer = start_writer(self._stream)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
     @property
     def size_bytes(self) -> int:
         """Size of the written data, bytes."""
-        return self._writer.size_bytes
+        return self._stream.tell()
 
     def attach(self, name: str, document: bytes, now_ns: int) -> None:
         """Add a description of the rig, in JSON."""
@@ -51,18 +54,18 @@ class McapFile:
         if channel is None:
             schema = self._schema(entry.message)
             channel = self._channels[key] = self._writer.register_channel(f"/{key}", "json", schema)
-        self._writer.add_message(channel, now_ns, entry.data, entry.t, entry.seq & 0xFFFFFFFF)
+        self._writer.add_message(channel, now_ns, entry.data, publish_time=entry.t, sequence=entry.seq & 0xFFFFFFFF)
 
     def flush(self) -> None:
         """Put what was added on the disk; returns when it is there."""
-        self._writer.flush()
+        self._writer.flush()  # type: ignore[no-untyped-call] # the package leaves its result open
         os.fsync(self._stream.fileno())
 
     def complete(self, facts: Mapping[str, str]) -> None:
         """End the file, with what is to be known of it, and give it its name."""
         with self._stream:
             self._writer.add_metadata(FACTS, dict(facts))
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call] # as above
             self._stream.flush()
             os.fsync(self._stream.fileno())
         self._part.rename(self.path)
@@ -73,6 +76,13 @@ class McapFile:
         if number is None:
             number = self._schemas[name] = self._writer.register_schema(name, "jsonschema", text.encode())
         return number
+
+
+def start_writer(stream: BinaryIO) -> Writer:
+    """Begin a file."""
+    writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+    writer.start(profile="", library="ldcnd")
+    return writer
 
 
 def part_of(path: Path) -> Path:

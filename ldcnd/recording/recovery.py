@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
+from mcap.writer import Writer
 
-from ldcnd.recording.mcap_file import FACTS, Losses, part_of
-from ldcnd.recording.mcap_writer import McapWriter
+from ldcnd.recording.mcap_file import FACTS, Losses, part_of, start_writer
 from ldcnd.recording.reading import Damage, Recording
 
 
@@ -37,7 +37,7 @@ def recover(damaged: Path, whole: Path) -> Recovered:
     recording = Recording(damaged)
     part = part_of(whole)
     with part.open("xb") as target:
-        copy = _Copy(McapWriter(target))
+        copy = _Copy(start_writer(target))
         try:
             for record in recording.records():
                 copy.add(record)
@@ -52,7 +52,7 @@ def recover(damaged: Path, whole: Path) -> Recovered:
 class _Copy:
     """The whole file while it is written."""
 
-    def __init__(self, writer: McapWriter) -> None:
+    def __init__(self, writer: Writer) -> None:
         self.messages = 0
         self.last_ns = 0
         self.losses = Losses()
@@ -88,7 +88,7 @@ class _Copy:
             damages = {f"damage {number}": str(damage) for number, damage in enumerate(recording.damages, 1)}
             facts = {"messages": str(self.messages), "recovered_from": recording.path.name, **damages}
             self._writer.add_metadata(FACTS, facts | self.losses.facts())
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call] # the package leaves its result open
 
     def _message(self, record: Message) -> None:
         channel = self._channels[record.channel_id]
