@@ -76,7 +76,7 @@ class HoldingOutput(Step):
             f"beyond a position error of {el} counts the drive opens its loop; then more output is tried",
             "run the step motor first: this one takes for granted that motor and encoder agree",
             "the loop is open before, between and after: a load that falls without power must be secured",
-            "Ctrl-C halts it and opens the loop",
+            "ending the step, in a terminal by Ctrl-C, halts it and opens the loop",
             "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
         )
 

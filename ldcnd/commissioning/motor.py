@@ -83,7 +83,7 @@ class MotorDirection(Step):
                 f" {lead.distance / lead.velocity:.2g} s, and you are asked whether the axis moved: watch it"
             ),
             "the loop is open before, between and after: a load that falls without power must be secured",
-            "Ctrl-C halts it and opens the loop",
+            "ending the step, in a terminal by Ctrl-C, halts it and opens the loop",
             "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
         )
 

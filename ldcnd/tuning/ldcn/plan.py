@@ -151,6 +151,6 @@ def _lines(info: AxisInfo, here: float, bounds: Bounds, excitation: Excitation) 
         "Short pulses come first, then soft moves by a quarter of that, stiff ones by an eighth, test moves by half.",
         "The loop is opened between moves: what does not stay where it is without power must be secured.",
         f"Without an encoder the motor would get pulses of at most {output}; the drive ends them.",
-        "Its gains are kept on this host, and put back at the end, at Ctrl-C and on a fault.",
+        "Its gains are kept on this host, and put back when it ends, is ended (Ctrl-C in a terminal) or fails.",
         "This is software, not an emergency stop: keep yours within reach.",
     )
