@@ -9,8 +9,9 @@ import pytest
 from ldcnd.cli.parameter_file import load_parameters
 from ldcnd.client.trace_file import load_trace
 from ldcnd.client.traces import fetch_trace, trace_header
-from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
+from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, ReportShadow, SetGains
 from ldcnd.model.events import CommandStatus
+from ldcnd.model.samples import ShadowFigure
 from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
 from tests.support.process import ROOT
 
@@ -235,6 +236,25 @@ async def test_what_needs_attention_is_said_once_and_links_keep_the_axis(house):
         await desk.page.get_by_role("link", name="Trace", exact=True).last.click()
         await expect(desk.page.get_by_role("heading", name="Record y")).to_be_visible()
     await house.sim.quiet("x", "y")
+
+
+async def test_what_a_shadow_finds_is_on_the_page_of_its_axis_and_its_alarm_needs_attention(house):
+    figure = ShadowFigure(
+        figure="friction", value=2.0, usual=2.0, low=1.5, high=2.5, unit="PWM steps", motions=20, alarm=False
+    )
+    grown = figure.model_copy(update={"value": 3.2, "alarm": True, "meaning": "bearings, guides, grease"})
+    rig = house.sim.rig
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        for t, each in enumerate((figure, grown)):
+            await rig.ask(ReportShadow(t=t, learning=False, judged=120, figures=(each,)), "x")
+            await expect(desk.panel("Shadow").get_by_text(f"{each.value:.3f}").first).to_be_visible()
+        await expect(desk.panel("Shadow").get_by_role("img", name="friction: from 2.000 to 3.200")).to_be_visible()
+        await expect(desk.panel("Shadow").get_by_text("friction: bearings, guides, grease")).to_be_visible()
+        await desk.open("rig")
+        await expect(desk.page.get_by_text("Motions take another friction than usual").first).to_be_visible()
+        await rig.ask(ReportShadow(t=3, learning=False, judged=140, figures=(figure,)), "x")
+        await expect(desk.page.get_by_text("Motions take another friction than usual")).to_have_count(0)
 
 
 async def test_a_page_is_added_by_its_list(house, tmp_path):

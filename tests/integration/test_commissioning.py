@@ -34,6 +34,7 @@ def state_home(tmp_path, monkeypatch):
 
 
 SEED = 7
+SOAK = (pytest.mark.soak, pytest.mark.timeout(1800))
 VELOCITIES = "velocity = 1000\nacceleration = 5000"
 STANDS = {"did the axis move": "n"}
 
@@ -75,7 +76,7 @@ async def test_a_reversed_motor_is_caught_within_the_stated_distance(direction, 
         assert await rig.registers() == GAINS
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(60, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [2, pytest.param(60, marks=SOAK)])
 @pytest.mark.parametrize("wrong", ["", "motor_reversed", "encoder_disconnected"])
 async def test_drawn_machines_stay_near_whatever_is_wrong_with_their_wires(wrong, count, tmp_path):
     for drawn in drawn_plants(SEED, count):
@@ -260,7 +261,7 @@ async def braked_without_power(rig):
         await asyncio.sleep(0.01)
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(60, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [2, pytest.param(20, marks=SOAK)])
 async def test_friction_and_load_of_drawn_machines_are_measured(count, tmp_path):
     hanging = [drawn for drawn in drawn_plants(SEED, 5 * count) if drawn.motor.load_nm][:count]
     off = []
