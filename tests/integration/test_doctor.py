@@ -30,10 +30,8 @@ async def test_a_port_that_does_not_open_is_told():
     rig = load_config(MIXED)
     absent = rig.bus[1].model_copy(update={"port": "/dev/absent-adapter"})
 
-    with pytest.raises(ExceptionGroup) as failure:
+    with pytest.raises(BusDown, match="/dev/absent-adapter cannot be opened"):
         await examine_line(rig, absent, lambda _: None)
-
-    assert failure.group_contains(BusDown)
 
 
 def test_what_a_drive_shows_of_its_traces_is_reported_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
