@@ -22,18 +22,19 @@ from ldcnd.errors import CommandAborted, DriveFault
 from ldcnd.model.commands import Verb
 from ldcnd.model.samples import AxisState
 
-WAY = 1.5
-"""Each motion goes this many times the position error limit."""
+WAY = 2.5
+"""Each motion goes this many times the position error limit: it counts from the goal before, which the axis may be one
+limit behind, so an axis that does not follow both ways exceeds the limit."""
 SATURATED_SHARE = 0.8
 """The output is at its limit from this share of the position error limit on."""
-DURATION_S = 2.0
+DURATION_S = 3.0
 """Time for each motion, seconds: so slow that it ends with no more speed than friction takes at once."""
 RAMP_SHARE = 0.1
 APPROACHES = 2
 """From each side."""
 GROWTH = 1.5
 CARRIED_GROWTH = 3.0
-"""Growth of the output limit where the axis stood, and where a load carried it away."""
+"""Growth of the output limit where the axis stood, and where it went one way: by itself, or carried by a load."""
 HALF_A_STEP = 0.5
 UNIT = "of 255 PWM steps"
 
@@ -92,7 +93,7 @@ class HoldingOutput(Step):
                 outputs = await self._approach(site, axis, output, el, origin)
                 if len(outputs) == 2 * APPROACHES:
                     return _judged(site, outputs, old.get("cl"))
-                carried = abs(await rest_counts(axis) - before) > WAY * el / 2
+                carried = abs(await rest_counts(axis) - before) > el / 2
                 output = math.ceil(output * (CARRIED_GROWTH if carried else GROWTH))
         return _failed(
             f"it does not follow with {min(OUTPUTS[-1], old['ol'])} {UNIT}: look for a closed brake, a jam, or a load"

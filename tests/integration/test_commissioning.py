@@ -209,11 +209,11 @@ def in_pwm(motor):
     return plant.friction_pwm, -plant.load_pwm
 
 
-@pytest.mark.parametrize("direction", ["forward", "reverse"])
-async def test_the_output_at_rest_tells_friction_and_load(direction, tmp_path):
+@pytest.mark.parametrize(("direction", "pulls"), [("forward", -3.2), ("reverse", -3.2), ("forward", 4.4)])
+async def test_the_output_at_rest_tells_friction_and_load(direction, pulls, tmp_path):
     nm = PLANT.torque_nm_per_a * PLANT.supply_v / PLANT.resistance_ohm / 255
     text = rig_text(direction=direction)
-    async with commissioning_rig(tmp_path, text=text, friction_nm=6 * nm, load_nm=-3.2 * nm) as rig:
+    async with commissioning_rig(tmp_path, text=text, friction_nm=6 * nm, load_nm=pulls * nm) as rig:
         checklist = await rig.checklist()
         preview = await checklist.preview("hold")
         kept = await checklist.run("hold")
@@ -221,11 +221,11 @@ async def test_the_output_at_rest_tells_friction_and_load(direction, tmp_path):
         shown = figures(kept)
         sign = 1 if direction == "forward" else -1
         assert kept.result.state is StepState.DONE
-        assert shown["output that holds the load, to half a step"] == pytest.approx(sign * 3.2, abs=0.5)
+        assert shown["output that holds the load, to half a step"] == pytest.approx(-sign * pulls, abs=0.5)
         assert shown["friction, to half a step"] == pytest.approx(6.0, abs=0.5)
-        assert f"pulls it {'back' if sign > 0 else 'forward'}" in kept.result.text
+        assert f"pulls it {'forward' if sign * pulls > 0 else 'back'}" in kept.result.text
         assert "holds it without power" in kept.result.text
-        assert any("by 300 counts (0.3 mm)" in line for line in preview)
+        assert any("by 500 counts (0.5 mm)" in line for line in preview)
         assert abs(rig.drive.shaft.position_counts) <= CAUGHT * MOST_EL_COUNTS
         assert await rig.registers() == GAINS
         assert checklist.gains_to_put_back is None
