@@ -311,7 +311,7 @@ SEEDS_OF_BEFORE = (5149,)
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
-    "seeds", [*(range(first, first + 50) for first in range(0, 150, 50)), SEEDS_OF_BEFORE], ids=str
+    "seeds", [*(range(first, first + 50) for first in range(0, 300, 50)), SEEDS_OF_BEFORE], ids=str
 )
 def test_no_schedule_moves_anything_twice_unasked_or_with_nobody_in_charge(seeds):
     campaign(seeds)
