@@ -3,12 +3,15 @@
 import asyncio
 import re
 import signal
+import sys
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
 import pytest
+import structlog
 from hypothesis import settings
 from pytest_asyncio import is_async_test
+from structlog._config import BoundLoggerLazyProxy
 
 from ldcnd.sim.jumping_loop import JumpingLoop
 
@@ -35,6 +38,20 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if collection_path.suffix == ".py" and (found := OF_A_MODULE.search(collection_path.read_text())):
         mark = found[1]
     return True if mark and re.search(rf"\bnot {mark}\b", config.option.markexpr) else None
+
+
+def pytest_runtest_setup() -> None:
+    """Log as if nothing had run before: a program that a test has run may have configured a level.
+
+    Loggers that were used meanwhile keep it by a method of their own.
+    """
+    if not structlog.is_configured():
+        return
+    structlog.reset_defaults()
+    for module in [module for name, module in sys.modules.items() if name.startswith("ldcnd.")]:
+        logger = getattr(module, "log", None)
+        if isinstance(logger, BoundLoggerLazyProxy):
+            vars(logger).pop("bind", None)
 
 
 def pytest_asyncio_loop_factories(

@@ -3,10 +3,8 @@
 import json
 
 import pytest
-import structlog
 from structlog.testing import capture_logs
 
-from ldcnd.daemon.command import dispatch as requests
 from ldcnd.errors import ErrorCode
 from ldcnd.model.events import ReadEvents
 from ldcnd.printable import is_printable
@@ -48,9 +46,7 @@ async def test_a_sequence_number_beyond_what_json_keeps_exactly_is_refused(seque
     assert error_of(answers).code is ErrorCode.MALFORMED_REQUEST
 
 
-async def test_refusals_without_end_leave_a_bounded_number_of_records(monkeypatch):
-    structlog.reset_defaults()  # another test may have configured a level, which loggers that were used keep
-    monkeypatch.setattr(requests, "log", structlog.get_logger())
+async def test_refusals_without_end_leave_a_bounded_number_of_records():
     async with running_rig() as rig:
         with capture_logs() as records:
             for _ in range(1000):

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ldcnd.daemon.axis.straight import LineAxis, Profile, deviation_of, straight_line
@@ -50,6 +50,7 @@ def test_without_common_ramps_the_deviation_is_that_of_the_ramps():
     assert deviation_of([fast, slow]) > 0.1
 
 
+@example([0, 0], 100.0, 1000.0, 2)  # axes that stay, with a limit between two values of their registers
 @given(
     st.lists(st.integers(-500_000, 500_000), min_size=2, max_size=4),
     st.floats(100, 100_000),

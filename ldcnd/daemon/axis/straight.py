@@ -175,7 +175,8 @@ def _at_least(axis: LineAxis, motion: Motion) -> Motion:
 
 
 def _standing(axis: LineAxis) -> Motion:
-    return axis.quantise(Motion(axis.target_counts, axis.most_velocity, axis.most_acceleration))
+    acceleration = _acceleration(axis, axis.most_acceleration)
+    return axis.quantise(Motion(axis.target_counts, axis.most_velocity, acceleration))
 
 
 def _acceleration(axis: LineAxis, wanted: float) -> float:
