@@ -22,7 +22,8 @@ tests: .venv/ready
 
 # whole programs as people run them: browsers, systemd, packages, pages to the letter; a quarter of an hour
 test-system: .venv/ready
-	$(PY) -m pytest -m system -n 2 --dist worksteal --timeout 240
+	$(PY) -m pytest -m "system and not alone" -n 2 --dist worksteal --timeout 240
+	$(PY) -m pytest -m alone
 
 check: .venv/ready
 	.venv/bin/ruff check .

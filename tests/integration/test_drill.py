@@ -1,5 +1,6 @@
 """The drills of the command line against a daemon in its own process."""
 
+import asyncio
 import json
 from asyncio.subprocess import PIPE, create_subprocess_exec
 
@@ -21,9 +22,15 @@ async def drill(endpoint: str, kind: str, *options: str) -> dict[str, float]:
 
 
 async def reset(endpoint: str) -> None:
-    done = await create_subprocess_exec(*LDCND, "axis", "reset", "x", "--connect", endpoint, stdout=PIPE, cwd=ROOT)
-    await done.communicate()
-    assert done.returncode == 0
+    """Reset x as soon as its drive has said that it stands: it is refused before."""
+    words = ("axis", "reset", "x", "--connect", endpoint)
+    async with asyncio.timeout(20):
+        while True:
+            done = await create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE, cwd=ROOT)
+            _, said = await done.communicate()
+            if done.returncode == 0:
+                return
+            assert b"[wrong_state]" in said
 
 
 async def test_each_loss_is_rehearsed_and_measured():

@@ -53,9 +53,11 @@ async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
         async with killable_daemon(config) as (_, endpoint), client(endpoint) as rig:
             (second,) = await rig.buses()
             async with asyncio.timeout(20):
-                while second.baud != 115_200:  # a machine that stands still for a moment has it look for lost drives
+                # a machine that stands still for a moment has it miss replies, or look for lost drives
+                state = await rig.state("x")
+                while second.baud != 115_200 or state is None or state.link is not LinkState.UP:
                     (second,) = await rig.buses()
-            state = await rig.state("x")
+                    state = await rig.state("x")
             after = await counts_of(rig, "x")
             still = await counts_of(rig, "y")
 

@@ -81,7 +81,7 @@ def add_verb(house: Path) -> None:
     insert(
         axis,
         "            case Reset():\n",
-        "            case Blink():\n                return self._motion.reply(turn)\n",
+        "            case Blink():\n                return self._motion.reply(permit)\n",
     )
     cli = house / "ldcnd" / "cli" / "axis.py"
     insert(cli, "    Halt,\n", "    Blink,\n")
