@@ -129,9 +129,12 @@ class Walk:
         return self.page.get_by_role("listitem").filter(has=self.page.get_by_role("button", name=called))
 
     async def begin(self, title: str) -> None:
-        """Begin a step, read what it will do, and agree."""
-        await self.step(title).get_by_role("button").click()
-        await expect(self.question).to_contain_text("run it")
+        """Begin a step, read what it will do, and agree; again if the page has lost the daemon meanwhile."""
+        for _ in range(AGAIN):
+            await self.step(title).get_by_role("button").click()
+            with suppress(AssertionError):
+                await expect(self.question).to_contain_text("run it")
+                break
         await self.question.get_by_role("button", name="Run it", exact=True).click()
 
     async def answer(self, words: str, text: str) -> None:
