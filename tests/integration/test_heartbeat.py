@@ -304,5 +304,5 @@ async def test_sigstop_a_hung_loop_and_sigkill_end_the_changes_within_the_bound(
 
     steady = statistics.median(later - earlier for earlier, later in pairwise(wire.changes_s))
     print({name: f"{each * 1e3:.1f} ms" for name, each in late_s.items()}, f"between changes {steady * 1e3:.1f} ms")
-    assert steady == pytest.approx(HALF_S, rel=0.2)
+    assert 0.8 * HALF_S < steady < SILENCE_S  # a host that stands still for moments makes it later, never sooner
     assert max(late_s.values()) <= BOUND_S
