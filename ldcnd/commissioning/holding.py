@@ -14,7 +14,16 @@ from typing_extensions import override
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.client.standstill import seen
-from ldcnd.commissioning.motor import CAUGHT, DAMPING, OUTPUTS, PWM_PER_GAIN, REGISTER_MOST, error_limit, lent_gains
+from ldcnd.commissioning.motor import (
+    CAUGHT,
+    DAMPING,
+    HOW_IT_ENDS,
+    OUTPUTS,
+    PWM_PER_GAIN,
+    REGISTER_MOST,
+    error_limit,
+    lent_gains,
+)
 from ldcnd.commissioning.questions import powered_off
 from ldcnd.commissioning.record import Figure, Result, Series, StepState
 from ldcnd.commissioning.step import Site, Step, refuse_latched, refuse_previewed, rest_counts
@@ -76,9 +85,7 @@ class HoldingOutput(Step):
             ),
             f"beyond a position error of {el} counts the drive opens its loop; then more output is tried",
             "run the step motor first: this one takes for granted that motor and encoder agree",
-            "the loop is open before, between and after: a load that falls without power must be secured",
-            "ending the step, in a terminal by Ctrl-C, halts it and opens the loop",
-            "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
+            *HOW_IT_ENDS,
         )
 
     @override

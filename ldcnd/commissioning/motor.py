@@ -44,6 +44,13 @@ PWM_PER_GAIN = 256
 """The drive's output is kp times the error, divided by this."""
 REGISTER_MOST = 0x7FFF
 
+HOW_IT_ENDS = (
+    "the loop is open before, between and after: a load that falls without power must be secured",
+    "ending the step, in a terminal by Ctrl-C, halts it and opens the loop",
+    "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
+)
+"""Said before each step that lends gains and moves."""
+
 
 class MotorDirection(Step):
     """Compares the direction of the motor with that of the encoder."""
@@ -82,9 +89,7 @@ class MotorDirection(Step):
                 "an encoder that does not count: the loop opens, too, within"
                 f" {lead.distance / lead.velocity:.2g} s, and you are asked whether the axis moved: watch it"
             ),
-            "the loop is open before, between and after: a load that falls without power must be secured",
-            "ending the step, in a terminal by Ctrl-C, halts it and opens the loop",
-            "the gains of the drive come back at the end; this is software, keep the emergency stop within reach",
+            *HOW_IT_ENDS,
         )
 
     @override

@@ -1,6 +1,6 @@
 """A conversation with one page: what it begins runs here, one thing at a time, and ends when the page goes.
 
-A page that goes takes back everything: its questions stay without answer, its button is let go, and what runs is
+When a page goes, all of it ends: its questions stay without answer, its button is let go, and what runs is
 cancelled, which halts what moves, brings gains back and gives control up. What was settled before is kept.
 """
 
@@ -16,7 +16,7 @@ from ldcnd.model.commands import ErrorReply
 from ldcnd.person import Left
 
 LOOK_EACH_S = 1.0
-"""Files and daemon are looked at again so often while nothing runs, seconds."""
+"""Interval at which files and daemon are checked again while nothing runs, seconds."""
 
 
 class Conversation(ABC):

@@ -206,7 +206,7 @@ class ShadowFigure(Frozen):
     unit: str
     """Unit of these values."""
     motions: int = Field(ge=1)
-    """So many motions are in the mean."""
+    """Number of motions in the mean."""
     alarm: bool
     """An alarm stands."""
     meaning: str | None = None

@@ -67,7 +67,7 @@ class Lease:
     sequence: int = -1
 
     def reply(self) -> LeaseReply:
-        """Return what its holder is told."""
+        """Return the reply to its holder."""
         return LeaseReply(lease=self.token, client=self.client, axes=tuple(sorted(self.axes)), lease_s=self.duration_s)
 
 

@@ -59,7 +59,7 @@ class ShadowAlarm(Frozen):
     unit: str
     """Unit of these values."""
     motions: int
-    """So many motions are in the mean."""
+    """Number of motions in the mean."""
     sigma: float
     """Standard deviation of single motions while the axis taught."""
     meaning: str
