@@ -129,13 +129,18 @@ class Walk:
         return self.page.get_by_role("listitem").filter(has=self.page.get_by_role("button", name=called))
 
     async def begin(self, title: str) -> None:
-        """Begin a step, read what it will do, and agree; again if the page has lost the daemon meanwhile."""
+        """Begin a step, read what it will do, and agree."""
+        await self.until_asked(title, "run it")
+        await self.question.get_by_role("button", name="Run it", exact=True).click()
+
+    async def until_asked(self, title: str, words: str) -> None:
+        """Begin a step that asks a question first; again if the page has lost the daemon meanwhile."""
         for _ in range(AGAIN):
             await self.step(title).get_by_role("button").click()
             with suppress(AssertionError):
-                await expect(self.question).to_contain_text("run it")
-                break
-        await self.question.get_by_role("button", name="Run it", exact=True).click()
+                await expect(self.question).to_contain_text(words)
+                return
+        pytest.fail(f"{self.axis}: {title} never asked: {words}")
 
     async def answer(self, words: str, text: str) -> None:
         """Answer a question by the field."""
@@ -203,7 +208,7 @@ class Walk:
 
     async def tune(self) -> None:
         async def tuning() -> None:
-            await self.step("Gains").get_by_role("button").click()
+            await self.until_asked("Gains", "within which distance")
             await self.answer("within which distance", "4")
             await self.answer("bandwidth of the loop", "20")
             await self.choose(f"move {self.axis} now", "Yes")
