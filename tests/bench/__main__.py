@@ -6,7 +6,9 @@ import logging
 import platform
 import sysconfig
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import cache, partial
 from pathlib import Path
 
 import structlog
@@ -23,7 +25,7 @@ from tests.bench import (
 )
 from tests.bench.bus_efficiency import FLOOR, FLOORS, MINIMAL, Conditions, Result
 from tests.bench.machine_speed import MachineSpeed
-from tests.bench.processes import build_programs
+from tests.bench.processes import TooBusy, build_programs
 from tests.bench.report import Row, paired, table
 from tests.bench.sources import NoCompiler
 
@@ -43,6 +45,20 @@ EFFICIENCY = {
 CPU_RATIO = dict.fromkeys((FAST, SLOW, *MORE), 1.6)
 """Processor time of an exchange, to that of the least that a Python program does."""
 CONSOLE_S, CONSOLE_ROUNDS = 5.0, 3
+PARTS = (
+    "console",
+    "115200",
+    "19200",
+    "one-piece",
+    "awake",
+    "one-piece-awake",
+    "system-calls",
+    "commands",
+    "lines",
+    "round-trip",
+    "stops",
+    "jumping-clock",
+)
 
 
 def main() -> None:
@@ -53,21 +69,21 @@ def main() -> None:
     )
     parser.add_argument("--virtual-seconds", type=float, default=30.0, help="length of a run on the jumping clock")
     parser.add_argument("--before", type=Path, help="another checkout, whose daemon is measured in the same rounds")
-    parser.add_argument("--no-processes", action="store_true", help="only what runs on the jumping clock")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=" ".join(PARTS))
     parser.add_argument("--json", type=Path, help="keep the figures here")
     options = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
 
     rows: list[Row] = []
     speed = MachineSpeed()
-    speed.look()
-    if not options.no_processes:
-        rows += _processes(options.rounds, options.before, speed)
-        rows += round_trip.rows()
-        speed.look()
-        rows += stops_under_load.rows()
-        speed.look()
-    rows += virtual_time.rows(options.virtual_seconds)
+    with tempfile.TemporaryDirectory() as name:
+        for part, measure in _parts(Path(name), options.rounds, options.virtual_seconds, options.before).items():
+            if part in options.only:
+                speed.look()
+                try:
+                    rows += measure()
+                except (NoCompiler, TooBusy) as error:
+                    print(f"{part} not measured: {error}", flush=True)
     speed.look()
     rows = speed.rows() + speed.judged(rows)
     print(table(rows))
@@ -82,26 +98,27 @@ def main() -> None:
         options.json.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=2))
 
 
-def _processes(rounds: int, before: Path | None, speed: MachineSpeed) -> list[Row]:
+def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> dict[str, Callable[[], list[Row]]]:
+    """Return what measures each part; one that the machine is too busy for leaves the figures of the others."""
     fewer = max(2, rounds // 2 + 1)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        try:
-            programs = build_programs(folder)
-        except NoCompiler as error:
-            print(f"skipped: {error}")
-            return []
-        rows = console.rows(folder, CONSOLE_S, CONSOLE_ROUNDS)
-        for conditions in (FAST, SLOW, *MORE):
-            each = rounds if conditions is FAST else fewer
-            for result in bus_efficiency.measure(programs, folder, conditions, each, before):
-                rows += _efficiency_rows(result)
-            speed.look()
-        rows += system_calls.rows(programs[0], folder)
-        rows += saturated_command.rows(programs[0], folder)
-        rows += scaling.rows(programs[0], folder, fewer)
-        speed.look()
-        return rows
+    programs = cache(partial(build_programs, folder))
+
+    def efficiency(conditions: Conditions, rounds: int) -> list[Row]:
+        results = bus_efficiency.measure(programs(), folder, conditions, rounds, before)
+        return [row for result in results for row in _efficiency_rows(result)]
+
+    found: tuple[Callable[[], list[Row]], ...] = (
+        partial(console.rows, folder, CONSOLE_S, CONSOLE_ROUNDS),
+        partial(efficiency, FAST, rounds),
+        *(partial(efficiency, each, fewer) for each in (SLOW, *MORE)),
+        lambda: system_calls.rows(programs()[0], folder),
+        lambda: saturated_command.rows(programs()[0], folder),
+        lambda: scaling.rows(programs()[0], folder, fewer),
+        round_trip.rows,
+        stops_under_load.rows,
+        partial(virtual_time.rows, virtual_s),
+    )
+    return dict(zip(PARTS, found, strict=True))
 
 
 def _efficiency_rows(result: Result) -> list[Row]:

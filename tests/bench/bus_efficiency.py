@@ -20,6 +20,7 @@ from tests.bench.processes import (
     ROOT,
     SUBJECT_CPU,
     Subject,
+    TooBusy,
     config_text,
     daemon,
     free_endpoint,
@@ -168,7 +169,7 @@ def _round(subject: Subject, listener) -> Round:
         if figures.exchanges:
             break
     else:
-        raise RuntimeError(f"{subject.name} sent nothing for {TRIES} times {ROUND_S} s")
+        raise TooBusy(f"{subject.name} sent nothing for {TRIES} times {ROUND_S} s")
     samples = _received(listener) - before
     subject.stop()
     return Round(

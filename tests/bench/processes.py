@@ -22,6 +22,10 @@ LINE_CPU, SUBJECT_CPU = 0, -1
 PATIENCE_S = 60.0
 
 
+class TooBusy(RuntimeError):
+    """This machine is so busy that what is to be measured does not get to run."""
+
+
 @dataclass(frozen=True, slots=True)
 class LineFigures:
     """What a paced line saw of its host since it was asked before."""
@@ -89,11 +93,11 @@ def heard(running: subprocess.Popen) -> str:
     """Return the next line that a program prints.
 
     Raises:
-        RuntimeError: none comes; the machine is so busy that the program does not get to run.
+        TooBusy: none comes.
     """
     assert running.stdout
     if not select.select([running.stdout], [], [], PATIENCE_S)[0]:
-        raise RuntimeError(f"{running.args!r}: not a word within {PATIENCE_S:g} s; this machine is too busy to measure")
+        raise TooBusy(f"{running.args!r}: not a word within {PATIENCE_S:g} s")
     return running.stdout.readline()
 
 

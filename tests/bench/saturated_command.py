@@ -12,7 +12,7 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.profiles import PROFILES
-from tests.bench.processes import SUBJECT_CPU, config_text, daemon, free_endpoint, heard, paced_lines, process
+from tests.bench.processes import SUBJECT_CPU, TooBusy, config_text, daemon, free_endpoint, heard, paced_lines, process
 from tests.bench.report import Row
 
 BAUD, DRIVE_BAUD = 115_200, 113_636
@@ -83,7 +83,7 @@ def _asked(line_program: Path, folder: Path, *, uvloop: bool) -> tuple[list[floa
             try:
                 took = json.loads(asking.communicate(timeout=PATIENCE_S)[0])
             except subprocess.TimeoutExpired:
-                raise RuntimeError(f"{COUNT} commands are not answered within {PATIENCE_S:g} s") from None
+                raise TooBusy(f"{COUNT} commands are not answered within {PATIENCE_S:g} s") from None
     return sorted(took["daemon_s"]), sorted(took["bare_s"])
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tests.bench.processes import (
     Subject,
+    TooBusy,
     config_text,
     daemon,
     free_endpoint,
@@ -151,7 +152,7 @@ def _until_polled(subject: Subject) -> None:
         settle(0.5)
         if all(line.exchanges > LEAST_EXCHANGES for line in subject.lines.figures()):
             return
-    raise RuntimeError(f"{subject.name}: not every line came up")
+    raise TooBusy(f"{subject.name}: not every line came up")
 
 
 def _round(subject: Subject) -> Load:
@@ -164,7 +165,7 @@ def _round(subject: Subject) -> Load:
     cpu_s = subject.cpu_s() - cpu_s
     subject.stop()
     if not all(each.exchanges for each in figures):
-        raise RuntimeError(f"{subject.name}: a line was silent for {ROUND_S} s")
+        raise TooBusy(f"{subject.name}: a line was silent for {ROUND_S} s")
     return Load(
         efficiency=statistics.fmean(each.efficiency for each in figures),
         cpu_us=cpu_s / sum(each.exchanges for each in figures) * 1e6,
