@@ -1,6 +1,5 @@
 """`ldcnd tune`: gains for an axis, as the family of its drive finds them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -10,11 +9,11 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
+from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import NotSupported, WrongState
 from ldcnd.families.known import FAMILIES
-from ldcnd.model.meta import AxisInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,36 +109,20 @@ def command(
     a move before and after; the moves come from the machine.
     """
     info = target.run(lambda client: axis_of(client, axis))
-    tuning = _of_family(info)
     if put_back:
-        kept = target.run(lambda client: _kept(client, axis))
-        tuning.put_back(target, kept)
+        kept = target.run(lambda client: _put_back(client, axis))
+        gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
+        how = "off, with its old gains" if kept.are_registers else "its old gains are in RAM"
+        target.show(kept, f"{axis}: {how}: {gains}")
         return
-    tuning.tune(target, info, TuneOptions(bandwidth_hz, within, values, record_s, plot, dry_run, yes))
-
-
-@dataclass(frozen=True, slots=True)
-class Tuning:
-    """What a family offers to this command.
-
-    Attributes:
-        tune: all of it.
-        put_back: puts back gains that a tuning has left behind.
-    """
-
-    tune: Callable[[Target, AxisInfo, TuneOptions], None]
-    put_back: Callable[[Target, KeptGains], None]
-
-
-def _of_family(info: AxisInfo) -> Tuning:
     family = FAMILIES.get(info.family)
-    if family is None or not family.tuning:
-        raise NotSupported(f"axis {info.axis}: nothing is known here of tuning a {info.model}", axis=info.axis)
-    tuning = import_module(family.tuning)
-    return Tuning(tuning.tune, tuning.put_back)
+    if family is None or family.tuning is None:
+        raise NotSupported(f"axis {axis}: nothing is known here of tuning a {info.model}", axis=axis)
+    tune = import_module(family.tuning.command).tune
+    tune(target, info, TuneOptions(bandwidth_hz, within, values, record_s, plot, dry_run, yes))
 
 
-async def _kept(client: RigClient, axis: str) -> KeptGains:
+async def _put_back(client: RigClient, axis: str) -> KeptGains:
     rig = Rig(client, await client.daemon())
     kept = kept_for(rig.name, axis)
     if kept is None:
@@ -148,4 +131,5 @@ async def _kept(client: RigClient, axis: str) -> KeptGains:
             axis=axis,
             remedy="type it on the host that tuned; or restart the daemon, which loads the configured gains",
         )
+    await put_back_gains(rig, kept, "ldcnd tune")
     return kept

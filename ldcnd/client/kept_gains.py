@@ -4,6 +4,7 @@ Tuning and commissioning load gains of their own for some moves. One file for bo
 neither takes the gains of the other for those of the machine.
 """
 
+import asyncio
 from pathlib import Path
 
 import pydantic
@@ -12,7 +13,7 @@ from ldcnd import durable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import at_rest, seen
-from ldcnd.errors import ConfigError, WrongState
+from ldcnd.errors import BusyTracing, ConfigError, WrongState
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import AxisState
@@ -25,6 +26,8 @@ LEASE_S = 5.0
 
 PUT_BACK_S = 15.0
 """Longest time that the gains may take to come back, seconds."""
+LOOK_S = 0.5
+"""Interval at which a drive that still records is asked again to take a parameter, seconds."""
 
 
 class KeptGains(Frozen):
@@ -35,7 +38,12 @@ class KeptGains(Frozen):
     axis: str
     """The axis."""
     gains: dict[str, int]
-    """Registers of Set Gain, by the names of `set_gains`."""
+    """Registers of Set Gain, by the names of `set_gains`; or parameters of a drive, by their numbers."""
+
+    @property
+    def are_registers(self) -> bool:
+        """Whether the loop has to be open when they are loaded."""
+        return self.gains.keys() <= frozenset(NAMES)
 
 
 def file_of(rig: str, axis: str) -> Path:
@@ -133,12 +141,45 @@ async def load(axis: Axis, gains: dict[str, int]) -> None:
     await axis.set_gains(**gains)
 
 
+async def restore(axis: Axis, kept: KeptGains) -> None:
+    """Put gains back: registers with the loop open, parameters one by one.
+
+    Raises:
+        LdcndError: as the daemon refused it; they are still kept.
+        WrongState: it takes longer than `PUT_BACK_S`; likewise.
+    """
+    try:
+        async with asyncio.timeout(PUT_BACK_S):
+            if kept.are_registers:
+                await load(axis, kept.gains)
+            else:
+                for name, value in kept.gains.items():
+                    await _write(axis, name, value)
+    except TimeoutError:
+        raise WrongState(
+            f"axis {kept.axis}: its gains are not back after {PUT_BACK_S:g} s",
+            axis=kept.axis,
+            remedy=f"type: ldcnd tune {kept.axis} --put-back",
+        ) from None
+    forget(kept)
+
+
+async def _write(axis: Axis, name: str, value: int) -> None:
+    """Write a parameter to RAM; a drive that still ends a record takes none before."""
+    while True:
+        try:
+            await axis.write_parameter(name, value)
+        except BusyTracing:
+            await asyncio.sleep(LOOK_S)
+        else:
+            return
+
+
 async def put_back(rig: Rig, kept: KeptGains, client: str) -> None:
-    """Put the gains of an axis back under control of this client's own; the axis is off afterwards.
+    """Do the same under control of this client's own: an axis whose gains are registers is off afterwards.
 
     Raises:
         LdcndError: as the daemon refused it; they are still kept.
     """
     async with rig.control(kept.axis, client=client, lease_s=LEASE_S) as axis:
-        await load(axis, kept.gains)
-    forget(kept)
+        await restore(axis, kept)

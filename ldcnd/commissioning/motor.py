@@ -5,7 +5,6 @@ error limit. The set-point leads away beyond that limit: a motor that turns the 
 encoder that does not count all end in the drive, which opens its loop.
 """
 
-import asyncio
 import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, forget, gains_in, keep, load, open_loop
+from ldcnd.client.kept_gains import KeptGains, gains_in, keep, open_loop, restore
 from ldcnd.client.standstill import seen
 from ldcnd.commissioning.record import Figure, Result, Series, StepState
 from ldcnd.commissioning.step import Site, Step, refuse_latched, refuse_previewed, rest_counts
@@ -150,10 +149,8 @@ async def lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
     try:
         yield kept.gains
     finally:
-        with suppress(LdcndError, TimeoutError):
-            async with asyncio.timeout(PUT_BACK_S):
-                await load(axis, kept.gains)
-                forget(kept)
+        with suppress(LdcndError):
+            await restore(axis, kept)
 
 
 def error_limit(site: Site) -> int:

@@ -58,14 +58,24 @@ class Gains(Step):
 
     name = "gains"
     title = "Gains"
-    about = "`ldcnd tune AXIS` measures the axis and proposes gains. This step only asks whether that was done."
+    about = (
+        "`ldcnd tune AXIS` measures the axis and proposes gains; of a drive that tunes itself it tries gains that you"
+        " name. This step only asks whether that was done."
+    )
     moves = False
     needs = (Verb.SET_GAINS,)
+
+    @override
+    def obstacle(self, site: Site) -> str:
+        gains_are_parameters = Verb.WRITE_PARAMETER in site.info.capabilities
+        return "" if gains_are_parameters else super().obstacle(site)
 
     @override
     async def run(self, site: Site, axis: Axis) -> Result:
         registers = {each.name: each.value for each in site.info.registers if each.value is not None}
         figures = tuple(Figure(what=name, value=registers[name]) for name in SHOWN if name in registers)
-        if await site.person.confirm(f"are the gains of {axis.name} tuned, and in the configuration"):
+        if await site.person.confirm(
+            f"are the gains of {axis.name} tuned, and in the configuration or stored in the drive"
+        ):
             return Result(state=StepState.DONE, text="tuned, as the person says", figures=figures)
         return Result(state=StepState.OPEN, text=f"type: ldcnd tune {axis.name}")

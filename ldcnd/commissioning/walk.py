@@ -33,7 +33,9 @@ class Walk:
         """
         if self._checklist.gains_to_put_back:
             self._person.tell("an earlier step, or a tuning, was cut short: the drive has gains of that")
-            if not await self._person.confirm("put the former gains back now? The loop is opened for it"):
+            if not await self._person.confirm(
+                "put the former gains back now? A loop that the daemon closes is opened for it"
+            ):
                 raise Left("the former gains are still to be put back")
             await self._checklist.put_back_gains()
 

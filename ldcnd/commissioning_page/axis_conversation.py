@@ -11,17 +11,13 @@ from ldcnd.commissioning.record import Record, StepRecord, StepState
 from ldcnd.commissioning.walk import Walk
 from ldcnd.commissioning_page.conversation import Conversation
 from ldcnd.commissioning_page.messages import CurveView, FromPage, StepView, View
-from ldcnd.commissioning_page.tuning import tune
+from ldcnd.commissioning_page.tuning import OfferedTuning, offered
 from ldcnd.config.rig import load_config
 from ldcnd.console.rigs import Rigs
 from ldcnd.errors import UnknownVerb
 
 TUNING = "gains"
 """The step that a page carries out by tuning."""
-ABOUT_TUNING = (
-    "The axis is moved a little and identified, gains are proposed and tried, and kept when you agree. It needs two"
-    f" steps before: {STEPS['settings'].title}, and {STEPS['motor'].title}."
-)
 
 
 class AxisConversation(Conversation):
@@ -44,17 +40,21 @@ class AxisConversation(Conversation):
         self._curves: tuple[CurveView, ...] = ()
         self._unit = ""
         self._seen: object = None
+        self._tuning: OfferedTuning | None = None
 
     @override
     def shown(self) -> View:
         return View(
-            steps=tuple(_step_view(self._record.of(name)) for name in STEPS), unit=self._unit, curves=self._curves
+            steps=tuple(self._step_view(self._record.of(name)) for name in STEPS),
+            unit=self._unit,
+            curves=self._curves,
         )
 
     @override
     async def refresh(self) -> None:
         self._seen = self._outside()
         config = load_config(self._config)
+        self._tuning = offered(config, self._axis)
         self._record = records.read(records.file_of(self._config, config.rig, self._axis), config.rig, self._axis)
         if config.rig in self._rigs.names:
             await self._opened(self._visitor)
@@ -70,8 +70,9 @@ class AxisConversation(Conversation):
         checklist = await self._opened(begun.by.strip() or self._visitor)
         walk = Walk(checklist, self.person, str(self._config), lambda kept: self._keep(checklist, kept))
         await walk.put_back_gains()
-        if begun.begin == TUNING and checklist.record.of(TUNING).result.state is not StepState.NOT_POSSIBLE:
-            await self._tune(checklist, walk)
+        possible = checklist.record.of(begun.begin).result.state is not StepState.NOT_POSSIBLE
+        if begun.begin == TUNING and self._tuning and possible:
+            await self._tune(self._tuning, checklist, walk)
         else:
             await walk.one(begun.begin)
 
@@ -88,9 +89,9 @@ class AxisConversation(Conversation):
         self._record = checklist.record
         self.person.tell(kept.result.text)
 
-    async def _tune(self, checklist: Checklist, walk: Walk) -> None:
+    async def _tune(self, offer: OfferedTuning, checklist: Checklist, walk: Walk) -> None:
         """Tune the axis, keep the result as that of the step, and offer its gains for the configuration."""
-        tuning = await tune(self._rigs.client(self._record.rig), self.person, self._axis)
+        tuning = await offer.tune(self._rigs.client(self._record.rig), self.person, self._axis)
         if tuning is None:
             return
         self._curves, self._unit = tuning.curves, tuning.unit
@@ -103,17 +104,17 @@ class AxisConversation(Conversation):
         changed_ns = self._config.stat().st_mtime_ns if self._config.exists() else 0
         return changed_ns, {rig: self._rigs.instance(rig) for rig in self._rigs.names}
 
-
-def _step_view(kept: StepRecord) -> StepView:
-    step, result = STEPS[kept.step], kept.result
-    impossible = result.state is StepState.NOT_POSSIBLE
-    return StepView(
-        name=kept.step,
-        title=step.title,
-        about=ABOUT_TUNING if kept.step == TUNING and not impossible else step.about,
-        state=result.state.value.replace("_", " "),
-        text=kept.reopened or result.text,
-        at=kept.at,
-        by=kept.by,
-        obstacle=result.text if impossible else "",
-    )
+    def _step_view(self, kept: StepRecord) -> StepView:
+        step, result = STEPS[kept.step], kept.result
+        tuning = self._tuning
+        impossible = result.state is StepState.NOT_POSSIBLE
+        return StepView(
+            name=kept.step,
+            title=step.title,
+            about=tuning.about if tuning and kept.step == TUNING and not impossible else step.about,
+            state=result.state.value.replace("_", " "),
+            text=kept.reopened or result.text,
+            at=kept.at,
+            by=kept.by,
+            obstacle=result.text if impossible else "",
+        )

@@ -167,6 +167,19 @@ OpenLine = Callable[[BusT, Opener | None, Chain | None], Line]
 """Makes a line: its configuration, what opens it instead of its port, the simulated line that it is."""
 
 
+@dataclass(frozen=True, slots=True)
+class TuningModules:
+    """How axes are tuned: modules that need optional packages, so they are loaded when a person asks for it.
+
+    Attributes:
+        command: `tune` of it is `ldcnd tune`.
+        page: `tune` of it is the step of the commissioning page, which `ABOUT` explains.
+    """
+
+    command: str
+    page: str
+
+
 class Family(ABC, Generic[BusT, SimulatedT]):
     """One drive family.
 
@@ -176,7 +189,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
         simulated_line: reads a `[[sim]]` table.
         simulated_key: the key of such a table that no other family has: its drives.
         bauds: rates that its lines may run at; none when the rate is fixed.
-        tuning: module of the command line that tunes its axes, with `tune` and `put_back`; empty without one.
+        tuning: of its axes; None where nothing is known of that.
     """
 
     name: str
@@ -184,7 +197,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
     simulated_line: type[SimulatedT]
     simulated_key: str
     bauds: tuple[int, ...] = ()
-    tuning: str = ""
+    tuning: TuningModules | None = None
 
     @abstractmethod
     def open_lines(self, state_dir: Path | None) -> OpenLine[BusT]:

@@ -1,22 +1,24 @@
 """`ldcnd tune` of a SmartStep: what it says of itself, gains tried in its RAM, records by its own recorder."""
 
 import asyncio
+from importlib import import_module
 
 import click
 import pytest
 
 from ldcnd.cli.smartstep import tune
-from ldcnd.client.kept_gains import KeptGains, file_of, keep, kept_for
+from ldcnd.client.kept_gains import KeptGains, file_of, keep, kept_for, put_back
+from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.errors import NotSupported, ValueOutOfRange, WrongState
 from ldcnd.families.known import FAMILIES
 from ldcnd.model.parameters import ReadParameter, WriteParameter
+from ldcnd.tuning.smartstep import guided
 from ldcnd.tuning.smartstep.session import (
     MoveFigures,
     SmartStepTuning,
     check_wanted,
     objection,
-    put_back,
     read_tuning,
     try_gains,
 )
@@ -62,7 +64,7 @@ async def test_its_auto_tuning_and_its_gains_are_read_and_nothing_is_written():
     assert [each for each in found.auto_tuning if "online auto-tuning" in each]
     assert {name: value.active for name, value in found.gains.items()}["Pn102"] == 40
     assert not [packet for packet in sent if packet[2:3] == b"1"]
-    assert "auto-tuning result (Fn007): 100 %" in tune._shown(found)
+    assert "auto-tuning result (Fn007): 100 %" in guided.shown(found)
 
 
 async def test_gains_that_are_kept_are_in_ram_and_both_moves_are_shown():
@@ -75,7 +77,7 @@ async def test_gains_that_are_kept_are_in_ram_and_both_moves_are_shown():
     assert shown.objection is None
     assert shown.before.top_speed_rpm == pytest.approx(shown.after.top_speed_rpm, rel=0.1)
     assert kept_for("mixed", "feed") is None
-    assert "ldcnd params set feed Pn100 60 --eeprom" in tune._ending(shown)
+    assert "ldcnd params set feed Pn100 60 --eeprom" in guided.ending(shown)
 
 
 async def test_gains_that_are_not_wanted_are_put_back():
@@ -86,7 +88,7 @@ async def test_gains_that_are_not_wanted_are_put_back():
 
     assert not shown.kept
     assert left == before
-    assert "not wanted; its old gains are back in RAM" in tune._ending(shown)
+    assert "not wanted; its old gains are back in RAM" in guided.ending(shown)
 
 
 async def test_a_motor_that_stands_ends_it_with_the_old_gains():
@@ -121,7 +123,7 @@ async def test_gains_of_a_tuning_that_was_killed_come_back_by_hand():
         keep(KeptGains(rig="mixed", axis="feed", gains=before))
         for name, value in WANTED.items():
             await client.command("feed", WriteParameter(parameter=name, value=value, client="dead"))
-        await put_back(client, kept_for("mixed", "feed"))
+        await put_back(Rig(client, await client.daemon()), kept_for("mixed", "feed"), "test")
 
         assert await in_ram(client) == before
         assert not file_of("mixed", "feed").exists()
@@ -168,4 +170,6 @@ def test_what_was_typed_is_a_parameter_and_a_number():
 
 
 def test_every_family_says_how_its_axes_are_tuned():
-    assert {family.tuning for family in FAMILIES.values()} == {"ldcnd.cli.ldcn.tune", "ldcnd.cli.smartstep.tune"}
+    for family in FAMILIES.values():
+        assert callable(import_module(family.tuning.command).tune)
+        assert callable(import_module(family.tuning.page).tune)

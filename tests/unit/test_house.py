@@ -23,7 +23,6 @@ def test_a_flow_passes_few_files(name):
 FAMILIES = re.compile(r"smartstep|\bldcn\b|\bldcn_", re.IGNORECASE)
 NAMED = {
     "ldcnd/cli/shadow.py": "watches drives of the one family whose output follows from what is published",
-    "ldcnd/commissioning_page/tuning.py": "tunes the drives of the one family whose gains a host can find",
     "ldcnd/families/known.py": "lists the families",
     "ldcnd/families/dissector.py": "Wireshark has one plugin for all lines",
     "ldcnd/messaging/keys.py": "the root of all keys",

@@ -11,9 +11,6 @@ from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.output import FAILED
 from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
-from ldcnd.client.kept_gains import KeptGains
-from ldcnd.client.kept_gains import put_back as put_back_gains
-from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
 from ldcnd.model.meta import AxisInfo
@@ -76,17 +73,6 @@ def _require_numpy() -> None:
     """
     if find_spec("numpy") is None:
         raise ConfigError("tuning needs numpy; install it with: pip install 'ldcnd[tune]'")
-
-
-def put_back(target: Target, kept: KeptGains) -> None:
-    """Put back gains that a tuning has left behind."""
-
-    async def work(client: RigClient) -> None:
-        await put_back_gains(Rig(client, await client.daemon()), kept, "ldcnd tune")
-
-    target.run(work)
-    gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
-    target.show(kept, f"{kept.axis}: off, with its old gains: {gains}")
 
 
 def _draw(figure: "Figure", tuned: "Tuned") -> None:

@@ -38,6 +38,7 @@ from ldcnd.families.family import (
     Trial,
     TrialMove,
     Tries,
+    TuningModules,
     bus_settings,
 )
 from ldcnd.families.ldcn import acceptance, examination, scan
@@ -65,7 +66,7 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
     bus_config = LdcnBusConfig
     simulated_line = SimulatedLdcnLineConfig
     simulated_key = "module"
-    tuning = "ldcnd.cli.ldcn.tune"
+    tuning = TuningModules("ldcnd.cli.ldcn.tune", "ldcnd.commissioning_page.ldcn.tuning")
     bauds = (9600, 19_200, 57_600, 115_200, 230_400)
     examination = (
         "Examine adapter, drives and timing of an LDCN or NMC line; exits with 1 when something must be put right."

@@ -48,6 +48,7 @@ from ldcnd.families.family import (
     Trial,
     TrialMove,
     Tries,
+    TuningModules,
     bus_settings,
 )
 from ldcnd.families.smartstep.config import (
@@ -91,7 +92,7 @@ class SmartStepFamily(
     bus_config = SmartStepBusConfig
     simulated_line = SimulatedSmartStepLineConfig
     simulated_key = "unit"
-    tuning = "ldcnd.cli.smartstep.tune"
+    tuning = TuningModules("ldcnd.cli.smartstep.tune", "ldcnd.commissioning_page.smartstep.tuning")
     examination = (
         "Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."
     )

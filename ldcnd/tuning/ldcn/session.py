@@ -23,6 +23,7 @@ from ldcnd.client.kept_gains import (
     load,
     open_loop,
     put_back,
+    restore,
 )
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
@@ -139,7 +140,7 @@ async def measure(client: RigClient, planned: Plan, bandwidth_hz: float | None, 
         if _is_worth_a_try(profile, known, usual, move):
             tell("test move with the old gains")
             before = tests.measured(known, await tests.run(excitation.test(usual, move, duration_s(move))))
-        await _restore(axis, kept)
+        await restore(axis, kept)
     farthest_counts = excitation.farthest_counts
     return Findings(planned, kept.gains, known, proposal, move, before, origin_counts, farthest_counts)
 
@@ -172,7 +173,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
             await load(axis, registers_of(found.proposal.gains, kept.gains))
             forget(kept)
         else:
-            await _restore(axis, kept)
+            await restore(axis, kept)
     return Verified(after, why, excitation.farthest_counts)
 
 
@@ -215,15 +216,9 @@ async def _put_back_anew(rig: Rig, kept: KeptGains, tell: Tell) -> None:
 async def _put_back_if_kept(axis: Axis, kept: KeptGains, tell: Tell) -> None:
     """Put gains back if they are still to be put back and this client still has control; what fails is tried anew."""
     if kept_for(kept.rig, kept.axis) and axis.control and not axis.control.lost:
-        with suppress(LdcndError, TimeoutError):
-            async with asyncio.timeout(PUT_BACK_S):
-                await _restore(axis, kept)
-                tell(f"{kept.axis}: off, with its old gains")
-
-
-async def _restore(axis: Axis, kept: KeptGains) -> None:
-    await load(axis, kept.gains)
-    forget(kept)
+        with suppress(LdcndError):
+            await restore(axis, kept)
+            tell(f"{kept.axis}: off, with its old gains")
 
 
 @asynccontextmanager

@@ -5,7 +5,6 @@ is recorded, and two traces compare only where the machine has done the same. Ne
 at power-off; the old ones are on the disk of this host before.
 """
 
-import asyncio
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
@@ -13,12 +12,12 @@ from contextlib import asynccontextmanager, suppress
 from pydantic import Field
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import LEASE_S, PUT_BACK_S, KeptGains, forget, keep, kept_for
+from ldcnd.client.kept_gains import LEASE_S, KeptGains, forget, keep, kept_for, restore
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.smartstep.monitors import FunctionSwitch
 from ldcnd.drivers.smartstep.parameters import PN110, digit_of, digit_texts
-from ldcnd.errors import BusyTracing, LdcndError, NotSupported, ValueOutOfRange, WrongState
+from ldcnd.errors import LdcndError, NotSupported, ValueOutOfRange, WrongState
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.parameters import ParameterValue
 from ldcnd.model.samples import MonitorName
@@ -30,7 +29,6 @@ CHANNELS = ("speed_feedback", "position_deviation", "inp")
 POINTS = 500
 TRACE_S = 120.0
 """Longest time from the end of a record until it has been read from the drive's memory, seconds."""
-LOOK_S = 0.5
 ALIKE = 0.1
 """Two moves are alike when their top speeds differ by no more than this share."""
 STANDS_RPM = 1.0
@@ -169,7 +167,7 @@ async def try_gains(
         if await accepted(tried):
             forget(kept)
             return tried.model_copy(update={"kept": True})
-        await _put_back(axis, kept)
+        await restore(axis, kept)
     return tried
 
 
@@ -187,31 +185,7 @@ async def _changing(
         finally:
             if kept_for(rig.name, found.axis):
                 with suppress(LdcndError, TimeoutError):  # still kept: a person puts them back
-                    await _put_back(axis, kept)
-
-
-async def _put_back(axis: Axis, kept: KeptGains) -> None:
-    """Write the old values; a drive that still ends a record takes none before."""
-    async with asyncio.timeout(PUT_BACK_S):
-        for name, value in kept.gains.items():
-            while True:
-                try:
-                    await axis.write_parameter(name, value)
-                    break
-                except BusyTracing:
-                    await asyncio.sleep(LOOK_S)
-    forget(kept)
-
-
-async def put_back(client: RigClient, kept: KeptGains) -> None:
-    """Put back what a tuning has left that was cut short.
-
-    Raises:
-        LdcndError: as the daemon refused it; they are still kept.
-    """
-    rig = Rig(client, await client.daemon())
-    async with rig.control(kept.axis, client=CLIENT, lease_s=LEASE_S) as axis:
-        await _put_back(axis, kept)
+                    await restore(axis, kept)
 
 
 async def _recorded(axis: Axis, record_s: float) -> MoveFigures:

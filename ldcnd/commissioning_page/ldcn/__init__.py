@@ -1,0 +1,1 @@
+"""What the page offers for drives of this family alone, loaded by the name that the family object gives."""
