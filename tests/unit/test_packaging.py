@@ -16,6 +16,7 @@ import pytest
 from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
+from ldcnd.daemon.publish.contract import all_schemas
 from ldcnd.fault_pages import codes
 from tests.support.pages import ROOT
 
@@ -74,8 +75,10 @@ def test_the_wheel_has_the_pages_and_no_tests(twice: list[dict[str, Path]]) -> N
     with zipfile.ZipFile(twice[0]["wheel"]) as wheel:
         names = set(wheel.namelist())
         metadata = wheel.read(next(name for name in names if name.endswith("METADATA"))).decode()
+        shipped = {Path(name).stem: wheel.read(name).decode() for name in names if name.startswith("ldcnd/schemas/")}
 
     assert {f"ldcnd/fault_pages/{code}.md" for code in codes()} <= names
+    assert shipped == all_schemas()
     assert "ldcnd/py.typed" in names
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"ldcnd"}
     assert set(re.findall(r"(?m)^Provides-Extra: (\S+)", metadata)) >= RUNTIME_EXTRAS

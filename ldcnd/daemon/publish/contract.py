@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
+from pathlib import Path
 from types import MappingProxyType
 
 from ldcnd.config.rig import RigConfig
@@ -127,12 +128,21 @@ def _channel(key: str, kind: Kind, sent: type[Frozen], taken: type[Frozen] | Non
 
 @cache
 def all_schemas() -> Mapping[str, str]:
-    """Return the schema text of every public model by name, as `schemas/` holds and `meta/schema/<name>` serves it.
-
-    Made once, it takes a tenth of a second.
-    """
+    """Return the schema text of every public model by name, as `ldcnd schema write` writes it; made once."""
     models: tuple[type[Frozen], ...] = (*PUBLIC_MODELS, RigConfig)
     return MappingProxyType({schema_name(model): schema_text(model) for model in models})
+
+
+def shipped_schemas() -> Mapping[str, bytes]:
+    """Return the same from their files, as `meta/schema/<name>` serves them.
+
+    A daemon generates none: that takes half as long as all the rest of its start-up, and `ldcnd schema check` holds the
+    files to the models.
+    """
+    package = Path(__file__).parents[2]
+    installed = package / "schemas"  # a wheel has a copy here; in a checkout they are beside the package
+    folder = installed if installed.is_dir() else package.parent / "schemas"
+    return {path.stem: path.read_bytes() for path in sorted(folder.glob("*.json"))}
 
 
 def as_markdown() -> str:

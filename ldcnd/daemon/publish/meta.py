@@ -10,7 +10,7 @@ from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
-from ldcnd.daemon.publish.contract import all_schemas
+from ldcnd.daemon.publish.contract import shipped_schemas
 from ldcnd.daemon.publish.health import HealthWatch
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import Drive, registers_of
@@ -103,7 +103,7 @@ class Describing:
                 self._described[keys.axis(axis.config.name)] = _Encoded(
                     partial(_axis_source, axis), partial(axis_info, bus, axis, group)
                 )
-        self._schemas = {keys.schema(name): text.encode() for name, text in all_schemas().items()}
+        self._schemas = {keys.schema(name): text for name, text in shipped_schemas().items()}
 
     def on_telemetry(self, query: Query) -> Iterator[None]:
         """Answer with the last value of every key that the query covers."""
