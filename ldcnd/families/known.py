@@ -1,18 +1,39 @@
 """The families that there are: the one list of them."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 from ldcnd.config.bus import BusConfig
 from ldcnd.config.simulated_line import SimulatedLineConfig
 from ldcnd.families.family import Family
-from ldcnd.families.ldcn.family import LDCN
-from ldcnd.families.smartstep.family import SMARTSTEP
 from ldcnd.sim.chain import Chain
 
-DEFAULT = LDCN.name
-FAMILIES: dict[str, Family[Any, Any]] = {LDCN.name: LDCN, SMARTSTEP.name: SMARTSTEP}
+DEFAULT = "ldcn"
+HOMES = {DEFAULT: "ldcnd.families.ldcn.family:LDCN", "smartstep": "ldcnd.families.smartstep.family:SMARTSTEP"}
+"""The module of each family, and behind the colon its name there."""
+
+
+class Families(Mapping[str, Family[Any, Any]]):
+    """The families by name, each loaded when it is used first: a rig seldom has two, and one is a tenth of a daemon."""
+
+    def __getitem__(self, name: str) -> Family[Any, Any]:
+        """Return a family."""
+        module, _, attribute = HOMES[name].partition(":")
+        family: Family[Any, Any] = getattr(import_module(module), attribute)
+        return family
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield their names; loads none."""
+        return iter(HOMES)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(HOMES)
+
+
+FAMILIES = Families()
 
 
 def bus_config(table: Mapping[str, Any]) -> type[BusConfig]:
@@ -22,9 +43,9 @@ def bus_config(table: Mapping[str, Any]) -> type[BusConfig]:
         ValueError: there is no such family.
     """
     family = table.get("family", DEFAULT)
-    if family not in FAMILIES:
+    if family not in HOMES:
         raise ValueError(f"family {family!r} is not known; there are {', '.join(FAMILIES)}")
-    return bus_configs()[family]
+    return FAMILIES[family].bus_config
 
 
 def bus_configs() -> dict[str, type[BusConfig]]:
@@ -36,13 +57,13 @@ def simulated_line(table: Mapping[str, Any]) -> type[SimulatedLineConfig]:
     """Return the model that reads a `[[sim]]` table: the one whose drives are in it.
 
     Raises:
-        ValueError: there are none, or drives of several families.
+        ValueError: there are none. Drives of several families are refused by the model of the first.
     """
-    found = [family for family in FAMILIES.values() if table.get(family.simulated_key)]
-    if len(found) != 1:
-        keys = " or ".join(f"{family.simulated_key}s" for family in FAMILIES.values())
-        raise ValueError(f"a simulated line has either {keys}")
-    return simulated_lines()[found[0].name]
+    for family in FAMILIES.values():
+        if table.get(family.simulated_key):
+            return family.simulated_line
+    keys = " or ".join(f"{family.simulated_key}s" for family in FAMILIES.values())
+    raise ValueError(f"a simulated line has either {keys}")
 
 
 def chain_of(settings: BusConfig, lines: Sequence[SimulatedLineConfig]) -> Chain | None:

@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
-from ldcnd.families.known import FAMILIES
+from ldcnd.families.known import HOMES
 from ldcnd.model.commands import MoveAbsolute, Power, SetPosition, Stop, Verb
 from ldcnd.model.samples import AxisState, Moving
 from ldcnd.planning.plan import plan_rig
@@ -36,7 +36,7 @@ stage = [{ node = 3 }]
 
 @pytest.fixture
 def config(tmp_path, monkeypatch):
-    monkeypatch.setitem(FAMILIES, TOY.name, TOY)
+    monkeypatch.setitem(HOMES, TOY.name, "tests.toy.family:TOY")
     file = tmp_path / "toys.toml"
     file.write_text(RIG)
     return load_config(file)

@@ -79,10 +79,14 @@ def test_unit_0_must_be_alone(tmp_path):
         load(tmp_path, GOOD + axis.replace('"feed"', '"spool"').replace("address = 1", "address = 0"))
 
 
-@pytest.mark.parametrize("drives", ["", 'module = [{ model = "ls182ap" }]\nunit = [{ number = 1 }]'])
-def test_a_simulated_line_has_modules_or_units(tmp_path, drives):
+def test_a_simulated_line_has_modules_or_units(tmp_path):
     with pytest.raises(ConfigError, match="either modules or units"):
-        load(tmp_path, GOOD + SIM + drives)
+        load(tmp_path, GOOD + SIM)
+
+
+def test_a_simulated_line_has_no_drives_of_another_family(tmp_path):
+    with pytest.raises(ConfigError, match=r"unit: drives of another family have this key"):
+        load(tmp_path, GOOD + SIM + 'module = [{ model = "ls-182ap" }]\nunit = [{ number = 1 }]')
 
 
 def test_a_smartstep_line_is_simulated_by_units(tmp_path):
