@@ -1,4 +1,4 @@
-"""What a client and a call of the command line load: nothing of the daemon, no serial port, nothing that takes long."""
+"""What a client, a call of the command line and a daemon load: nothing of another's, and nothing that takes long."""
 
 import subprocess
 import sys
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.families.known import DEFAULT, HOMES
 from tests.support.process import ROOT
 
 CLIENT = ROOT / "ldcnd" / "client"
@@ -67,6 +68,44 @@ try:
 except SystemExit as end:
     print(end.code, models(Frozen), *sys.modules, sep="\\n")
 """
+BESIDE_A_DAEMON = {
+    "bluesky",
+    "commissioning",
+    "commissioning_page",
+    "console",
+    "epics",
+    "metrics",
+    "pki",
+    "recording",
+    "ros2",
+    "top",
+    "tuning",
+}
+MODULES_OF_A_DAEMON = 184
+MODELS_OF_A_DAEMON = 184
+"""The most of our modules, and models, that there are when a daemon opens its lines: most of the time until then."""
+DAEMON = """
+import asyncio, sys, time
+from pathlib import Path
+from ldcnd.cli import main, run
+from ldcnd.config.rig import load_config
+from ldcnd.daemon.process.assembly import build_daemon
+from ldcnd.daemon.publish.contract import all_schemas
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.model.frozen import Frozen
+from ldcnd.planning.plan import require_plan
+
+def models(of):
+    return sum(1 + models(model) for model in of.__subclasses__())
+
+async def build(config):
+    require_plan(config)
+    async with MemoryBroker().session() as session:
+        build_daemon(config, session, time.time_ns, "test")
+
+asyncio.run(build(load_config(Path({rig!r}))))
+print(all_schemas.cache_info().misses, models(Frozen), *sys.modules, sep="\\n")
+"""
 
 
 def printed_by(program: str, folder: Path) -> list[str]:
@@ -95,3 +134,15 @@ def test_a_call_of_the_command_line_loads_little(words: str, most: int, tmp_path
     assert not (OTHERS - {"click"} | SLOW_TO_LOAD) & set(loaded)
     assert len(loaded) <= MODULES_OF_A_CALL
     assert int(models) <= most
+
+
+def test_a_daemon_loads_one_family_and_generates_no_schema(tmp_path: Path) -> None:
+    schemas, models, *loaded = printed_by(DAEMON.format(rig=str(ROOT / "config" / "simulated.toml")), tmp_path)
+
+    print(f"a daemon: {sum(name.startswith('ldcnd') for name in loaded)} modules, {models} models")
+    assert schemas == "0"
+    assert [home for home in HOMES.values() if home.partition(":")[0] in loaded] == [HOMES[DEFAULT]]
+    assert not {f"ldcnd.{name}" for name in BESIDE_A_DAEMON} & set(loaded)
+    assert not (OTHERS - {"click", "serial", "serial_asyncio"} | SLOW_TO_LOAD - {"structlog"}) & set(loaded)
+    assert sum(name.startswith("ldcnd") for name in loaded) <= MODULES_OF_A_DAEMON
+    assert int(models) <= MODELS_OF_A_DAEMON
