@@ -55,7 +55,7 @@ MODELS_OF_CALLS = {
 }
 """The most models that these calls of the command line make; with the modules, two thirds of the time of a call."""
 CALL = """
-import sys
+import gc, sys
 from ldcnd.cli.main import main
 from ldcnd.model.frozen import Frozen
 
@@ -66,7 +66,7 @@ sys.argv = ["ldcnd", *{words!r}]
 try:
     main()
 except SystemExit as end:
-    print(end.code, models(Frozen), *sys.modules, sep="\\n")
+    print(end.code, models(Frozen), gc.get_freeze_count(), *sys.modules, sep="\\n")
 """
 BESIDE_A_DAEMON = {
     "bluesky",
@@ -125,7 +125,7 @@ def test_the_client_loads_nothing_of_the_daemon(tmp_path: Path) -> None:
 @pytest.mark.real_time
 @pytest.mark.parametrize(("words", "most"), MODELS_OF_CALLS.items())
 def test_a_call_of_the_command_line_loads_little(words: str, most: int, tmp_path: Path) -> None:
-    code, models, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
+    code, models, frozen, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
 
     print(f"{words}: {len(loaded)} modules, {models} models")
     assert code == "3"
@@ -134,6 +134,7 @@ def test_a_call_of_the_command_line_loads_little(words: str, most: int, tmp_path
     assert not (OTHERS - {"click"} | SLOW_TO_LOAD) & set(loaded)
     assert len(loaded) <= MODULES_OF_A_CALL
     assert int(models) <= most
+    assert int(frozen) > 10_000  # what it has loaded, which the collector passes by
 
 
 def test_a_daemon_loads_one_family_and_generates_no_schema(tmp_path: Path) -> None:
