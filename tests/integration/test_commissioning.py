@@ -14,13 +14,14 @@ from ldcnd.client.rig import Rig
 from ldcnd.commissioning.checklist import STEPS, Checklist
 from ldcnd.commissioning.first_settings import SOFT_GAINS
 from ldcnd.commissioning.limit_switches import _judged
-from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS
+from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
 from ldcnd.commissioning.record import Result, StepState
 from ldcnd.commissioning.report import html_of
 from ldcnd.config.rig import load_config
 from ldcnd.errors import LeaseExpired, StopLatched, WrongState
 from ldcnd.person import Left
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.servo import FULL_PWM
 from ldcnd.tuning.ldcn.plant import Plant
 from tests.support.commissioning import AXIS, GAINS, PLANT, ScriptedPerson, commissioning_rig, rig_text
 from tests.support.process import ROOT
@@ -64,14 +65,18 @@ async def test_a_motor_that_agrees_with_its_encoder_is_found_within_the_stated_d
 
 
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
-async def test_a_reversed_motor_is_caught_within_the_stated_distance(direction, tmp_path):
-    text = rig_text(direction=direction)
+async def test_a_reversed_motor_is_caught_within_the_stated_distance(direction, tmp_path, monkeypatch):
+    text = rig_text(direction=direction).replace("el = 4000", "cl = 121, el = 4000")
     async with commissioning_rig(tmp_path, STANDS, text=text, motor_reversed=True) as rig:
-        checklist = await rig.checklist()
+        checklist, loop, loaded = await rig.checklist(), rig.drive.loop, []
+        monkeypatch.setattr(loop, "set_gains", lambda gains, real=loop.set_gains: (loaded.append(gains), real(gains)))
         kept = await checklist.run("motor")
 
         assert kept.result.state is StepState.FAILED
         assert "swap the two wires of the motor" in kept.result.text
+        assert {gains.ol for gains in loaded} - {250} <= set(OUTPUTS)
+        assert {gains.cl for gains in loaded} == {121}
+        assert max(OUTPUTS) <= FULL_PWM / 4
         assert abs(rig.drive.shaft.position_counts) <= CAUGHT * MOST_EL_COUNTS
         assert await rig.registers() == GAINS
 
