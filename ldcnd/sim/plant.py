@@ -1,13 +1,22 @@
-"""The machine on a simulated drive's shaft: DC motor, load, encoder, limit switches, index pulse, potentiometer.
+"""The machine on a simulated drive's shaft: motor, load, encoder, limit switches, index pulse, potentiometer.
 
 Time is counted in steps of one servo cycle; the drive says for how many steps which duty was on the motor. This module
 is independent of protocols. The motor has no inductance: within a servo cycle its current follows the voltage at once.
+
+A brushless motor with trapezoidal back EMF behind a drive that commutates by Hall sensors is the same as a DC motor: in
+each sixth of an electrical turn current flows through two of its three phases, and the torque per ampere is constant.
+With one phase open none flows where the pair has that phase: AB, AC, BA and CA of the six AB AC BC BA CA CB. So two
+thirds of an electrical turn are without torque, in two spans of 120 degrees. (LS-182AP manual: Hall sensors, 60/120
+degrees; PIC-SERVO SC data sheet, 3-phase outputs: the Hall inputs choose one chopped and one low half bridge.)
 """
 
 import math
 import random
 from collections import deque
 from dataclasses import dataclass
+
+LIVE_SIXTH = 2
+"""Of each half of an electrical turn: the pair without the phase that may be lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +43,8 @@ class MotorPlant:
         delay_s: from a change of the output to the torque: the amplifier and the motor's inductance, as a dead time.
         backlash_counts: lost motion between motor and encoder, which sits on the load.
         motor_reversed: the motor's leads are swapped: a positive output turns it in reverse.
+        phase_lost: the motor is a brushless one, and one of its phases is open.
+        pole_pairs: electrical turns in a revolution.
         encoder_disconnected: the counter stands still while the shaft turns, and the drive does not notice.
     """
 
@@ -57,6 +68,8 @@ class MotorPlant:
     delay_s: float = 0.0
     backlash_counts: float = 0.0
     motor_reversed: bool = False
+    phase_lost: bool = False
+    pole_pairs: int = 4
     encoder_disconnected: bool = False
 
 
@@ -84,6 +97,7 @@ class Shaft:
         self._late_share = plant.delay_s / step_s - whole
         self._on_the_way: deque[float | None] = deque([0.0] * (whole + 1))
         self._backlash = plant.backlash_counts
+        self._sixths_per_count = 6 * plant.pole_pairs / plant.counts_per_rev if plant.phase_lost else 0.0
         self._supply_v = -plant.supply_v if plant.motor_reversed else plant.supply_v
         self._peak_v = math.inf
         self._peak_change = 0.0
@@ -115,7 +129,7 @@ class Shaft:
         self.current_limited = False
         if self.delay_steps:
             duty = self._delayed(duty)
-        if duty is None:
+        if duty is None or (self._sixths_per_count and not self._conducts):
             velocity = before * self._coasting_decay
         else:
             winding_v = duty * self._supply_v - self._back_emf_v * before
@@ -160,9 +174,15 @@ class Shaft:
         self.slack_counts = min(max(slack, 0.0), self._backlash)
         return slack - self.slack_counts
 
+    @property
+    def _conducts(self) -> bool:
+        """Whether current can flow: both phases of the pair that is on are connected."""
+        sixth = math.floor(self.position_counts * self._sixths_per_count) % 3
+        return sixth == LIVE_SIXTH or not self._sixths_per_count
+
     def current_a(self, duty: float | None) -> float:
         """Return the motor current with that duty on the motor, positive when it drives forward."""
-        if duty is None:
+        if duty is None or not self._conducts:
             return 0.0
         winding_v = duty * self._supply_v - self._back_emf_v * self.velocity_counts
         return min(max(winding_v, -self._peak_v), self._peak_v) / self.plant.resistance_ohm

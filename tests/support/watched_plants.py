@@ -106,6 +106,16 @@ class AxisAtWork:
         needed = self.move.acceleration_counts_per_s2 * radians * self._motor.inertia_kg_m2 * (1 - MOTOR_SHARE)
         self.becomes(SlippingShaft(self._motor, self.profile.servo_cycle_s, share * needed))
 
+    def loses_phase(self) -> None:
+        """Let one phase of its motor be open."""
+        self._motor = replace(self._motor, phase_lost=True)
+        self.becomes(Shaft(self._motor, self.profile.servo_cycle_s))
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the drive has opened its loop by itself: no motion follows."""
+        return self._loop.faulted
+
     def motion(self) -> Iterator[Seen]:
         """Move once; yield what is published meanwhile, and of the rest after it."""
         dice, loop, cycle_s = self._dice, self._loop, self.profile.servo_cycle_s
@@ -120,7 +130,7 @@ class AxisAtWork:
             max(round(acceleration * tick_s**2 * FRACTION), 1),
         )
         until_s, left = math.inf, dice.randrange(round(self._sample_s / cycle_s))
-        while self._t_s < until_s:
+        while self._t_s < until_s and not self.tripped:
             loop.run(left)
             self._t_s += left * cycle_s
             if until_s == math.inf and loop.trajectory.done:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import pytest
 
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC
-from ldcnd.tuning.ldcn.effort import MOST_GAP_S, EffortMeter
+from ldcnd.tuning.ldcn.effort import MOST_GAP_S, EffortMeter, Seen
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Shadow
+from ldcnd.tuning.ldcn.watching import meaning
 from tests.support.simulated_plants import drawn_plants
 from tests.support.watched_plants import AxisAtWork
 
@@ -16,6 +17,9 @@ SEED = 24
 PLANTS = 20
 FOUND_WITHIN = 40
 """Motions."""
+FAR_COUNTS = 100_000
+LOST_WITHIN = 5
+"""Motions without one phase."""
 MOTIONS_IN_TEN_HOURS = 1800
 """Of an axis that moves every 20 s."""
 TAUGHT = LEARNT_MOTIONS + 10  # a figure of two motions takes some more
@@ -129,6 +133,51 @@ def test_motions_unlike_those_that_taught_are_not_judged(taught):
     assert watched.shadow.unlike == 6
 
 
+def test_a_lost_phase_is_said_with_the_place_where_the_axis_stands(taught):
+    print(phase_lost(taught))
+
+
+@ONE_MACHINE
+def test_an_output_that_moves_nothing_is_said_anew_at_another_place_and_ends_after_motions_without(taught):
+    watched = copy.deepcopy(taught)
+    shadow, axis = watched.shadow, watched.axis
+
+    def stands(counts):
+        told = []
+        for _ in range(30):
+            axis._t_s += 0.01
+            told += shadow.take(Seen(axis._t_s, counts, FAR_COUNTS))
+        return told
+
+    (first,), (again,), nothing = stands(10**6), stands(10**6 + 500), stands(10**6)
+    shadow.restart()  # the loop is opened
+    alarms = [alarm for _, alarm in watched.alarms(30) if alarm.figure is FigureName.OUTPUT_AT_REST]
+
+    assert nothing == []
+    assert (first.places, again.places) == ((10**6,), (10**6, 10**6 + 500))
+    assert "a jam, a hard stop" in meaning(first.figure, more=True, places=first.places)
+    assert "hardly a jam" in meaning(again.figure, more=True, places=again.places)
+    assert [alarm.over for alarm in alarms] == [True]
+    assert FigureName.OUTPUT_AT_REST not in shadow.standing
+
+
+def phase_lost(taught: Watched) -> str:
+    """Assert that a lost phase is said, or opens the loop, in the stated time; return which, and when."""
+    watched = copy.deepcopy(taught)
+    watched.alarms(1)  # now it stands where its last way, which was drawn, has ended
+    watched.axis.loses_phase()
+    for motion in range(1, LOST_WITHIN + 1):
+        alarms = [alarm for _, alarm in watched.alarms(1)]
+        if alarms:
+            (alarm,) = alarms
+            assert alarm.figure is FigureName.OUTPUT_AT_REST
+            assert alarm.value > alarm.high > 2 * alarm.usual
+            return f"phase lost: {alarm.value:.0f} PWM steps, {alarm.usual:.1f} usual, after {motion} motions"
+        if watched.axis.tripped:
+            return f"phase lost: the drive opens its loop in motion {motion}"
+    raise AssertionError("a lost phase was not said")
+
+
 def found(taught: Watched, change: str) -> str:
     """Assert that a change is found; return when, and what stands at the end of the stated time."""
     happens, names = CHANGES[change]
@@ -151,6 +200,7 @@ def test_a_drawn_machine_works_for_ten_hours_without_an_alarm_and_each_change_is
     taught = Watched.taught(drawn)
     for change in CHANGES:
         print(found(taught, change))
+    print(phase_lost(taught))
 
     assert taught.alarms(MOTIONS_IN_TEN_HOURS - TAUGHT) == []
 

@@ -1,5 +1,7 @@
 """The machine on a simulated shaft."""
 
+from itertools import pairwise
+
 import pytest
 
 from ldcnd.sim.plant import MotorPlant, Shaft
@@ -183,3 +185,29 @@ def test_swapped_leads_turn_the_motor_the_other_way():
 
     assert swapped.position_counts == pytest.approx(-right.position_counts)
     assert swapped.current_a(0.5) == pytest.approx(-right.current_a(0.5))
+
+
+def test_without_one_phase_the_torque_is_missing_in_two_thirds_of_a_turn_twice_per_electrical_turn():
+    shaft, right = shaft_of(phase_lost=True, pole_pairs=4), shaft_of()
+    currents = []
+    for place in range(2000):
+        shaft.position_counts = place + 0.5
+        currents.append(shaft.current_a(0.5))
+    spans = sum(before == 0.0 != now for before, now in pairwise([*currents, currents[0]]))
+
+    assert set(currents) == {0.0, right.current_a(0.5)}
+    assert currents.count(0.0) / 2000 == pytest.approx(2 / 3, abs=0.005)
+    assert spans == 2 * 4
+
+
+def test_without_one_phase_a_motor_coasts_through_a_dead_span_or_stands_in_it():
+    standing, moving, driven = (shaft_of(phase_lost=True, pole_pairs=1, friction_nm=0.0) for _ in range(3))
+    moving.velocity_counts = 1.0
+    driven.position_counts = 800.0  # of 2000: a sixth of a turn with torque begins at 667
+
+    for shaft in (standing, moving, driven):
+        run(shaft, 0.5, 10)
+
+    assert standing.position_counts == 0.0
+    assert moving.velocity_counts == pytest.approx(1.0, rel=0.01)
+    assert driven.velocity_counts > 0.0

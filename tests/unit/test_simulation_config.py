@@ -133,7 +133,8 @@ def test_index_pulses_can_be_nearer_than_a_revolution(tmp_path):
 
 def test_a_machine_may_have_a_load_a_dead_time_backlash_and_wrong_wires(tmp_path):
     plant = (
-        "{ load_nm = -0.02, delay_s = 0.001, backlash_counts = 8, motor_reversed = true, encoder_disconnected = true }"
+        "{ load_nm = -0.02, delay_s = 0.001, backlash_counts = 8, motor_reversed = true, encoder_disconnected = true,"
+        " phase_lost = true, pole_pairs = 3 }"
     )
     config = load(tmp_path, f'[[module]]\nmodel = "ls182ap"\nplant = {plant}')
 
@@ -142,6 +143,7 @@ def test_a_machine_may_have_a_load_a_dead_time_backlash_and_wrong_wires(tmp_path
     assert (machine.load_nm, machine.delay_s, machine.backlash_counts) == (-0.02, 0.001, 8)
     assert machine.motor_reversed
     assert machine.encoder_disconnected
+    assert (machine.phase_lost, machine.pole_pairs) == (True, 3)
 
 
 def test_a_line_of_a_rig_takes_the_same_modules():

@@ -95,6 +95,10 @@ class PlantConfig(Frozen):
     """Lost motion between the motor and the encoder, which sits on the load; 0."""
     motor_reversed: bool | None = None
     """Whether the motor's leads are swapped: a positive output turns it in reverse. Then no position loop holds."""
+    phase_lost: bool | None = None
+    """Whether it is a brushless motor behind Hall sensors with one phase open: no torque in two thirds of a turn."""
+    pole_pairs: int | None = Field(default=None, ge=1, le=100)
+    """Electrical turns in a revolution of such a motor; 4."""
     encoder_disconnected: bool | None = None
     """Whether the counter stands still while the shaft turns, and the drive does not notice."""
 

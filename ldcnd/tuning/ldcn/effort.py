@@ -21,6 +21,8 @@ from ldcnd.tuning.ldcn.plant import Plant
 
 REST_S = 0.1
 """Shortest time without a change of position after which an axis is at rest, seconds."""
+STOOD_SHARE = 0.7
+"""Of that time, for an output that moves nothing."""
 STILL_COUNTS = 1
 STILL_SHARE = 0.005
 """It stays where it is as long as it moves by no more than this share of the way that it came, or `STILL_COUNTS`."""
@@ -104,6 +106,21 @@ class EffortMeter:
         self._rest = deque[tuple[Seen, float]]()  # the last samples at rest, with the integral sum
         self._motion: list[tuple[Seen, float]] = []
         self._still = STILL_COUNTS
+        self._stood: tuple[Seen, float] | None = None  # since when it stands
+
+    @property
+    def resting_pwm(self) -> float | None:
+        """Output that has not moved the axis for nearly `REST_S`: the least of that time, PWM steps; None in motion.
+
+        Of the integral only what it has gathered since the axis stands: what it had before is not known.
+        """
+        if self._stood is None or self._rest[-1][0].t_s - self._rest[0][0].t_s < STOOD_SHARE * REST_S:
+            return None
+        gains, before = self._gains, self._stood[1]
+        outputs = [
+            (gains.kp * seen.error_counts + gains.ki * (total - before) / 256) / 256 for seen, total in self._rest
+        ]
+        return min(*map(abs, outputs), gains.ol)
 
     def take(self, seen: Seen) -> Effort | None:
         """Take the next position with the loop closed; return what a motion has shown that has just ended."""
@@ -123,6 +140,7 @@ class EffortMeter:
         while seen.t_s - rest[0][0].t_s > REST_S:
             rest.popleft()
         spread = max(each.counts for each, _ in rest) - min(each.counts for each, _ in rest)
+        self._stood = (self._stood or rest[0]) if spread <= STILL_COUNTS else None
         if not self._motion:
             if spread > self._still:
                 self._motion = list(rest)[-2:]

@@ -7,6 +7,8 @@ not judged.
 
 A mean is outside when it is six of its standard errors from what was learnt, and by enough to matter. If motions were
 independent and normally distributed, one in 5e8 would be. They are not quite; the tests count.
+
+An axis that does not move makes no motion to be judged. So an output that should have moved it is an alarm at once.
 """
 
 from collections import deque
@@ -17,7 +19,7 @@ import numpy as np
 
 from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.tuning.ldcn.effort import Effort, EffortMeter, Seen
+from ldcnd.tuning.ldcn.effort import LEAST_COUNTS, Effort, EffortMeter, Seen
 from ldcnd.tuning.ldcn.plant import Plant
 
 LEARNT_MOTIONS = 100
@@ -38,6 +40,11 @@ LEAST_MISFIT_PWM = 0.05
 what the model leaves, PWM steps."""
 FALLEN_SHARE = 0.5
 """An alarm ends when the mean is within this share of its limit."""
+STALLED_SHARE = 0.5
+STALLED_FACTOR = 3.0
+"""An output that moves nothing is an alarm from this share of the output limit on, and no less than so many times the
+identified friction and load."""
+MOST_PLACES = 8
 MAD_TO_SIGMA = 1.4826
 SPEEDS_DIFFER = 1.1
 """A dependence on the speed is learnt when the fastest motion is faster than the slowest by this factor."""
@@ -53,7 +60,11 @@ class FigureName(StrEnum):
     MISFIT = "misfit"
     """What the model cannot explain, PWM steps: the load does not follow the motor, or not evenly."""
 
+    OUTPUT_AT_REST = "output_at_rest"
+    """Output that does not move the axis, PWM steps; judged at once, from the model."""
 
+
+OF_MOTIONS = (FigureName.FRICTION, FigureName.INERTIA, FigureName.MISFIT)
 UNITS = {FigureName.FRICTION: "PWM steps", FigureName.INERTIA: "of the model's", FigureName.MISFIT: "PWM steps"}
 
 
@@ -105,6 +116,7 @@ class Alarm:
         unit: of the four.
         motions: so many motions are in the mean.
         sigma: learnt for single motions.
+        places: where the axis stood with an output that it cannot need, counts; no two close together.
     """
 
     figure: FigureName
@@ -118,6 +130,7 @@ class Alarm:
     unit: str
     motions: int
     sigma: float
+    places: tuple[int, ...] = ()
 
 
 @dataclass(slots=True)
@@ -162,25 +175,65 @@ class Shadow:
         self.trend: dict[FigureName, Alarm] = {}
         self._meter = EffortMeter(profile, plant, gains)
         self._friction_pwm = plant.friction_pwm
+        self._needed_pwm = plant.friction_pwm + abs(plant.load_pwm)
+        self._stalls_pwm = max(STALLED_SHARE * gains.ol, STALLED_FACTOR * self._needed_pwm)
+        self._since_stall = 0
         self._before: Effort | None = None
-        self._off = {name: deque[float](maxlen=max(WINDOWS)) for name in FigureName}
-        self._latest = {name: deque[float](maxlen=LATEST_MOTIONS) for name in FigureName}
-        self._usual = {name: deque[float](maxlen=max(WINDOWS)) for name in FigureName}
+        self._off = {name: deque[float](maxlen=max(WINDOWS)) for name in OF_MOTIONS}
+        self._latest = {name: deque[float](maxlen=LATEST_MOTIONS) for name in OF_MOTIONS}
+        self._usual = {name: deque[float](maxlen=max(WINDOWS)) for name in OF_MOTIONS}
 
     @property
     def is_learning(self) -> bool:
         """Whether any figure still has too few motions to be judged."""
-        return len(self.memory.learnt) < len(FigureName)
+        return len(self.memory.learnt) < len(OF_MOTIONS)
 
     def take(self, seen: Seen) -> tuple[Alarm, ...]:
         """Take the next position with the loop closed; return what began or ended with it."""
         effort = self._meter.take(seen)
-        return () if effort is None else self._judged(effort)
+        stalled = self._stalled(seen)
+        return stalled if effort is None else (*stalled, *self._judged(effort))
 
     def restart(self) -> None:
         """The loop was opened, or positions are missing."""
         self._meter.restart()
         self._before = None
+
+    def _stalled(self, seen: Seen) -> tuple[Alarm, ...]:
+        """Return an alarm for an output that should have moved the axis, at a place where none was before."""
+        name, pwm = FigureName.OUTPUT_AT_REST, self._meter.resting_pwm
+        if pwm is None or pwm < self._stalls_pwm:
+            return ()
+        self._since_stall = 0
+        standing = self.standing.get(name)
+        places = standing.places if standing else ()
+        if len(places) == MOST_PLACES or any(abs(seen.counts - place) < LEAST_COUNTS for place in places):
+            return ()
+        alarm = Alarm(
+            figure=name,
+            over=False,
+            t_s=seen.t_s,
+            value=pwm,
+            latest=pwm,
+            usual=self._needed_pwm,
+            low=-np.inf,
+            high=self._stalls_pwm,
+            unit="PWM steps",
+            motions=1,
+            sigma=0.0,
+            places=(*places, seen.counts),
+        )
+        self.standing[name] = self.trend[name] = alarm
+        return (alarm,)
+
+    def _moved(self, t_s: float) -> tuple[Alarm, ...]:
+        """Return the end of such an alarm after enough motions without one."""
+        self._since_stall += 1
+        if FigureName.OUTPUT_AT_REST not in self.standing or self._since_stall < WINDOWS[0]:
+            return ()
+        del self.trend[FigureName.OUTPUT_AT_REST]
+        alarm = self.standing.pop(FigureName.OUTPUT_AT_REST)
+        return (replace(alarm, over=True, t_s=t_s),)
 
     def _judged(self, effort: Effort) -> tuple[Alarm, ...]:
         shown = {FigureName.INERTIA: effort.inertia, FigureName.MISFIT: effort.left_pwm}
@@ -200,7 +253,7 @@ class Shadow:
             memory.speeds = _widened(memory.speeds, effort.top_counts_per_s)
             memory.ways = _widened(memory.ways, way)
         alarms = [self._take(name, Shown(value, effort.top_counts_per_s), effort.t_s) for name, value in shown.items()]
-        return tuple(alarm for alarm in alarms if alarm)
+        return (*self._moved(effort.t_s), *(alarm for alarm in alarms if alarm))
 
     def _take(self, name: FigureName, shown: Shown, t_s: float) -> Alarm | None:
         learnt = self.memory.learnt.get(name)
@@ -238,7 +291,7 @@ class Shadow:
                 return max(LEAST_FRICTION_PWM, LEAST_FRICTION_SHARE * self._friction_pwm)
             case FigureName.INERTIA:
                 return LEAST_INERTIA
-            case FigureName.MISFIT:
+            case _:
                 return LEAST_MISFIT_PWM
 
     def _mean(self, name: FigureName, learnt: Learnt, window: int, t_s: float) -> Alarm:

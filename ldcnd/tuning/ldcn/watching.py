@@ -62,6 +62,8 @@ class ShadowAlarm(Frozen):
     """Number of motions in the mean."""
     sigma: float
     """Standard deviation of single motions while the axis taught."""
+    places: tuple[int, ...] = ()
+    """Where the axis stood with an output that it cannot need, counts."""
     meaning: str
     """What may be behind it."""
 
@@ -114,8 +116,16 @@ def _plant_of(report: TuningReport) -> Plant:
     return Plant(**{name: each.value for name, each in report.plant.items()})
 
 
-def meaning(figure: FigureName, *, more: bool) -> str:
-    """Return what may be behind more or less of a figure than is usual."""
+def meaning(figure: FigureName, *, more: bool, places: tuple[int, ...] = ()) -> str:
+    """Return what may be behind more or less of a figure than is usual, or behind an axis that stood at some places."""
+    if figure is FigureName.OUTPUT_AT_REST:
+        where = f"it stood at {', '.join(map(str, places))} counts with that output"
+        if len(places) > 1:
+            return f"{where}: a motor without supply or without one phase, or a brake; hardly a jam"
+        return (
+            f"{where}: a jam, a hard stop, a brake, or a motor without supply or without one phase. Switch it off and"
+            " turn it a little by hand: a motor without one phase moves on from some places, and stands at others"
+        )
     match figure, more:
         case FigureName.FRICTION, True:
             return "bearings, guides, grease, a brake that drags; or a coupling that slips"
@@ -271,7 +281,7 @@ class WatchedAxis:
                     unit=mean.unit,
                     motions=mean.motions,
                     alarm=standing is not None,
-                    meaning=meaning(name, more=more) if standing else None,
+                    meaning=meaning(name, more=more, places=standing.places) if standing else None,
                 )
             )
         return ReportShadow(
@@ -281,10 +291,9 @@ class WatchedAxis:
     def _reported(self, alarm: Alarm, t: int) -> ShadowAlarm:
         values = asdict(alarm)
         del values["t_s"]
-        values["low"] = None if alarm.figure is FigureName.MISFIT else alarm.low
-        return ShadowAlarm(
-            axis=self.name, t=t, meaning=meaning(alarm.figure, more=alarm.latest >= alarm.usual), **values
-        )
+        values["low"] = alarm.low if math.isfinite(alarm.low) else None
+        more = alarm.latest >= alarm.usual
+        return ShadowAlarm(axis=self.name, t=t, meaning=meaning(alarm.figure, more=more, places=alarm.places), **values)
 
 
 def _profile_of(info: AxisInfo) -> Profile:
