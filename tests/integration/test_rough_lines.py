@@ -14,7 +14,7 @@ from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import running_rig
 
-ROUGH_FROM_S, ROUGH_FOR_S = 20.0, 20.0
+ROUGH_FROM_S, ROUGH_FOR_S = 8.0, 20.0
 PLACES = {"x": 30.0, "y": -30.0}
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 
@@ -68,6 +68,7 @@ async def test_a_rough_line_shows_no_false_position_and_lets_stops_through(line:
             await rig.client.command(axis, Power(on=True))
             reply = await rig.client.command(axis, MoveAbsolute(position=place))
             await rig.client.wait_for_end(axis, reply.command_id)
+        assert loop.time() < ROUGH_FROM_S - 1.0  # both stand before anything is wrong
         await asyncio.sleep(ROUGH_FROM_S - 1.0 - loop.time())
         watching = [group.create_task(watched(rig.client, axis, found[axis]), name=f"watch {axis}") for axis in PLACES]
         await asyncio.sleep(ROUGH_FOR_S)

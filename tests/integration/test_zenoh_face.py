@@ -3,10 +3,10 @@
 import asyncio
 import json
 import re
-import shlex
 import sys
 import time
 from asyncio.subprocess import PIPE, STDOUT, create_subprocess_exec
+from collections.abc import Iterator
 from itertools import pairwise
 from statistics import median
 
@@ -15,7 +15,8 @@ import msgpack
 import pytest
 import zenoh
 
-from tests.support.process import LDCND, ROOT, daemon
+from tests.support.command_line import run_all
+from tests.support.process import ROOT, daemon
 
 pytestmark = pytest.mark.real_time
 
@@ -34,79 +35,85 @@ def get(session: zenoh.Session, selector: str, payload: object = None) -> dict[s
     return {str(reply.ok.key_expr): reply.ok for reply in replies if reply.ok is not None}
 
 
-async def test_last_values_and_descriptions_are_readable_by_anyone():
-    async with daemon(RIG) as endpoint:
-        with connect(endpoint) as session:
-            telemetry = get(session, "ldcn/sim/tele/**")
-            schemas = {
-                key.rpartition("/")[2]: json.loads(sample.payload.to_string())
-                for key, sample in get(session, "ldcn/sim/meta/schema/*").items()
-            }
+@pytest.fixture(scope="module")
+def served() -> Iterator[str]:
+    """Return the endpoint of one daemon for the tests that only look and stop: to start one takes seconds."""
+    with asyncio.Runner() as runner:
+        running = daemon(RIG)
+        yield runner.run(running.__aenter__())
+        runner.run(running.__aexit__(None, None, None))
 
-            keys = {key.removeprefix("ldcn/sim/tele/") for key in telemetry}
-            items = ("position", "velocity", "adc", "inputs", "fault", "state")
-            assert keys == {f"{axis}/{item}" for axis in "xyzc" for item in items}
-            for key, sample in telemetry.items():
-                assert str(sample.encoding) == "application/json"
-                value = json.loads(sample.payload.to_string())
-                jsonschema.validate(value, schemas[f"{key.rpartition('/')[2]}_sample"])
-                assert sample.timestamp is not None
-                assert abs(value["t"] - time.time_ns()) < 30e9
-                assert value["quality"] in ("good", "uncertain", "bad")
 
-            packed = get(session, "ldcn/sim/tele/x/position?enc=msgpack")["ldcn/sim/tele/x/position"]
-            assert str(packed.encoding) == "application/msgpack;position_sample"
-            jsonschema.validate(msgpack.unpackb(packed.payload.to_bytes()), schemas["position_sample"])
+async def test_last_values_and_descriptions_are_readable_by_anyone(served):
+    with connect(served) as session:
+        telemetry = get(session, "ldcn/sim/tele/**")
+        schemas = {
+            key.rpartition("/")[2]: json.loads(sample.payload.to_string())
+            for key, sample in get(session, "ldcn/sim/meta/schema/*").items()
+        }
 
-            meta = {
-                key.removeprefix("ldcn/sim/meta/"): json.loads(sample.payload.to_string())
-                for key, sample in get(session, "ldcn/sim/meta/**").items()
-            }
-            jsonschema.validate(meta["daemon"], schemas["daemon_info"])
-            jsonschema.validate(meta["axes/x"], schemas["axis_info"])
-            assert meta["axes/x"]["unit"] == "mm"
-            assert meta["daemon"]["axes"] == ["x", "y", "z", "c"]
-            for command in meta["commands"]["commands"]:
-                assert command["request_schema"] in schemas
-                assert command["reply_schema"] in schemas
-            on_disk = {path.stem: json.loads(path.read_text()) for path in (ROOT / "schemas").glob("*.json")}
-            assert schemas == on_disk
+        keys = {key.removeprefix("ldcn/sim/tele/") for key in telemetry}
+        items = ("position", "velocity", "adc", "inputs", "fault", "state")
+        assert keys == {f"{axis}/{item}" for axis in "xyzc" for item in items}
+        for key, sample in telemetry.items():
+            assert str(sample.encoding) == "application/json"
+            value = json.loads(sample.payload.to_string())
+            jsonschema.validate(value, schemas[f"{key.rpartition('/')[2]}_sample"])
+            assert sample.timestamp is not None
+            assert abs(value["t"] - time.time_ns()) < 30e9
+            assert value["quality"] in ("good", "uncertain", "bad")
 
-            alive = f"ldcn/sim/alive/{meta['daemon']['instance']}"
-            expected = {alive} | {f"{alive}/axis/{axis}" for axis in "xyzc"}
-            # an axis is alive when its line is up, which may be after the daemon has answered
-            async with asyncio.timeout(30):
-                while (tokens := alive_tokens(session)) != expected:
-                    assert tokens < expected
-                    await asyncio.sleep(0.1)
+        packed = get(session, "ldcn/sim/tele/x/position?enc=msgpack")["ldcn/sim/tele/x/position"]
+        assert str(packed.encoding) == "application/msgpack;position_sample"
+        jsonschema.validate(msgpack.unpackb(packed.payload.to_bytes()), schemas["position_sample"])
+
+        meta = {
+            key.removeprefix("ldcn/sim/meta/"): json.loads(sample.payload.to_string())
+            for key, sample in get(session, "ldcn/sim/meta/**").items()
+        }
+        jsonschema.validate(meta["daemon"], schemas["daemon_info"])
+        jsonschema.validate(meta["axes/x"], schemas["axis_info"])
+        assert meta["axes/x"]["unit"] == "mm"
+        assert meta["daemon"]["axes"] == ["x", "y", "z", "c"]
+        for command in meta["commands"]["commands"]:
+            assert command["request_schema"] in schemas
+            assert command["reply_schema"] in schemas
+        on_disk = {path.stem: json.loads(path.read_text()) for path in (ROOT / "schemas").glob("*.json")}
+        assert schemas == on_disk
+
+        alive = f"ldcn/sim/alive/{meta['daemon']['instance']}"
+        expected = {alive} | {f"{alive}/axis/{axis}" for axis in "xyzc"}
+        # an axis is alive when its line is up, which may be after the daemon has answered
+        async with asyncio.timeout(30):
+            while (tokens := alive_tokens(session)) != expected:
+                assert tokens < expected
+                await asyncio.sleep(0.1)
 
 
 def alive_tokens(session):
     return {str(reply.ok.key_expr) for reply in session.liveliness().get("ldcn/sim/alive/**") if reply.ok}
 
 
-async def test_a_wildcard_moves_nothing_and_a_stop_needs_nothing():
-    async with daemon(RIG) as endpoint:
-        with connect(endpoint) as session:
-            assert not any("@" in key for key in get(session, "**"))
-            assert get(session, "ldcn/sim/@cmd/x/power", {"on": True})
+async def test_a_wildcard_moves_nothing_and_a_stop_needs_nothing(served):
+    with connect(served) as session:
+        assert not any("@" in key for key in get(session, "**"))
+        assert get(session, "ldcn/sim/@cmd/x/power", {"on": True})
 
-            replies = list(session.get("ldcn/sim/@cmd/*/move_absolute", payload='{"position": 5}', timeout=5))
-            assert [json.loads(reply.err.payload.to_string())["code"] for reply in replies] == ["wildcard_refused"]
+        replies = list(session.get("ldcn/sim/@cmd/*/move_absolute", payload='{"position": 5}', timeout=5))
+        assert [json.loads(reply.err.payload.to_string())["code"] for reply in replies] == ["wildcard_refused"]
 
-            stopped = get(session, "ldcn/sim/@stop")
-            (answer,) = stopped.values()
-            assert json.loads(answer.payload.to_string())["confirmed"] == ["x", "y", "z", "c"]
-            state = get(session, "ldcn/sim/tele/x/state")["ldcn/sim/tele/x/state"]
-            assert json.loads(state.payload.to_string())["stop_latched"] is True
+        stopped = get(session, "ldcn/sim/@stop")
+        (answer,) = stopped.values()
+        assert json.loads(answer.payload.to_string())["confirmed"] == ["x", "y", "z", "c"]
+        state = get(session, "ldcn/sim/tele/x/state")["ldcn/sim/tele/x/state"]
+        assert json.loads(state.payload.to_string())["stop_latched"] is True
 
 
-async def test_published_samples_count_up_and_bear_the_instant_of_measurement():
-    async with daemon(RIG) as endpoint:
-        with connect(endpoint) as session:
-            received = session.declare_subscriber("ldcn/sim/tele/x/position", zenoh.handlers.FifoChannel(100))
-            samples = [received.recv() for _ in range(20)]
-            received.undeclare()
+async def test_published_samples_count_up_and_bear_the_instant_of_measurement(served):
+    with connect(served) as session:
+        received = session.declare_subscriber("ldcn/sim/tele/x/position", zenoh.handlers.FifoChannel(100))
+        samples = [received.recv() for _ in range(20)]
+        received.undeclare()
 
     values = [msgpack.unpackb(sample.payload.to_bytes()) for sample in samples]
     assert [value["seq"] for value in values] == list(range(values[0]["seq"], values[0]["seq"] + 20))
@@ -144,17 +151,17 @@ async def test_a_json_rig_is_readable_by_tools_that_print_what_they_get(tmp_path
     assert sum("/axis/" in key for key in shown) == 4
 
 
-async def test_the_tour_of_the_readme_runs():
+async def test_the_tour_of_the_readme_runs(tmp_path):
     text = (ROOT / "README.md").read_text()
     commands = re.findall(r"^\.venv/bin/(ldcnd axis .*)$", text, re.MULTILINE)
     assert len(commands) >= 6
 
     async with daemon(RIG) as endpoint:
-        for command in commands:
-            words = shlex.split(command)[1:]
-            done = await create_subprocess_exec(*LDCND, *words, "--connect", endpoint, stdout=PIPE, stderr=STDOUT)
-            printed, _ = await done.communicate()
-            assert done.returncode == 0, f"{command}: {printed.decode()}"
+        ran = await run_all(tmp_path, *(f"{command} --connect {endpoint}" for command in commands))
+
+    assert [(each.code, command) for each, command in zip(ran, commands, strict=True)] == [
+        (0, command) for command in commands
+    ], ran
 
 
 async def test_a_command_without_a_daemon_says_so_and_exits_with_3():

@@ -26,6 +26,7 @@ from tests.support.process import free_port
 from tests.support.rig import RunningRig, running_rig
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
+SELDOM = RatesConfig(position=0.2, velocity=0.2, adc=0.0, state=0.2)
 
 
 class RecordWitness:
@@ -72,7 +73,7 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
     Args:
         variant: of the drives.
         assumed: settings of the trace that differ from it.
-        loaded: poll as the mixed rig does, which takes two thirds of the line, not only now and then.
+        loaded: poll the SmartSteps as the mixed rig does, which takes two thirds of their line, not only now and then.
     """
     config = load_config(MIXED)
     bits = variant.trigger_map
@@ -88,12 +89,15 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
         assert isinstance(axis, SmartStepAxisConfig)
         monitors = axis.smartstep.monitors if loaded else {}
         unit = SmartStepUnitConfig.model_validate({**axis.smartstep.model_dump(), "trace": trace, "monitors": monitors})
-        rates = axis.rates if loaded else RatesConfig(position=0.2, velocity=0.2, state=0.2)
+        rates = axis.rates if loaded else SELDOM
         return axis.model_copy(update={"smartstep": unit, "rates": rates})
 
-    lines, steps = config.bus
+    line, steps = config.bus
+    # what is about the traces alone polls the LDCN line so often that it stays up; each poll costs
+    quiet = tuple(axis.model_copy(update={"rates": SELDOM}) for axis in line.axis)
+    line = line.model_copy(update={"axis": quiet})
     steps = steps.model_copy(update={"axis": tuple(traced(axis) for axis in steps.axis)})
-    return config.model_copy(update={"bus": (lines, steps)})
+    return config.model_copy(update={"bus": (line, steps)})
 
 
 @asynccontextmanager
