@@ -18,7 +18,7 @@ PLANTS = 20
 FOUND_WITHIN = 40
 """Motions."""
 FAR_COUNTS = 100_000
-LOST_WITHIN = 5
+LOST_WITHIN = 2
 """Motions without one phase."""
 MOTIONS_IN_TEN_HOURS = 1800
 """Of an axis that moves every 20 s."""
