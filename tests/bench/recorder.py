@@ -19,8 +19,9 @@ from ldcnd.messaging.codec import Encoding
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import PositionSample, Quality, TelemetryItem
+from ldcnd.model.samples import PositionSample, TelemetryItem
 from tests.bench.client_sample import BARE, Reader
+from tests.bench.sample_cost import publish_position
 from tests.support.process import free_port
 
 AXES = 31
@@ -29,17 +30,6 @@ RATE_HZ = 12_000
 SECONDS = 8.0
 ROUND_S = 0.02
 SETTLED_S = 1.5
-EPOCH_NS = 1_700_000_000_000_000_000
-FIELDS = {
-    "t_error_ns": 250_000,
-    "seq": 0,
-    "quality": Quality.GOOD,
-    "value": 12.345678,
-    "unit": "mm",
-    "turns": None,
-    "counts": 123_456,
-    "following_error": 0.001,
-}
 RECORDING = """
 import asyncio, sys, threading, time
 from pathlib import Path
@@ -101,7 +91,7 @@ async def cost(seconds: float = SECONDS, rate_hz: int = RATE_HZ) -> Cost:
             begun_s, number = loop.time(), 0
             while (passed_s := loop.time() - begun_s) < seconds:
                 while number < rate_hz * passed_s:
-                    topics[number % AXES].publish({"t": EPOCH_NS + number, **FIELDS})
+                    publish_position(topics[number % AXES], number)
                     number += 1
                 await asyncio.sleep(ROUND_S)
             await asyncio.sleep(SETTLED_S)
