@@ -5,6 +5,7 @@ neither takes the gains of the other for those of the machine.
 """
 
 import asyncio
+from contextlib import suppress
 from pathlib import Path
 
 import pydantic
@@ -13,7 +14,7 @@ from ldcnd import durable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import at_rest, seen
-from ldcnd.errors import BusyTracing, ConfigError, WrongState
+from ldcnd.errors import BusyTracing, ConfigError, StopLatched, WrongState
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import AxisState
@@ -39,6 +40,8 @@ class KeptGains(Frozen):
     """The axis."""
     gains: dict[str, int]
     """Registers of Set Gain, by the names of `set_gains`; or parameters of a drive, by their numbers."""
+    model: str = ""
+    """The drive model; empty in a file of an earlier version."""
 
     @property
     def are_registers(self) -> bool:
@@ -56,14 +59,14 @@ def keep(kept: KeptGains) -> None:
 
     Raises:
         WrongState: others are kept already: what the drive has now was lent to it.
-        ConfigError: the file cannot be written; nothing has been changed then.
+        ConfigError: the file cannot be written, or what is there cannot be read; nothing has been changed then.
     """
     path = file_of(kept.rig, kept.axis)
-    if path.exists():
+    if kept_for(kept.rig, kept.axis):
         raise WrongState(
             f"axis {kept.axis}: its gains are still to be put back ({path})",
             axis=kept.axis,
-            remedy=f"type: ldcnd tune {kept.axis} --put-back",
+            remedy=put_back_by_hand(kept.axis),
         )
     try:
         durable.replace(path, kept.model_dump_json(indent=1))
@@ -75,15 +78,18 @@ def kept_for(rig: str, axis: str) -> KeptGains | None:
     """Return what is kept for an axis; None without a file.
 
     Raises:
-        ConfigError: the file cannot be read.
+        ConfigError: the file cannot be read, or is about another axis.
     """
-    path = file_of(rig, axis)
+    path, by_hand = file_of(rig, axis), "set the gains by hand, and remove it"
     try:
-        return KeptGains.model_validate_json(path.read_bytes())
+        kept = KeptGains.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
     except (OSError, pydantic.ValidationError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}", remedy="set the gains by hand, and remove it") from error
+        raise ConfigError(f"{path}: cannot be read: {error}", remedy=by_hand) from error
+    if (kept.rig, kept.axis) != (rig, axis):
+        raise ConfigError(f"{path} is about axis {kept.axis} of rig {kept.rig}", remedy=by_hand)
+    return kept
 
 
 def forget(kept: KeptGains) -> None:
@@ -97,6 +103,11 @@ def forget(kept: KeptGains) -> None:
         durable.remove(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be removed: {error.strerror}", remedy="remove it by hand") from error
+
+
+def put_back_by_hand(axis: str) -> str:
+    """Return what a person types to have gains put back."""
+    return f"type: ldcnd tune {axis} --put-back"
 
 
 def gains_in(info: AxisInfo) -> dict[str, int]:
@@ -125,7 +136,8 @@ async def open_loop(axis: Axis) -> None:
     state = (await seen(axis)).state
     if state.state is AxisState.ERROR_STOP and not state.stop_latched:
         await at_rest(axis)
-        await axis.reset()
+        with suppress(StopLatched):  # a stop has come meanwhile: only a person clears its latch
+            await axis.reset(faults_only=True)
     await axis.power(on=False)
     await at_rest(axis)
 
@@ -159,7 +171,7 @@ async def restore(axis: Axis, kept: KeptGains) -> None:
         raise WrongState(
             f"axis {kept.axis}: its gains are not back after {PUT_BACK_S:g} s",
             axis=kept.axis,
-            remedy=f"type: ldcnd tune {kept.axis} --put-back",
+            remedy=put_back_by_hand(kept.axis),
         ) from None
     forget(kept)
 
@@ -179,7 +191,17 @@ async def put_back(rig: Rig, kept: KeptGains, client: str) -> None:
     """Do the same under control of this client's own: an axis whose gains are registers is off afterwards.
 
     Raises:
-        LdcndError: as the daemon refused it; they are still kept.
+        WrongState: they are those of another drive; they are still kept.
+        LdcndError: as the daemon refused it; likewise.
     """
+    info = next((each for each in await rig.describe() if each.axis == kept.axis), None)
+    if info and kept.model not in ("", info.model):
+        raise WrongState(
+            f"axis {kept.axis} is a {info.model}; the gains that are kept for it are those of a {kept.model}",
+            axis=kept.axis,
+            value=info.model,
+            limit=kept.model,
+            remedy=f"remove {file_of(kept.rig, kept.axis)} if that drive has gone",
+        )
     async with rig.control(kept.axis, client=client, lease_s=LEASE_S) as axis:
         await restore(axis, kept)

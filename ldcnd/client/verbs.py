@@ -265,9 +265,14 @@ class AxisVerbs(ABC):
             )
         )
 
-    async def reset(self) -> CommandReply:
-        """Clear the stop latch and the drive's faults; after a drive fault the axis is disabled. Nothing moves."""
-        return await self._send(Reset)
+    async def reset(self, *, faults_only: bool = False) -> CommandReply:
+        """Clear the stop latch and the drive's faults; after a drive fault the axis is disabled. Nothing moves.
+
+        Args:
+            faults_only: Clear faults, and no latch: refused while a stop is latched. Programs that go on by themselves
+                send it so.
+        """
+        return await self._send(lambda: Reset(faults_only=faults_only))
 
     async def set_position(self, position: float) -> CommandReply:
         """Set the position of an axis at standstill; afterwards it is referenced.

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, ClassVar, Generic, Literal, TypeVar, get_args
 from pydantic import ConfigDict, Field
 
 from ldcnd.errors import ErrorCode
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 from ldcnd.model.samples import MOST_SHADOW_FIGURES, ShadowFigure
 
-LARGEST_INTEGER = 2**53 - 1
-"""The largest integer that every reader of JSON keeps exactly."""
+LATEST_NS = 2**63 - 1
+"""The latest instant that every encoding takes, UTC in ns since 1970."""
 LONGEST_NAME = 64
 """Longest name or id that a client may give, in characters."""
 ANSWER_S = 5.0
@@ -198,7 +198,7 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
     instance: str | None = None
     """The run of the daemon for which it is meant, as in `meta/daemon`. A restart discards all command ids; with this
     field a command that is sent again after a restart is refused instead of being carried out twice."""
-    not_after: int | None = Field(default=None, ge=0, le=2**63 - 1)
+    not_after: int | None = Field(default=None, ge=0, le=LATEST_NS)
     """Do not start it after this instant, UTC in ns since 1970; needs clocks that agree."""
 
 
@@ -503,6 +503,9 @@ class Reset(AxisCommand[CommandReply]):
 
     verb = Verb.RESET
 
+    faults_only: bool = False
+    """Clear faults, and no latch: refused while a stop is latched. Programs that go on by themselves send it so."""
+
 
 class SetPosition(AxisCommand[CommandReply]):
     """Set the position of an axis at standstill; afterwards it is referenced."""
@@ -545,7 +548,7 @@ class MoveAnalog(AxisCommand[CommandReply]):
     effect = Effect.MOTION
     ends = Ends.BY_READING
 
-    target: int = Field(ge=0)
+    target: int = Field(ge=0, le=LARGEST_INTEGER)
     """A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
@@ -707,11 +710,11 @@ class ReportShadow(Command[ShadowReply]):
     about = About.AXIS
     effect = Effect.QUESTION
 
-    t: int = Field(ge=0)
+    t: int = Field(ge=0, le=LATEST_NS)
     """Of the last position that the observer has seen, UTC in ns since 1970."""
     learning: bool
     """It still learns what is usual."""
-    judged: int = Field(ge=0)
+    judged: int = Field(ge=0, le=LARGEST_INTEGER)
     """Motions that have taught or were judged since the observer began."""
     figures: tuple[ShadowFigure, ...] = Field(default=(), max_length=MOST_SHADOW_FIGURES)
     """Those of which enough is known."""

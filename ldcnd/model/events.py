@@ -5,7 +5,7 @@ from enum import StrEnum
 from pydantic import Field
 
 from ldcnd.model.commands import About, Command, Effect
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 
 ALARM_HISTORY = "alarm_history"
 """The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
@@ -143,5 +143,5 @@ class ReadEvents(Command[EventList]):
     """Only this axis."""
     count: int = Field(default=100, ge=1, le=1000)
     """Maximum number, and never more than one reply takes."""
-    from_number: int | None = Field(default=None, ge=0)
+    from_number: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
     """The first of these and later ones; the latest when missing."""

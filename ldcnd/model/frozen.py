@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pydantic.json_schema import JsonSchemaValue
     from pydantic_core import CoreSchema
 
+LARGEST_INTEGER = 2**53 - 1
+"""The largest integer that every reader of JSON keeps exactly."""
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Effect, Verb
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 from ldcnd.model.samples import MonitorName
 
 SLOW_S = 60.0
@@ -308,7 +308,7 @@ class PlanParameters(AxisCommand[ParameterPlan]):
 
     values: Mapping[str, Annotated[int, Field(ge=0, le=0xFFFF)]]
     """The wanted words, by number such as Pn100. The unit number in Pn000 is not taken from here."""
-    driver_type: int | None = None
+    driver_type: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
     """8800H of the drive that the values come from; with another type, or none, there is a problem."""
     any_type: bool = False
     """Take values of another or of an unknown type of drive."""

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 from ldcnd.model import leases
 from ldcnd.model.commands import About, Command, CommandReply, Effect, Ends, MoveAbsolute
 from ldcnd.model.events import ReadEvents, ReadOutcome
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 
 
 class AxisMove(MoveAbsolute):
@@ -366,7 +366,7 @@ class ReadWireLog(Command[WireLogReply]):
     """Which line."""
     seconds: float = Field(default=10.0, gt=0, le=86_400)
     """How far back, in seconds; what is older than the recorder keeps is gone."""
-    from_record: int | None = Field(default=None, ge=0)
+    from_record: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
     """Go on from this record; null for the first one within `seconds`."""
 
 

@@ -4,7 +4,7 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 
 
 class AxisState(StrEnum):
@@ -205,7 +205,7 @@ class ShadowFigure(Frozen):
     """Above this mean likewise."""
     unit: str
     """Unit of these values."""
-    motions: int = Field(ge=1)
+    motions: int = Field(ge=1, le=LARGEST_INTEGER)
     """Number of motions in the mean."""
     alarm: bool
     """An alarm stands."""

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Verb
-from ldcnd.model.frozen import Frozen
+from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 from ldcnd.model.parameters import AssumptionInfo
 from ldcnd.model.samples import Sample
 
@@ -232,7 +232,7 @@ class TakeTrace(AxisCommand[TraceReply]):
     """Time between two samples, in seconds, or "fastest"."""
     samples: int = Field(default=500, ge=2, le=MOST_SAMPLES)
     """How many samples; a drive's own recorder always takes as many as it has room for."""
-    pre_trigger: int = Field(default=0, ge=0)
+    pre_trigger: int = Field(default=0, ge=0, le=LARGEST_INTEGER)
     """Number of them before the trigger; ignored without one."""
     full_scale: Mapping[str, Annotated[float, Field(gt=0)]] = {}
     """Largest magnitude expected of a channel, in its unit: a drive's recorder that can resolves it finer. Put back

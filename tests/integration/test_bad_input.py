@@ -86,6 +86,13 @@ async def ask(rig: RunningRig, key: str, payload: bytes, encoding: str) -> dict[
         (f"{X}/home", b'{"method": "current"}', "application/json", "not_supported", ["current", "index"]),
         (f"{X}/home", b'{"method": "magic"}', "application/json", "malformed_request", ["method"]),
         (f"{X}/set_gains", b'{"kp": 99999}', "application/json", "malformed_request", ["kp", "32767"]),
+        (
+            f"{X}/report_shadow",
+            b'{"t": 1000000000000000000000000000000, "learning": false, "judged": 1}',
+            "application/json",
+            "malformed_request",
+            ["t:"],
+        ),
         (f"{X}/fly", b"{}", "application/json", "unknown_verb", ["fly", "move_absolute"]),
         (f"{X}/plan", b"{}", "application/json", "unknown_verb", ["preview"]),
         ("ldcn/sim/@cmd/nobody/halt", b"{}", "application/json", "unknown_axis", ["nobody", "x, y, z, c"]),

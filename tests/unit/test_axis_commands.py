@@ -246,6 +246,20 @@ async def test_a_reset_waits_for_a_stop_that_no_drive_has_confirmed():
         assert bench.drive.calls == []
 
 
+async def test_a_reset_of_faults_only_clears_no_latch():
+    async with axis_bench() as bench:
+        bench.show(enabled=False, faults=(OVERHEAT,))
+        await bench.stop()
+
+        with pytest.raises(StopLatched, match="latched"):
+            await bench.send(Reset(faults_only=True))
+        assert "reset" not in bench.drive.calls
+        assert bench.tracker.stop_latched
+
+        await bench.send(Reset())
+        assert not bench.tracker.stop_latched
+
+
 # -- moves -------------------------------------------------------------------------------------------------------------
 
 

@@ -112,7 +112,7 @@ class AxisCommands:
             case Halt():
                 return await self._halt(permit)
             case Reset():
-                return await self._reset(permit)
+                return await self._reset(permit, faults_only=request.faults_only)
             case _:
                 raise NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
 
@@ -284,7 +284,7 @@ class AxisCommands:
             self.brought_to_rest(permit.command_id, permit.verb)
         return self._motion.reply(permit)
 
-    async def _reset(self, permit: Permit) -> CommandReply:
+    async def _reset(self, permit: Permit, *, faults_only: bool) -> CommandReply:
         """Recover from what has stopped the motor; mere warnings are cleared with a closed loop as it is.
 
         A drive whose loop is open may hold a cause that it does not show: a Logosol drive hides a position error while
@@ -292,7 +292,7 @@ class AxisCommands:
         """
         tracker = self._tracker
         guards.check_reachable(tracker)
-        guards.check_stop_confirmed(tracker)
+        (guards.check_not_latched if faults_only else guards.check_stop_confirmed)(tracker)
         guards.check_stands(tracker)  # a stop that is under way keeps its latch
         if tracker.state is AxisState.ERROR_STOP and self._moves_by_force():
             raise WrongState(
