@@ -10,6 +10,7 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.client.kept_gains import put_back as put_back_gains
+from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import NotSupported, WrongState
@@ -131,5 +132,5 @@ async def _put_back(client: RigClient, axis: str) -> KeptGains:
             axis=axis,
             remedy="type it on the host that tuned; or restart the daemon, which loads the configured gains",
         )
-    await put_back_gains(rig, kept, "ldcnd tune")
+    await put_back_gains(rig, kept, program_name("ldcnd tune"))
     return kept

@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import os
+import socket
 from collections.abc import AsyncIterator
 from itertools import count
 from typing import TypeVar
@@ -16,6 +18,17 @@ RequestT = TypeVar("RequestT", bound=AxisCommand[CommandReply])
 
 RENEWALS_PER_LEASE = 4
 """Number of consecutive renewals that may be lost before a lease ends."""
+LONGEST_NAME = 64
+"""Longest name of a client, characters."""
+
+
+def program_name(name: str) -> str:
+    """Return the name under which this process takes control: the same program elsewhere is another client.
+
+    A client that acquires again replaces its own lease without force. So two processes of one name would take an axis
+    from each other in mid-motion, unasked.
+    """
+    return f"{name}, process {os.getpid()} on {socket.gethostname()}"[:LONGEST_NAME]
 
 
 class Control:

@@ -258,6 +258,40 @@ async def test_gains_wait_on_the_disk_while_another_client_has_control():
     assert "ldcnd tune x --put-back" in str(refused.value.remedy)
 
 
+async def test_an_axis_that_was_moved_since_it_was_agreed_to_is_not_tuned():
+    async with tuned_rig() as (rig, shaft):
+        planned = await plan(rig.client, "x", None)
+        await rig.client.command("x", Power(on=True))
+        reply = await rig.client.command("x", MoveAbsolute(position=1.5))
+        await rig.client.wait_for_end("x", reply.command_id)
+        await rig.client.command("x", Power(on=False))
+        place = shaft.position_counts
+
+        with pytest.raises(WrongState, match="was moved since"):
+            await measure(rig.client, planned, 20.0, lambda _: None)
+
+        assert shaft.position_counts == pytest.approx(place, abs=2)
+        assert await is_off_with_its_old_gains(rig)
+
+
+async def test_an_axis_with_another_scale_than_was_agreed_to_is_not_tuned():
+    async with tuned_rig() as (rig, _):
+        planned = await plan(rig.client, "x", 2.0)
+    async with tuned_rig(counts_per_unit=5000.0) as (rig, shaft):
+        with pytest.raises(WrongState, match="another counts_per_unit"):
+            await measure(rig.client, planned, 20.0, lambda _: None)
+
+        assert shaft.position_counts == 0
+        assert not (await rig.client.state("x")).enabled
+
+
+@pytest.mark.parametrize("within", [1e308, -1.0, float("nan"), float("inf")])
+async def test_a_distance_that_is_none_is_refused(within):
+    async with tuned_rig() as (rig, _):
+        with pytest.raises(ValueOutOfRange, match="are no distance"):
+            await plan(rig.client, "x", within)
+
+
 async def test_nothing_is_sent_by_a_plan_and_it_states_the_distance():
     async with tuned_rig(counts_per_unit=500.0) as (rig, _):
         planned = await plan(rig.client, "x", 1.5)

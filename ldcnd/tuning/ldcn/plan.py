@@ -4,18 +4,30 @@ import math
 from dataclasses import dataclass
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import kept_for
+from ldcnd.client.kept_gains import kept_for, put_back_by_hand
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.standstill import at_rest
+from ldcnd.drivers.driver import LARGEST_COUNT
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
-from ldcnd.errors import NotReferenced, NotSupported, PositionLimit, Remedy, StopLatched, WrongState, step
+from ldcnd.errors import (
+    NotReferenced,
+    NotSupported,
+    PositionLimit,
+    Remedy,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import AxisState
 from ldcnd.tuning.ldcn.excitation import Bounds, Excitation
 
 WITHIN_COUNTS = 2000
 """Distance where none is wanted, counts."""
+PLANNED_WITH = ("model", "address", "identity", "unit", "counts_per_unit", "direction", "modulo", "limits", "approach")
+"""What a plan stands on."""
 BELOW = 1 - 1e-9
 """Keeps a limit that was converted to counts and back from being exceeded by its rounding."""
 
@@ -28,12 +40,14 @@ class Plan:
         info: the axis.
         profile: its dialect.
         bounds: what the axis may be asked to do.
+        here_counts: where the axis stands, by its encoder: the bounds are from there.
         lines: the same for people.
     """
 
     info: AxisInfo
     profile: Profile
     bounds: Bounds
+    here_counts: int
     lines: tuple[str, ...]
 
     @property
@@ -71,11 +85,11 @@ async def plan(client: RigClient, name: str, within: float | None) -> Plan:
             raise WrongState(
                 f"axis {name}: an earlier tuning was cut short and its gains are still to be put back",
                 axis=name,
-                remedy=f"type: ldcnd tune {name} --put-back",
+                remedy=put_back_by_hand(name),
             )
         await check_off(axis)
         counts_per_unit = info.counts_per_unit or 1.0
-        within_counts = WITHIN_COUNTS if within is None else round(within * counts_per_unit)
+        within_counts = WITHIN_COUNTS if within is None else _counts(name, within * counts_per_unit)
         limits = info.limits
         bounds = Bounds(
             within_counts,
@@ -85,7 +99,40 @@ async def plan(client: RigClient, name: str, within: float | None) -> Plan:
         excitation = Excitation(profile, bounds)
         await _check_travel(axis, info, within_counts / counts_per_unit)
         lines = _lines(info, axis.position.value, bounds, excitation)
-    return Plan(info, profile, bounds, lines)
+        here_counts = axis.position.sample.counts
+    return Plan(info, profile, bounds, here_counts, lines)
+
+
+def _counts(axis: str, within_counts: float) -> int:
+    """Return a distance in whole counts.
+
+    Raises:
+        ValueOutOfRange: it is none, or no drive counts so far.
+    """
+    if not 0 <= within_counts <= LARGEST_COUNT:
+        raise ValueOutOfRange(
+            f"axis {axis}: {within_counts:g} counts are no distance",
+            axis=axis,
+            value=str(within_counts),
+            limit=LARGEST_COUNT,
+            remedy="give the distance in axis units",
+        )
+    return round(within_counts)
+
+
+def check_as_planned(planned: Plan, info: AxisInfo) -> None:
+    """Refuse an axis that is another one than when the plan was made and agreed to: distances would mean others.
+
+    Raises:
+        WrongState: names what differs.
+    """
+    differ = [name for name in PLANNED_WITH if getattr(info, name) != getattr(planned.info, name)]
+    if differ:
+        raise WrongState(
+            f"axis {info.axis} has another {' and '.join(differ)} than when this was planned",
+            axis=info.axis,
+            remedy="tune it again",
+        )
 
 
 def _profile_of(info: AxisInfo) -> Profile:

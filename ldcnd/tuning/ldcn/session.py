@@ -23,8 +23,10 @@ from ldcnd.client.kept_gains import (
     load,
     open_loop,
     put_back,
+    put_back_by_hand,
     restore,
 )
+from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
@@ -42,11 +44,11 @@ from ldcnd.model.traces import TakeTrace
 from ldcnd.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
 from ldcnd.tuning.ldcn.excitation import MOST_ERROR_LIMIT, Excitation, Purpose, Record, Shown, Trial, Trials
 from ldcnd.tuning.ldcn.identify import Identified, identify
-from ldcnd.tuning.ldcn.plan import Plan, check_off
+from ldcnd.tuning.ldcn.plan import Plan, check_as_planned, check_off
 from ldcnd.tuning.ldcn.response import Move, simulate
 from ldcnd.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
 
-CLIENT = "ldcnd tune"
+CLIENT = program_name("ldcnd tune")
 LEAD_S = 0.1
 """Samples are taken for so much longer than the trial lasts, seconds."""
 FIRST_INTERVAL_S = 0.0025
@@ -74,7 +76,6 @@ class Findings:
         proposal: gains for it.
         move: the test move.
         before: as measured with the old gains; fewer than two where the drive gave up or the model forbade it.
-        origin_counts: where the axis stood at the beginning.
         farthest_counts: from there.
     """
 
@@ -84,7 +85,6 @@ class Findings:
     proposal: Proposal
     move: Move
     before: tuple[Measured, ...]
-    origin_counts: int
     farthest_counts: int
 
 
@@ -117,12 +117,11 @@ async def measure(client: RigClient, planned: Plan, bandwidth_hz: float | None, 
         ValueOutOfRange: its traces tell too little, or no gains have the margins.
         LdcndError: as the daemon refused it; also when control was lost.
     """
-    excitation = Excitation(planned.profile, planned.bounds)
     profile = planned.profile
     async with _tuned_axis(client, planned, tell) as (axis, kept), _named(axis.name):
         tests = _Trials(client, axis, planned, kept.gains)
+        excitation = Excitation(profile, planned.bounds, await tests.offset_counts())
         tell("pulses: does the encoder count the motor's way?")
-        origin_counts = await tests.rest_counts()
         await tests.run(excitation.pulses())
         tell(f"it gives way at {excitation.level} of 255 PWM steps; soft moves")
         soft = await tests.run(excitation.soft())
@@ -142,7 +141,7 @@ async def measure(client: RigClient, planned: Plan, bandwidth_hz: float | None, 
             before = tests.measured(known, await tests.run(excitation.test(usual, move, duration_s(move))))
         await restore(axis, kept)
     farthest_counts = excitation.farthest_counts
-    return Findings(planned, kept.gains, known, proposal, move, before, origin_counts, farthest_counts)
+    return Findings(planned, kept.gains, known, proposal, move, before, farthest_counts)
 
 
 async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
@@ -156,15 +155,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
     planned, profile = found.plan, found.plan.profile
     async with _tuned_axis(client, planned, tell) as (axis, kept), _named(axis.name):
         tests = _Trials(client, axis, planned, kept.gains)
-        offset_counts = await tests.rest_counts() - found.origin_counts
-        if abs(offset_counts) > planned.bounds.within_counts // 2:
-            raise WrongState(
-                f"axis {axis.name} was moved since it was measured: it stands {offset_counts:+d} counts from there",
-                axis=axis.name,
-                value=offset_counts,
-                remedy="tune it again",
-            )
-        excitation = Excitation(profile, planned.bounds, offset_counts)
+        excitation = Excitation(profile, planned.bounds, await tests.offset_counts())
         tell("test move with the proposed gains")
         records = await tests.run(excitation.test(found.proposal.gains, found.move, duration_s(found.move)))
         after = tests.measured(found.known, records)
@@ -188,7 +179,8 @@ async def _tuned_axis(client: RigClient, planned: Plan, tell: Tell) -> AsyncIter
             await check_off(axis)
             await axis.set_gains()  # a drive that was not powered on since its reset has none yet
             info = next(each for each in await rig.describe() if each.axis == name)
-            kept = KeptGains(rig=rig.name, axis=name, gains=gains_in(info))
+            check_as_planned(planned, info)
+            kept = KeptGains(rig=rig.name, axis=name, gains=gains_in(info), model=info.model)
             keep(kept)
             try:
                 yield axis, kept
@@ -208,7 +200,7 @@ async def _put_back_anew(rig: Rig, kept: KeptGains, tell: Tell) -> None:
         raise WrongState(
             f"axis {kept.axis}: tuning was cut short, and its old gains could not be put back: {error}",
             axis=kept.axis,
-            remedy=f"once it can be controlled again, type: ldcnd tune {kept.axis} --put-back",
+            remedy=f"once it can be controlled again, {put_back_by_hand(kept.axis)}",
         ) from error
     tell(f"{kept.axis}: off, with its old gains")
 
@@ -300,6 +292,24 @@ class _Trials:
         )
         times, positions = _until_rest(trace, from_counts)
         return Shown(Record(trial.gains, move, trial.start, times, positions), tripped, rest_counts)
+
+    async def offset_counts(self) -> int:
+        """Return where the axis stands, from where it stood when this was planned and agreed to, in counts.
+
+        Raises:
+            WrongState: so far away that the moves would leave the distance that was stated.
+        """
+        planned = self._plan
+        offset_counts = await self.rest_counts() - planned.here_counts
+        if abs(offset_counts) > planned.bounds.within_counts // 2:
+            raise WrongState(
+                f"axis {self._axis.name} was moved since this was planned: it stands {offset_counts:+d} counts from"
+                " there",
+                axis=self._axis.name,
+                value=offset_counts,
+                remedy="tune it again",
+            )
+        return offset_counts
 
     async def rest_counts(self) -> int:
         """Wait until the axis stands, by samples of its own; return where, in counts."""

@@ -7,12 +7,13 @@ at power-off; the old ones are on the disk of this host before.
 
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 
 from pydantic import Field
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import LEASE_S, KeptGains, forget, keep, kept_for, restore
+from ldcnd.client.kept_gains import LEASE_S, KeptGains, forget, keep, kept_for, put_back_by_hand, restore
+from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.smartstep.monitors import FunctionSwitch
@@ -22,7 +23,7 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.parameters import ParameterValue
 from ldcnd.model.samples import MonitorName
 
-CLIENT = "ldcnd tune"
+CLIENT = program_name("ldcnd tune")
 GAINS = ("Pn100", "Pn101", "Pn102", "Pn103", "Pn109", "Pn10A", "Pn401")
 """Parameters of the loops, as far as the drive's manual lists them (3, user parameters)."""
 CHANNELS = ("speed_feedback", "position_deviation", "inp")
@@ -153,7 +154,7 @@ async def try_gains(
         LdcndError: as the daemon refused it; the old gains are back then, unless control was lost.
     """
     check_wanted(found, wanted)
-    async with _changing(client, found, wanted) as (axis, kept):
+    async with _changing(client, found, wanted, tell) as (axis, kept):
         await moves("the present gains")
         before = await _recorded(axis, record_s)
         for name, value in wanted.items():
@@ -173,19 +174,23 @@ async def try_gains(
 
 @asynccontextmanager
 async def _changing(
-    client: RigClient, found: SmartStepTuning, wanted: Mapping[str, int]
+    client: RigClient, found: SmartStepTuning, wanted: Mapping[str, int], tell: Tell
 ) -> AsyncIterator[tuple[Axis, KeptGains]]:
     """Control an axis whose parameters are kept; puts them back unless that was done, or they are not to come back."""
     rig = Rig(client, await client.daemon())
-    kept = KeptGains(rig=rig.name, axis=found.axis, gains={name: found.gains[name].active for name in wanted})
     async with rig.control(found.axis, client=CLIENT, lease_s=LEASE_S) as axis:
+        # read again: others could write until now
+        old = {name: (await axis.read_parameter(name)).value.active for name in wanted}
+        kept = KeptGains(rig=rig.name, axis=found.axis, gains=old)
         keep(kept)
         try:
             yield axis, kept
         finally:
             if kept_for(rig.name, found.axis):
-                with suppress(LdcndError, TimeoutError):  # still kept: a person puts them back
+                try:
                     await restore(axis, kept)
+                except LdcndError as error:
+                    tell(f"{found.axis}: its old gains could not be put back: {error}; {put_back_by_hand(found.axis)}")
 
 
 async def _recorded(axis: Axis, record_s: float) -> MoveFigures:
