@@ -5,7 +5,6 @@ persons.
 """
 
 import asyncio
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
@@ -14,6 +13,8 @@ from ldcnd.errors import LdcndError
 
 YES = ("y", "yes")
 NO = ("n", "no")
+LEAST, MOST = 1e-12, 1e12
+"""Range of a number that a person types, either way, beside 0: what is worked out with it stays finite."""
 
 
 class Left(Exception):
@@ -79,19 +80,23 @@ class Person(ABC):
         return await self.ask(question if default is None else f"{question} [{default:g}]")
 
     async def number(self, question: str, default: float | None = None) -> float:
-        """Ask until the answer is a finite number; an empty one stands for the default."""
+        """Ask until the answer is 0 or a number from `LEAST` to `MOST`, either way; an empty one is the default."""
         while True:
             answer = await self.ask_number(question, default)
             if not answer and default is not None:
                 return default
-            try:
-                number = float(answer)
-            except ValueError:
-                self.tell(f"{answer!r} is no number")
-                continue
-            if math.isfinite(number):
+            if (number := typed_number(answer)) is not None:
                 return number
-            self.tell("it must be a finite number")
+            self.tell(f"{answer!r} is no number: 0, or {LEAST:g} to {MOST:g} either way")
+
+
+def typed_number(text: str) -> float | None:
+    """Return a number that was typed; None for any other text, and for one that is too large or too small."""
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if not number or LEAST <= abs(number) <= MOST else None
 
 
 def said(error: LdcndError) -> str:

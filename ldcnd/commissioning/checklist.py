@@ -3,14 +3,15 @@
 import asyncio
 import difflib
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from pydantic import JsonValue
 
-from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back
+from ldcnd import durable
+from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
+from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import seen
 from ldcnd.commissioning import record as records
@@ -26,7 +27,7 @@ from ldcnd.commissioning.speed import HighestSpeed
 from ldcnd.commissioning.step import Site, Step
 from ldcnd.commissioning.travel import Travel
 from ldcnd.config.axis import AxisConfig, MovedAxisConfig
-from ldcnd.config.edit import draft_of, edited_for_axis
+from ldcnd.config.edit import edited_for_axis
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.errors import ConfigError, LdcndError, UnknownAxis, WrongState
 from ldcnd.model.meta import AxisInfo
@@ -48,7 +49,7 @@ STEPS: dict[str, Step] = {
     )
 }
 """All of them, in the order in which they build on each other."""
-CLIENT = "ldcnd commission"
+CLIENT = program_name("ldcnd commission")
 LEASE_S = 2.0
 """So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
 WITHOUT_RUN = (StepState.NOT_POSSIBLE, StepState.NOT_NEEDED)
@@ -63,11 +64,13 @@ class Change:
     """What a step proposes, as a change of the file.
 
     Attributes:
-        text: the file as it would be.
+        before: the file as it was.
+        text: as it would be.
         lines: the difference, as `diff -u` shows it.
         restarts: whether the daemon must be restarted for it; otherwise SIGHUP has it read the file again.
     """
 
+    before: str
     text: str
     lines: tuple[str, ...]
     restarts: bool
@@ -110,7 +113,7 @@ class Checklist:
             In words what has been reopened, and why.
         """
         site = await self._site()
-        messages = []
+        messages: list[str] = []
         record = self.record
         for name, step in STEPS.items():
             kept = record.of(name)
@@ -150,6 +153,17 @@ class Checklist:
             async with asyncio.timeout(PUT_BACK_S):
                 await put_back(self._rig, kept, CLIENT)
 
+    async def _put_back_or_say(self) -> None:
+        """Put back what a step has left in the drive; where that fails, they stay kept, and the person is told."""
+        try:
+            await self.put_back_gains()
+        except (LdcndError, TimeoutError) as error:
+            why = said(error) if isinstance(error, LdcndError) else f"it took longer than {PUT_BACK_S:g} s"
+            self._person.tell(
+                f"{self._axis}: its former gains could not be put back: {why}",
+                f"the drive has gains of this step until they are: begin a step, or {put_back_by_hand(self._axis)}",
+            )
+
     async def preview(self, name: str) -> tuple[str, ...]:
         """Return in words what a step would do now; nothing is sent to the drive.
 
@@ -184,8 +198,7 @@ class Checklist:
             self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
             raise
         finally:
-            with suppress(LdcndError, TimeoutError):  # they are still kept
-                await self.put_back_gains()
+            await self._put_back_or_say()
         return self._settle(step, site, result)
 
     async def settle(self, name: str, result: Result) -> StepRecord:
@@ -209,18 +222,18 @@ class Checklist:
             return None
         named = str(self._config)
         lines = difflib.unified_diff(before.splitlines(), after.splitlines(), named, named, lineterm="", n=2)
-        return Change(after, tuple(lines), restarts=any(not _is_reloaded(each) for each in proposals))
+        return Change(before, after, tuple(lines), restarts=any(not _is_reloaded(each) for each in proposals))
 
     def write(self, change: Change) -> None:
         """Replace the configuration; it was checked whole when the change was made.
 
         Raises:
-            ConfigError: it cannot be written; it is as it was.
+            ConfigError: it cannot be written, or was changed since; it is as it is.
         """
         try:
-            with draft_of(self._config) as draft:
-                draft.write_text(change.text, encoding="utf-8")
-                draft.replace(self._config)
+            if self._config.read_text(encoding="utf-8") != change.before:
+                raise ConfigError(f"{self._config} has been changed meanwhile", remedy="look at the change again")
+            durable.replace(self._config, change.text)
         except OSError as error:
             raise ConfigError(f"{self._config}: cannot be written: {error.strerror}") from error
 
@@ -231,6 +244,7 @@ class Checklist:
         infos = {info.axis: info for info in await self._rig.describe()}
         if self._axis not in infos:
             raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
+        self.record = records.read(self.path, self._rig.name, self._axis)  # another session may have added to it
         return Site(self._rig, infos[self._axis], config, self._person, self.record)
 
     def _kept(self, step: Step, site: Site, result: Result) -> StepRecord:
@@ -239,6 +253,7 @@ class Checklist:
 
     def _settle(self, step: Step, site: Site, result: Result) -> StepRecord:
         kept = self._kept(step, site, result)
+        self.record = records.read(self.path, self._rig.name, self._axis)
         self._keep(self.record.with_step(kept))
         return kept
 

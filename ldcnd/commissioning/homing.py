@@ -1,17 +1,22 @@
 """Home repeatability: the reference is searched several times by the configured method; the marks must agree."""
 
+from functools import partial
+
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
 from ldcnd.commissioning.record import Figure, Result, Series, StepState
-from ldcnd.commissioning.step import Site, Step, ended_while_held, rest_counts
+from ldcnd.commissioning.step import Site, Step, moved_while_held, rest_counts
+from ldcnd.config.axis import HomeConfig
 from ldcnd.errors import CommandAborted
-from ldcnd.model.commands import Verb
+from ldcnd.model.commands import Home, Verb
 
 SEARCHES = 5
 MOST_SEARCHES = 50
 BACK_S = 2.0
 """Before each further search it goes back by what it searches in this time at most, seconds."""
+REQUESTED = set(Home.model_fields) & set(HomeConfig.model_fields)
+"""What a request can say of a search."""
 
 
 class HomeRepeatability(Step):
@@ -34,15 +39,17 @@ class HomeRepeatability(Step):
         home = site.config.home
         if home is None:
             return ()
-        far = abs(home.velocity) * home.timeout_s if home.distance is None else home.distance
+        fastest = max(abs(home.velocity), home.find_velocity or 0.0)
+        far = fastest * home.timeout_s if home.distance is None else home.distance
+        then = "" if home.move_to is None else f", and goes to {site.length(home.move_to)} behind each"
         return (
             (
-                f"{site.info.axis} searches {home.method.value} at {home.velocity:g} {site.info.unit}/s, for"
-                f" {home.timeout_s:g} s and {site.length(far)} at most, {SEARCHES} times unless you say otherwise"
+                f"{site.info.axis} searches {home.method.value} at {site.length(fastest)}/s at most, for"
+                f" {home.timeout_s:g} s and {site.length(far)} at most, {SEARCHES} times unless you say otherwise{then}"
             ),
             (
-                f"between the searches it goes back by at most {site.length(abs(home.velocity) * BACK_S)}, and never"
-                " behind where it began"
+                f"between the searches it goes back by at most {site.length(abs(home.velocity) * BACK_S)}, at"
+                f" {site.length(abs(home.velocity))}/s, and never behind where it began"
             ),
             "it moves while you hold the key; letting go halts it and ends the step",
             "its loop is closed and stays closed; its positions count from the reference afterwards",
@@ -58,10 +65,12 @@ class HomeRepeatability(Step):
         await axis.power(on=True)
         sign = -1 if site.info.direction == "reverse" else 1
         began = sign * await rest_counts(axis) / site.counts_per_unit
+        # with what was said before: the daemon may run with another `home` than the file
+        search = partial(axis.home, **home.model_dump(include=REQUESTED, exclude_none=True))
         marks: list[float] = []
         async with person.holding(f"{axis.name} searches its reference {searches} times") as released:
             for number in range(1, searches + 1):
-                if await ended_while_held(axis, await axis.home(), released) is None:
+                if await moved_while_held(axis, search, released) is None:
                     raise _halted(axis)
                 marks.append(await _mark(site, axis))
                 person.tell(f"search {number}: {site.length(marks[-1] - marks[0])} from the first")
@@ -70,7 +79,8 @@ class HomeRepeatability(Step):
                     # between where it began and the mark is no other mark
                     back = min(abs(marks[0] + home.position - began), abs(home.velocity) * BACK_S)
                     goal = marks[0] + home.position - (back if home.velocity > 0 else -back)
-                    if await ended_while_held(axis, await axis.move_relative(goal - here), released) is None:
+                    go_back = partial(axis.move_relative, goal - here, velocity=abs(home.velocity))
+                    if await moved_while_held(axis, go_back, released) is None:
                         raise _halted(axis)
         return _judged(site, marks)
 

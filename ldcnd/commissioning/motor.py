@@ -144,7 +144,7 @@ async def lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
     await open_loop(axis)
     await axis.set_gains()  # a drive that was not powered on since its reset has none yet
     info = next(each for each in await site.rig.describe() if each.axis == axis.name)
-    kept = KeptGains(rig=site.rig.name, axis=axis.name, gains=gains_in(info))
+    kept = KeptGains(rig=site.rig.name, axis=axis.name, gains=gains_in(info), model=info.model)
     keep(kept)
     try:
         yield kept.gains

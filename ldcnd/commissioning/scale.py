@@ -1,10 +1,12 @@
 """Encoder direction and counts per unit: a known motion, measured by a person."""
 
+from functools import partial
+
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
 from ldcnd.commissioning.record import Figure, Proposal, Result, StepState
-from ldcnd.commissioning.step import Site, Step, done, ended_while_held, refuse_previewed, rest_counts
+from ldcnd.commissioning.step import Site, Step, done, moved_while_held, refuse_previewed, rest_counts
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.commands import Verb
 
@@ -57,8 +59,7 @@ class Scale(Step):
         await axis.power(on=True)
         before = await rest_counts(axis)
         async with person.holding(f"{site.info.axis} moves by {site.length(distance)}") as released:
-            motion = await axis.move_relative(distance, velocity=velocity)
-            ended = await ended_while_held(axis, motion, released)
+            ended = await moved_while_held(axis, partial(axis.move_relative, distance, velocity=velocity), released)
         counts = await rest_counts(axis) - before
         if ended is None:
             person.tell("halted; what it went until then can be measured as well")

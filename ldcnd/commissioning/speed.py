@@ -5,13 +5,14 @@ import math
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 from typing_extensions import override
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.commissioning.record import Figure, Proposal, Result, Series, StepState
-from ldcnd.commissioning.step import Site, Step, ended_while_held, refuse_previewed
+from ldcnd.commissioning.step import Site, Step, moved_while_held, refuse_previewed
 from ldcnd.errors import CommandAborted, DriveFault, LdcndError
 from ldcnd.model.commands import Verb
 
@@ -86,7 +87,9 @@ class HighestSpeed(Step):
         person, config = site.person, site.config
         velocity, _ = _highest(site)
         enough = CRUISE * velocity * velocity / config.acceleration
-        distance = await person.number(f"how far may it move, signed, in {site.info.unit}", enough)
+        least = config.velocity * config.velocity / config.acceleration
+        while abs(distance := await person.number(f"how far may it move, signed, in {site.info.unit}", enough)) < least:
+            person.tell(f"in less than {site.length(least)} it does not reach its velocity")
         refuse_previewed(await axis.preview(distance=distance, velocity=config.velocity))
         await axis.power(on=True)
         async with person.holding(f"{axis.name} moves by {site.length(distance)} and back, again and again") as held:
@@ -118,15 +121,16 @@ async def _try(
     for way in (distance, -distance):
         loop = asyncio.get_running_loop()
         began_s = loop.time()
-        motion = await axis.move_relative(way, velocity=velocity, acceleration=acceleration)
+        move = partial(axis.move_relative, way, velocity=velocity, acceleration=acceleration)
         try:
-            ended = await ended_while_held(axis, motion, held, _watch(axis, lags))
+            moved = await moved_while_held(axis, move, held, partial(_watch, axis, lags))
         except DriveFault as fault:
             objection = fault.message
             await open_loop(axis)
             break
-        if ended is None:
+        if moved is None:
             raise CommandAborted(f"axis {axis.name}: the key was let go", axis=axis.name, remedy="run the step again")
+        motion, ended = moved
         duration_s = motion.reply.duration_s or 0.0
         late_s = max(late_s, loop.time() - began_s - duration_s)
         if late_s > LATE_S + LATE_SHARE * duration_s:

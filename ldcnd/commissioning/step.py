@@ -2,7 +2,7 @@
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -152,24 +152,32 @@ def refuse_previewed(reply: PreviewReply) -> None:
         )
 
 
-async def ended_while_held(
-    axis: Axis, motion: Motion, released: asyncio.Event, beside: Coroutine[None, None, None] | None = None
-) -> State | None:
-    """Wait until a motion has ended; None when the key was released first: then the axis is halted and stands.
+async def moved_while_held(
+    axis: Axis,
+    move: Callable[[], Awaitable[Motion]],
+    released: asyncio.Event,
+    beside: Callable[[], Coroutine[None, None, None]] | None = None,
+) -> tuple[Motion, State] | None:
+    """Make one motion; None when the key was released before it had ended: then the axis stands.
+
+    Nothing is begun once the key is released: a step of several motions asks before each.
 
     Args:
         axis: which moves.
-        motion: under way.
+        move: begins the motion.
         released: is set when the key is.
         beside: runs meanwhile, is cancelled at the end, and raises nothing itself.
 
     Raises:
-        LdcndError: it has ended otherwise.
+        LdcndError: it was refused, or has ended otherwise.
     """
+    if released.is_set():
+        return None
+    motion = await move()
     async with asyncio.TaskGroup() as group:
         ended = group.create_task(_ended(motion), name=f"motion of {axis.name}")
         let_go = group.create_task(released.wait(), name="released key")
-        watching = group.create_task(beside, name=f"watch {axis.name}") if beside else None
+        watching = group.create_task(beside(), name=f"watch {axis.name}") if beside else None
         await asyncio.wait((ended, let_go), return_when=asyncio.FIRST_COMPLETED)
         let_go.cancel()
         if watching:
@@ -182,7 +190,7 @@ async def ended_while_held(
     outcome = ended.result()
     if isinstance(outcome, LdcndError):
         raise outcome
-    return outcome
+    return motion, outcome
 
 
 async def _ended(motion: Motion) -> State | LdcndError:

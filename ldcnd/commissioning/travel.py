@@ -9,6 +9,7 @@ from ldcnd.commissioning.record import Figure, Proposal, Result, StepState
 from ldcnd.commissioning.step import Site, Step, rest_counts
 from ldcnd.errors import LeaseExpired, ValueOutOfRange
 from ldcnd.model.commands import Verb
+from ldcnd.person import typed_number
 
 MARGIN = 0.02
 """Share of the travel that the limits keep from each end."""
@@ -91,9 +92,9 @@ class Travel(Step):
                 case ["here"]:
                     await rest_counts(axis)
                     return axis.position.value
-                case ["jog", text] if velocity := _number(text):
+                case ["jog", text] if velocity := typed_number(text):
                     await self._jog(site, axis, velocity)
-                case [text] if (position := _number(text)) is not None:
+                case [text] if (position := typed_number(text)) is not None:
                     return position
                 case _:
                     person.tell(HELP)
@@ -112,11 +113,3 @@ class Travel(Step):
                     await jog.held()
         await rest_counts(axis)
         site.person.tell(f"{axis.name} is at {axis.position.value:g} {site.info.unit}")
-
-
-def _number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if abs(number) < float("inf") else None

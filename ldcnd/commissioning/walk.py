@@ -48,15 +48,20 @@ class Walk:
         """
         step = STEPS[name]
         self._person.tell("", f"{step.title} ({name})", f"  {step.about}")
-        self._person.tell(*(f"  * {line}" for line in await self._checklist.preview(name)))
-        answer = await self._person.choose("run it", RUN)
-        if answer == "no":
-            return None
-        if answer == "skip":
-            while not (reason := await self._person.ask("for which reason")):
-                pass
-            self._show(await self._checklist.settle(name, Result(state=StepState.SKIPPED, text=reason)))
-            return None
+        shown: tuple[str, ...] | None = None
+        while (preview := await self._checklist.preview(name)) != shown:  # what was agreed to is what is run
+            if shown is not None:
+                self._person.tell("what it will do has changed meanwhile:")
+            shown = preview
+            self._person.tell(*(f"  * {line}" for line in shown))
+            answer = await self._person.choose("run it", RUN)
+            if answer == "no":
+                return None
+            if answer == "skip":
+                while not (reason := await self._person.ask("for which reason")):
+                    pass
+                self._show(await self._checklist.settle(name, Result(state=StepState.SKIPPED, text=reason)))
+                return None
         kept = await self._checklist.run(name)
         self._show(kept)
         if kept.result.state is StepState.FAILED:
@@ -69,8 +74,13 @@ class Walk:
         Returns:
             True when it was written: the daemon has to read it before the next step. None otherwise.
         """
-        change = self._checklist.change(name)
-        if change is None or not await self._person.approve(self._file, change.lines):
+        while change := self._checklist.change(name):
+            if not await self._person.approve(self._file, change.lines):
+                return None
+            if change == self._checklist.change(name):  # what was shown is what is written
+                break
+            self._person.tell(f"{self._file} was changed meanwhile")
+        if change is None:
             return None
         self._checklist.write(change)
         how = "restart the daemon" if change.restarts else "SIGHUP lets the daemon read it"

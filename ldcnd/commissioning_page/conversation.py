@@ -42,11 +42,19 @@ class Conversation(ABC):
             self.person.answer(message.answer)
         if message.hold:
             self.person.hold(message.hold)
-        if message.leave and self._activity:
-            self._activity.cancel()
+        if message.leave:
+            self._leave()
         if message.begin and not self._begun:
             self._begun = message
             self._begin.set()
+
+    def _leave(self) -> None:
+        """End what runs, or was about to; once only, for a second time would end how it is brought to its end."""
+        if self._activity is None:
+            self._begun = None
+            self._begin.clear()
+        elif not self._activity.cancelling():
+            self._activity.cancel()
 
     async def view(self) -> View:
         """Wait until there is something else to show, and return it."""

@@ -141,6 +141,7 @@ class PagePerson(Person):
     def leave(self) -> None:
         """No answer will come any more, and nothing is held."""
         self._gone = True
+        self._pressed = False
         self._release()
         if self._answer and not self._answer.done():
             self._answer.set_exception(Left("the page has gone"))

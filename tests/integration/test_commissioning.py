@@ -4,12 +4,15 @@ import asyncio
 import functools
 import re
 import shutil
+from contextlib import asynccontextmanager
 from dataclasses import fields, replace
 from xml.etree import ElementTree as ET
 
 import pytest
 
-from ldcnd.client.kept_gains import KeptGains, keep
+from ldcnd.client.axis import Axis
+from ldcnd.client.kept_gains import KeptGains, file_of, keep
+from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.commissioning.checklist import STEPS, Checklist
 from ldcnd.commissioning.first_settings import SOFT_GAINS
@@ -17,8 +20,9 @@ from ldcnd.commissioning.limit_switches import _judged
 from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
 from ldcnd.commissioning.record import Result, StepState
 from ldcnd.commissioning.report import html_of
+from ldcnd.commissioning.walk import Walk
 from ldcnd.config.rig import load_config
-from ldcnd.errors import LeaseExpired, StopLatched, WrongState
+from ldcnd.errors import CommandAborted, ConfigError, LeaseExpired, LeaseHeld, StopLatched, WrongState
 from ldcnd.person import Left
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.servo import FULL_PWM
@@ -161,6 +165,23 @@ async def test_a_stop_in_the_middle_stays_latched_and_the_gains_are_put_back(tmp
         assert await rig.registers() == GAINS
 
 
+async def test_a_stop_between_a_trip_and_its_reset_stays_latched_and_ends_the_step(tmp_path, monkeypatch):
+    async with commissioning_rig(tmp_path, STANDS) as rig:
+        rig.drive.shaft.stalled = True
+        reset = Axis.reset
+
+        async def stopped_before(axis, **arguments):
+            await rig.running.client.stop()
+            return await reset(axis, **arguments)
+
+        monkeypatch.setattr(Axis, "reset", stopped_before)
+        with pytest.raises(StopLatched):
+            await (await rig.checklist()).run("motor")
+
+        assert (await rig.running.client.state(AXIS)).stop_latched
+        assert await rig.registers() == GAINS
+
+
 async def test_gains_are_put_back_when_the_step_is_cancelled(tmp_path):
     async with commissioning_rig(tmp_path, STANDS, friction_nm=0.2) as rig:
         checklist = await rig.checklist()
@@ -195,6 +216,63 @@ async def test_gains_that_could_not_be_put_back_are_put_back_by_the_next_call(tm
 
         assert await rig.registers() == GAINS
         assert again.gains_to_put_back is None
+
+
+async def test_gains_that_could_not_be_put_back_are_said(tmp_path):
+    async with commissioning_rig(tmp_path, STANDS, friction_nm=0.2) as rig:
+        running = asyncio.create_task((await rig.checklist()).run("motor"))
+        while (await rig.registers())["el"] != MOST_EL_COUNTS:
+            await asyncio.sleep(0.05)
+        other = Rig(rig.running.client, await rig.running.client.daemon())
+        async with other.control(AXIS, client="other", lease_s=5.0, force=True):
+            with pytest.raises(LeaseExpired):
+                await running
+
+        assert "x: its former gains could not be put back: axis x is controlled by other" in rig.person.told[-2]
+        assert "ldcnd tune x --put-back" in rig.person.told[-1]
+
+
+async def test_another_process_of_the_same_program_takes_no_axis_away(tmp_path, monkeypatch):
+    async with commissioning_rig(tmp_path, STANDS) as rig:
+        other = Rig(rig.running.client, await rig.running.client.daemon())
+        with monkeypatch.context() as elsewhere:
+            elsewhere.setattr("os.getpid", lambda: 1)
+            name = program_name("ldcnd commission")
+        async with other.control(AXIS, client=name, lease_s=5.0):
+            with pytest.raises(LeaseHeld, match="controlled by ldcnd commission, process 1 on"):
+                await (await rig.checklist()).run("motor")
+
+
+@pytest.mark.parametrize(
+    ("kept", "said"),
+    [
+        (KeptGains(rig="bench", axis="y", gains=GAINS), "is about axis y of rig bench"),
+        (KeptGains(rig="other", axis=AXIS, gains=GAINS), "is about axis x of rig other"),
+        (KeptGains(rig="bench", axis=AXIS, gains=GAINS, model="ls-182ap"), "are those of a ls-182ap"),
+    ],
+)
+async def test_gains_of_another_axis_or_drive_are_not_put_back(kept, said, tmp_path):
+    async with commissioning_rig(tmp_path) as rig:
+        file_of("bench", AXIS).parent.mkdir(parents=True)
+        file_of("bench", AXIS).write_text(kept.model_dump_json())
+        before = await rig.registers()
+        with pytest.raises((ConfigError, WrongState), match=said):
+            await (await rig.checklist()).put_back_gains()
+
+        assert await rig.registers() == before
+        assert file_of("bench", AXIS).exists()
+
+
+@pytest.mark.parametrize("half", ["", "{", '{"rig":"bench","axis":"x","gains":{"kp":1e400}}'])
+async def test_a_file_of_kept_gains_that_is_none_ends_the_step_before_anything_is_sent(half, tmp_path):
+    async with commissioning_rig(tmp_path, STANDS) as rig:
+        file_of("bench", AXIS).parent.mkdir(parents=True)
+        file_of("bench", AXIS).write_text(half)
+        with pytest.raises(ConfigError, match="cannot be read"):
+            await (await rig.checklist()).run("motor")
+
+        assert await rig.registers() == GAINS
+        assert rig.drive.shaft.position_counts == 0
 
 
 async def test_gains_that_another_program_has_lent_are_never_taken_for_those_of_the_machine(tmp_path):
@@ -349,6 +427,83 @@ def pressing(rig, *sides):
     return asyncio.create_task(press())
 
 
+@pytest.mark.parametrize(
+    ("step", "said", "script"), [("home", "search 1:", {"how many": "3"}), ("speed", "followed", {"how far may": "4"})]
+)
+async def test_no_further_motion_begins_once_the_key_is_released(step, said, script, tmp_path, monkeypatch):
+    async with commissioning_rig(tmp_path, script) as rig:
+        begun = []
+        move, tell, holding = Axis.move_relative, rig.person.tell, rig.person.holding
+
+        async def recorded(axis, *arguments, **more):
+            begun.append(arguments)
+            return await move(axis, *arguments, **more)
+
+        @asynccontextmanager
+        async def holding_until_said(what):
+            async with holding(what) as released:
+
+                def release(*lines):
+                    tell(*lines)
+                    if said in lines[0]:
+                        begun.clear()
+                        released.set()
+
+                rig.person.tell = release
+                yield released
+
+        rig.person.holding = holding_until_said
+        monkeypatch.setattr(Axis, "move_relative", recorded)
+        with pytest.raises(CommandAborted, match="the key was let go"):
+            await (await rig.checklist()).run(step)
+
+        assert begun == []
+
+
+async def test_a_search_goes_as_the_preview_has_said_whatever_the_daemon_was_started_with(tmp_path, monkeypatch):
+    text = rig_text().replace('method = "index", velocity = 0.5', 'method = "index", velocity = 0.6')
+    async with commissioning_rig(tmp_path, {"how many": "2"}, text=text) as rig:
+        rig.config.write_text(rig_text())
+        checklist = await rig.checklist()
+        velocities, home = [], Axis.home
+
+        async def recorded(axis, **more):
+            begun = await home(axis, **more)
+            velocities.append(begun.reply.velocity)
+            return begun
+
+        monkeypatch.setattr(Axis, "home", recorded)
+        preview = await checklist.preview("home")
+        await checklist.run("home")
+
+        assert "at 0.5 mm/s at most" in preview[0]
+        assert velocities == [pytest.approx(0.5, rel=0.01)] * 2
+
+
+async def test_a_distance_too_short_for_the_velocity_is_asked_for_again(tmp_path):
+    distances = iter(["0", "0.5", "4"])
+    text = rig_text().replace("velocity = 40, acceleration = 400", "velocity = 15, acceleration = 150")
+    async with commissioning_rig(tmp_path, {"how far may": lambda: next(distances)}, text=text) as rig:
+        kept = await (await rig.checklist()).run("speed")
+
+        assert figures(kept)["distance"] == 4
+        assert rig.person.told.count("in less than 1 mm it does not reach its velocity") == 2
+
+
+async def test_numbers_with_which_nothing_can_be_worked_out_are_asked_for_again(tmp_path):
+    measured, ends = iter(["1e-320", "4"]), iter(["-1e308", "-10"])
+    script = {"how far shall": "4", "how far did": lambda: next(measured), "reverse end": lambda: next(ends)}
+    text = rig_text().replace("home =", 'reference = "at_reset"\nhome =')
+    async with commissioning_rig(tmp_path, script | {"forward end": "10"}, text=text) as rig:
+        checklist = await rig.checklist()
+        await checklist.run("scale")
+        await checklist.run("travel")
+        again = await rig.checklist()
+
+        assert again.record.of("scale").result.state is StepState.DONE
+        assert proposed(again.record.of("travel")) == {"limits.position_min": -9.6, "limits.position_max": 9.6}
+
+
 async def test_limit_switches_are_watched_and_nothing_is_sent_that_moves(tmp_path):
     text = rig_text().replace("velocity = 0.5 }", 'velocity = 0.5, switch_active = "low" }')
     async with commissioning_rig(tmp_path, {"has the axis": "y"}, text=text) as rig:
@@ -478,6 +633,58 @@ async def test_a_changed_configuration_and_another_drive_open_steps_again(tmp_pa
 
         assert any("Brake or hanging load is open again" in line for line in rig.person.told)
         assert any("model was pic-servo-sc and is ls-182ap" in line for line in rig.person.told)
+
+
+async def test_two_sessions_keep_the_results_of_each_other(tmp_path):
+    async with commissioning_rig(tmp_path, {"what falls": "none", "a remark": ""}) as rig:
+        first, second = await rig.checklist(), await rig.checklist()
+        await first.settle("motor", Result(state=StepState.SKIPPED, text="seen to be right"))
+        await second.run("load")
+
+        again = await rig.checklist()
+        assert again.record.of("motor").result.state is StepState.SKIPPED
+        assert again.record.of("load").result.state is StepState.DONE
+
+
+async def test_what_a_person_has_agreed_to_is_what_is_run(tmp_path):
+    answers = iter(["yes", "no"])
+
+    def agree():
+        rig.config.write_text(rig.config.read_text().replace("el = 4000", "el = 100"))
+        return next(answers)
+
+    async with commissioning_rig(tmp_path, STANDS) as rig:
+        rig.person.script["run it"] = agree
+        checklist = await rig.checklist()
+        await Walk(checklist, rig.person, "rig.toml", lambda _: None).one("motor")
+
+        assert "what it will do has changed meanwhile:" in rig.person.told
+        assert any("by about 200 counts" in line for line in rig.person.told)
+        assert checklist.record.of("motor").result.state is StepState.OPEN
+        assert not (await rig.running.client.state(AXIS)).enabled
+
+
+async def test_a_configuration_that_was_changed_while_a_change_was_looked_at_keeps_both(tmp_path):
+    async with commissioning_rig(tmp_path, {"how far shall": "4", "how far did": "8"}) as rig:
+        checklist = await rig.checklist()
+        await checklist.run("scale")
+        late = checklist.change("scale")
+        asked = []
+
+        def approve(file, lines):
+            asked.append(lines)
+            rig.config.write_text(rig.config.read_text().replace("position_max = 18", "position_max = 12"))
+            return "y"
+
+        rig.person.script["write this"] = lambda: approve("", "")
+        assert await Walk(checklist, rig.person, "rig.toml", lambda _: None).offer("scale")
+        with pytest.raises(ConfigError, match="changed meanwhile"):
+            checklist.write(late)
+
+        axis = load_config(rig.config).bus[0].axis[0]
+        assert len(asked) == 2
+        assert axis.limits.position_max == 12
+        assert axis.counts_per_unit == pytest.approx(500, rel=0.01)
 
 
 async def test_the_report_is_well_formed_and_has_the_numbers(tmp_path):

@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.commissioning_page.messages import Answer, Hold
+from ldcnd.commissioning_page.conversation import Conversation
+from ldcnd.commissioning_page.messages import Answer, FromPage, Hold, View
 from ldcnd.commissioning_page.page_person import HELD_S, PagePerson
 from ldcnd.person import Left
 
@@ -46,7 +47,7 @@ async def test_a_number_is_asked_for_until_it_is_one(person):
 
     assert first.default == "2.5"
     assert number.result() == 4
-    assert person.lines == ("'far' is no number",)
+    assert person.lines == ("'far' is no number: 0, or 1e-12 to 1e+12 either way",)
 
 
 async def test_control_characters_of_drives_and_files_reach_no_page(person):
@@ -73,6 +74,82 @@ async def test_a_press_that_is_over_at_once_holds_nothing(person):
         await asyncio.sleep(0)
         assert not person.holds
         person.leave()
+
+
+async def test_a_page_that_goes_in_the_instant_of_its_press_holds_nothing(person):
+    async def held():
+        with pytest.raises(Left):
+            async with person.holding("it moves"):
+                pytest.fail("nothing holds it")
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(held())
+        person.hold(Hold(number=(await asked(person)).number, on=True))
+        person.leave()
+
+
+@pytest.mark.parametrize("typed", ["1e308", "-1e13", "1e-13", "1e-320", "nan", "-inf"])
+async def test_a_number_with_which_nothing_can_be_worked_out_is_none(person, typed):
+    async with asyncio.TaskGroup() as group:
+        number = group.create_task(person.number("how far"))
+        first = (await asked(person)).number
+        person.answer(Answer(number=first, text=typed))
+        while person.question is None or person.question.number == first:
+            await asyncio.sleep(0)
+        person.answer(Answer(number=person.question.number, text="-2"))
+
+    assert number.result() == -2
+    assert "is no number" in person.lines[0]
+
+
+class Steps(Conversation):
+    """A page whose only step takes a while to come to its end."""
+
+    def __init__(self):
+        super().__init__()
+        self.brought_to_its_end = False
+
+    def shown(self):
+        return View()
+
+    async def refresh(self):
+        pass
+
+    def is_stale(self):
+        return False
+
+    async def carry_out(self, begun):
+        try:
+            await self.person.ask("go on")
+        finally:
+            await asyncio.sleep(1.0)
+            self.brought_to_its_end = True
+
+
+async def test_leaving_twice_does_not_cut_short_how_a_step_is_brought_to_its_end():
+    page = Steps()
+    running = asyncio.create_task(page.run())
+    page.heard(FromPage(begin="step"))
+    await asked(page.person)
+    page.heard(FromPage(leave=True))
+    await asyncio.sleep(0.5)
+    page.heard(FromPage(leave=True))
+    await asyncio.sleep(1.0)
+    running.cancel()
+
+    assert page.brought_to_its_end
+
+
+async def test_a_step_that_is_left_before_it_has_begun_does_not_begin():
+    page = Steps()
+    running = asyncio.create_task(page.run())
+    page.heard(FromPage(begin="step"))
+    page.heard(FromPage(leave=True))
+    await asyncio.sleep(5.0)
+    running.cancel()
+
+    assert page.person.question is None
+    assert (await page.view()).running == ""
 
 
 async def test_silence_releases_the_button_for_good(person):
