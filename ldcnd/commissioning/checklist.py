@@ -9,7 +9,6 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from ldcnd import durable
 from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
@@ -27,9 +26,9 @@ from ldcnd.commissioning.speed import HighestSpeed
 from ldcnd.commissioning.step import Site, Step
 from ldcnd.commissioning.travel import Travel
 from ldcnd.config.axis import AxisConfig, MovedAxisConfig
-from ldcnd.config.edit import edited_for_axis
+from ldcnd.config.edit import edited_for_axis, write_over
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.errors import ConfigError, LdcndError, UnknownAxis, WrongState
+from ldcnd.errors import LdcndError, UnknownAxis, WrongState
 from ldcnd.model.meta import AxisInfo
 from ldcnd.person import Person, said
 
@@ -230,12 +229,7 @@ class Checklist:
         Raises:
             ConfigError: it cannot be written, or was changed since; it is as it is.
         """
-        try:
-            if self._config.read_text(encoding="utf-8") != change.before:
-                raise ConfigError(f"{self._config} has been changed meanwhile", remedy="look at the change again")
-            durable.replace(self._config, change.text)
-        except OSError as error:
-            raise ConfigError(f"{self._config}: cannot be written: {error.strerror}") from error
+        write_over(self._config, change.before, change.text)
 
     # -- what it stands on -------------------------------------------------------------------------------------------
 

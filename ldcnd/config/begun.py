@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 from ldcnd.config.bus import BusConfig
-from ldcnd.config.edit import draft_of
+from ldcnd.config.edit import draft_of, write_over
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
 from ldcnd.families.family import ScannedDrive, Scans
@@ -89,11 +89,9 @@ def write(begun: Begun) -> tuple[str, ...]:
     """Write a configuration; return the remarks on it.
 
     Raises:
-        ConfigError: it cannot be written, or would be none; the file stays as it was.
+        ConfigError: it cannot be written, or was changed since; it is as it is.
     """
-    with draft_of(begun.file) as draft:
-        _write_checked(draft, begun.file, begun.text)
-        draft.replace(begun.file)
+    write_over(begun.file, begun.before, begun.text)
     return begun.remarks
 
 

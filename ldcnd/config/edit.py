@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from ldcnd import durable
 from ldcnd.config.rig import load_config
 from ldcnd.errors import ConfigError
 
@@ -51,6 +52,20 @@ def edited_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> 
                     return edited
     by_hand = "\n".join(_table(name, values) for name, values in tables.items())
     raise ConfigError(f"{config}: put this behind axis {axis} by hand:\n{by_hand}")
+
+
+def write_over(config: Path, before: str, text: str) -> None:
+    """Replace a configuration that is still as it was when the change was made; empty stands for none.
+
+    Raises:
+        ConfigError: it cannot be written, or was changed since; it is as it is.
+    """
+    try:
+        if (config.read_text(encoding="utf-8") if config.exists() else "") != before:
+            raise ConfigError(f"{config} has been changed meanwhile", remedy="look at the change again")
+        durable.replace(config, text)
+    except OSError as error:
+        raise ConfigError(f"{config}: cannot be written: {error.strerror}") from error
 
 
 @contextmanager

@@ -195,6 +195,12 @@ async def test_a_configuration_is_begun_and_continued_and_what_a_person_wrote_st
         == "address 1 is configured as ls-182ap; nothing answers there"
     )
     assert load_config(file) == rig
+    late = begun_with(file, "ldcn", PORT, drives)
+    changed = file.read_text() + "# changed while that was looked at\n"
+    file.write_text(changed)
+    with pytest.raises(ConfigError, match="changed meanwhile"):
+        write(late)
+    assert file.read_text() == changed
     assert list(tmp_path.iterdir()) == [file]
 
 
