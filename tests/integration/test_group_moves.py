@@ -147,6 +147,20 @@ async def test_a_group_move_that_is_sent_again_is_answered_alike_and_starts_once
     assert len(starts(rig)) == 1
 
 
+async def test_a_group_move_that_comes_twice_at_once_is_answered_alike_and_starts_once():
+    async with rig_on(chain_of(), GANTRY) as rig:
+        await powered(rig, "x", "y")
+        moves = (AxisMove(axis="x", position=5.0, command_id="1"), AxisMove(axis="y", position=6.0, command_id="2"))
+        request = MoveTogether(moves=moves, path=LinePath.LINEAR)
+
+        # the second arrives before the ledger knows a share of the first
+        first, second = await asyncio.gather(rig.client.ask(request), rig.client.ask(request))
+
+    assert first == second
+    assert first.deviation is not None
+    assert len(starts(rig)) == 1
+
+
 async def test_a_group_move_of_one_new_and_one_old_id_starts_nothing():
     async with rig_on(chain_of(), GANTRY) as rig:
         await powered(rig, "x", "y")

@@ -234,7 +234,8 @@ class RigCommands:
                 self._rig, _shares(command), execute, straight=straight, max_deviation=deviation
             )
         share = self._ledger.get(reply.replies[0].command_id).command
-        if isinstance(share, (GroupMoveRequest, PathShareRequest)):  # the first time that these ids came
+        # the ledger decides which request was the first: of two that come at once it knows neither before
+        if isinstance(share, (GroupMoveRequest, PathShareRequest)):
             reply = share.rendezvous.reply(reply.replies)
         return reply
 
