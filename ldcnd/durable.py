@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import stat
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,13 +17,17 @@ def state_file(kind: str, rig: str, axis: str) -> Path:
 def replace(path: Path, text: str) -> None:
     """Replace a file whole; it is on the disk when this returns.
 
+    A link stays one, and who might read the file may still read it, and nobody else.
+
     Raises:
         OSError: it cannot be written; the file is as it was.
     """
+    path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.name}.new")
     try:
         with draft.open("w", encoding="utf-8") as file:
+            _give_the_rights_of(path, file.fileno())
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
@@ -45,6 +50,15 @@ def remove(path: Path) -> None:
     except FileNotFoundError:
         return
     _sync(path.parent)
+
+
+def _give_the_rights_of(path: Path, opened: int) -> None:
+    """Give an open file owner and mode of one that it will replace, if there is one."""
+    with contextlib.suppress(FileNotFoundError):
+        was = path.stat()
+        with contextlib.suppress(PermissionError):  # of another user: only the mode can be kept
+            os.fchown(opened, was.st_uid, was.st_gid)
+        os.fchmod(opened, stat.S_IMODE(was.st_mode))
 
 
 def _sync(directory: Path) -> None:
