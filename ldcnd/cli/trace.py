@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.output import show_passing
@@ -107,7 +107,8 @@ def take(
     out: Path | None,
 ) -> None:
     """Record channels of AXIS; `ldcnd trace channels` shows what it has. Ctrl-C and SIGTERM end the trace."""
-    request = TakeTrace(
+    request = of_options(
+        TakeTrace,
         channels=channels,
         interval_s=FASTEST if isinstance(interval, str) else interval,
         samples=samples,

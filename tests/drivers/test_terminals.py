@@ -56,8 +56,11 @@ class Bench:
 
     async def moving(self, axis: str, velocity: float) -> None:
         """Let an axis move slowly towards the end of its travel."""
-        await self.rig.client.command(axis, Power(on=True))
-        await self.rig.client.command(axis, MoveAbsolute(position=90.0, velocity=velocity))
+        client = self.rig.client
+        await client.command(axis, Power(on=True))
+        if not (await client.state(axis)).referenced:  # a slow host did not see it at rest after its reset
+            await client.command(axis, SetPosition(position=0.0))
+        await client.command(axis, MoveAbsolute(position=90.0, velocity=velocity))
 
     async def stand(self, *numbers: int) -> bool:
         """Tell whether drives truly stand."""
