@@ -12,6 +12,7 @@ from ldcnd.messaging.hand_over import Answer
 from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Declaration, Sample, SampleKind, Session
 from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
+from ldcnd.model.events import ReadOutcome
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.model.samples import (
@@ -288,14 +289,23 @@ class RigClient:
                 _, sample = await anext(states)
 
     async def _unanswered(self, what: str) -> LdcndError:
-        """Return the error for a command without an answer: access control and absence cannot be distinguished."""
+        """Return the error for a command without an answer: absence, access control, or an answer that was lost.
+
+        They look alike. Who is not permitted to command gets no answer to a question of the same kind either.
+        """
+        payload, encoding = encode(ReadOutcome(command_id=what), Encoding.MSGPACK)
         try:
             await self.daemon()
+            heard = await self.session.query(
+                self.keys.command(RIG_ITSELF, ReadOutcome.verb), payload, encoding=encoding
+            )
         except SessionError:
             return OutcomeUnknown(f"{what}: no answer, and no daemon serves rig {self.rig} now")
+        if heard:
+            return OutcomeUnknown(f"{what}: its answer was lost on the way; it may be carried out all the same")
         return SessionError(
             f"{what}: the daemon of rig {self.rig} is there but did not get it; this login is not permitted to command",
-            remedy="use the login of an operator; right after a connection was lost, try again",
+            remedy="use the login of an operator",
         )
 
     def _one(self, answers: list[Answer], model: type[ModelT]) -> ModelT:

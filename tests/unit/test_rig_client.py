@@ -100,6 +100,19 @@ async def test_a_command_that_nobody_answers_although_the_daemon_is_there_is_not
         await newer.client.command("x", POWER)
 
 
+async def test_a_command_whose_answer_was_lost_has_an_unknown_outcome(newer: Newer) -> None:
+    def lose_answers_of_motors(query: Query) -> None:
+        if query.key == KEYS.command("_", "outcome"):
+            query.reply_error(text({"code": "unknown_command", "message": "none", "retryable": False}), JSON)
+        query.finish()
+
+    await newer.answers(KEYS.daemon, present)
+    await newer.answers(KEYS.all_commands, lose_answers_of_motors)
+
+    with pytest.raises(OutcomeUnknown, match="may be carried out all the same"):
+        await newer.client.command("x", POWER)
+
+
 async def test_a_command_whose_daemon_has_disappeared_has_an_unknown_outcome(newer: Newer) -> None:
     declared = await newer.answers(KEYS.daemon, present)
     with pytest.raises(SessionError):
