@@ -80,7 +80,7 @@ async def test_gains_of_a_tuning_that_was_killed_are_put_back_by_hand(state_file
         loaded, state = await registers(rig), await rig.state("x")
 
     assert left != CONFIGURED
-    assert kept == {"rig": "sim", "axis": "x", "gains": CONFIGURED}
+    assert kept == {"rig": "sim", "axis": "x", "gains": CONFIGURED, "model": "ls-182ap"}
     assert refused[0] == 1
     assert "ldcnd tune x --put-back" in refused[2]
     assert put_back[0] == 0, put_back[2]
