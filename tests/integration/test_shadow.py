@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
+from ldcnd.client.kept_gains import KeptGains, forget, gains_in, keep
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.axis import RatesConfig
@@ -116,6 +117,31 @@ async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_obse
     assert ["learnt before" in line for line in said if "with these gains" in line] == [False, True, False]
     assert kept()["learnt"] == {}
     assert kept()["gains"] == {**healthy_gains, "kp": 300}
+
+
+async def test_gains_that_are_lent_teach_nothing():
+    said = []
+    async with working_rig() as (rig, _):
+        usual = Rig(rig.client, await rig.client.daemon())
+        async with usual.control("x", client="test") as axis:
+            await axis.power(on=True)
+            async with watched(rig, [], said):
+                await move(axis, 10)
+                (info,) = await usual.describe()
+                own = KeptGains(rig="sim", axis="x", gains=gains_in(info), model=info.model)
+                keep(own)
+                await axis.set_gains(kp=300)
+                await asyncio.sleep(LOOK_S + 1)
+                learnt = kept()
+                await move(axis, 10)
+                await axis.set_gains(kp=own.gains["kp"])
+                forget(own)
+                await asyncio.sleep(LOOK_S + 1)
+
+    assert learnt["learnt"]
+    assert (kept()["learnt"], kept()["gains"]) == (learnt["learnt"], own.gains)
+    assert "x: waits until it has its own gains back" in said
+    assert ["learnt before" in line for line in said if "with these gains" in line] == [False, True]
 
 
 async def test_what_cannot_be_watched_is_refused_and_slow_positions_are_said():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pydantic
 
 from ldcnd import durable
-from ldcnd.client.kept_gains import gains_in
+from ldcnd.client.kept_gains import file_of, gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
@@ -171,7 +171,16 @@ class WatchedAxis:
             tell(f"{self.name}: waits until its loop has been closed once: its gains are not known")
 
     def described(self, info: AxisInfo) -> None:
-        """Take the description of the axis; what was learnt with other gains is void."""
+        """Take the description of the axis; what was learnt with other gains is void.
+
+        Not with those that a tuning or commissioning of this host has lent it for some moves: they teach nothing.
+        """
+        if file_of(self._rig, self.name).exists():
+            if self._shadow is not None:
+                self.keep()
+                self._gains, self._shadow = {}, None
+                self._tell(f"{self.name}: waits until it has its own gains back")
+            return
         try:
             gains = gains_in(info)
         except WrongState:
