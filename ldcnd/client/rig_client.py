@@ -12,7 +12,6 @@ from ldcnd.messaging.hand_over import Answer
 from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Declaration, Sample, SampleKind, Session
 from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
-from ldcnd.model.events import ReadOutcome
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.model.samples import (
@@ -293,6 +292,8 @@ class RigClient:
 
         They look alike. Who is not permitted to command gets no answer to a question of the same kind either.
         """
+        from ldcnd.model.events import ReadOutcome  # noqa: PLC0415 - for this rare question alone
+
         payload, encoding = encode(ReadOutcome(command_id=what), Encoding.MSGPACK)
         try:
             await self.daemon()
