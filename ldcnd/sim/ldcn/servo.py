@@ -159,8 +159,11 @@ class ServoLoop:
 
     @property
     def following_error(self) -> int:
-        """Command position minus actual position, counts; 0 with the loop open."""
-        return self.trajectory.position // FRACTION - self.position if self.servo_on else 0
+        """Command position minus actual position as the filter took it in the last servo tick, counts; 0 if open.
+
+        No manual says of which instant it is. With a divisor the axis moves on until the next tick.
+        """
+        return self.trajectory.position // FRACTION - self._ticked_position if self.servo_on else 0
 
     @property
     def move_done(self) -> bool:

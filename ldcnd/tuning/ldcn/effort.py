@@ -178,6 +178,7 @@ class EffortMeter:
         mean = np.clip(mean, -gains.ol, gains.ol)
         mean -= np.where(np.abs(mean) >= 1.0, LOST_PWM - gains.deadband, 0.0) * np.sign(mean)
         given = np.concatenate([[0.0], np.cumsum(mean * steps)])
+        given = np.interp(times - plant.delay_s, times, given)  # what has reached the motor
         weight = 1.0 / plant.acceleration
         value = (given - plant.damping_per_s * weight * (counts - counts[0]))[part]
         momentum = (speed * np.sign(way) * weight)[part]

@@ -5,8 +5,8 @@ value that may depend on the speed, and how far single motions are from it. Late
 last few, and of the last many: a large change is found soon, a small one in time. Motions unlike those that taught are
 not judged.
 
-A mean is outside when it is six of its standard errors from what was learnt, and by enough to matter. If motions were
-independent and normally distributed, one in 5e8 would be. They are not quite; the tests count.
+A mean is outside when it is seven of its standard errors from what was learnt, and by enough to matter. If motions were
+independent and normally distributed, one in 4e11 would be. They are not quite; the tests count.
 
 An axis that does not move makes no motion to be judged. So an output that should have moved it is an alarm at once.
 """
@@ -27,7 +27,7 @@ LEARNT_MOTIONS = 100
 WINDOWS = (20, 200)
 """Means are taken over so many motions."""
 LATEST_MOTIONS = 5
-STANDARD_ERRORS = 6.0
+STANDARD_ERRORS = 7.0
 OUTLIER_SIGMAS = 4.0
 """A single motion counts as no farther away than this."""
 LIKE = 1.3
