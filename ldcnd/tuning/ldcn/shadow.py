@@ -5,8 +5,8 @@ value that may depend on the speed, and how far single motions are from it. Late
 last few, and of the last many: a large change is found soon, a small one in time. Motions unlike those that taught are
 not judged.
 
-A mean is outside when it is seven of its standard errors from what was learnt, and by enough to matter. If motions were
-independent and normally distributed, one in 4e11 would be. They are not quite; the tests count.
+A mean is outside when it is six of its standard errors from what was learnt, and by enough to matter. Of normally
+distributed ones one in 5e8 would be. They are not quite; the tests count.
 
 An axis that does not move makes no motion to be judged. So an output that should have moved it is an alarm at once.
 """
@@ -27,7 +27,10 @@ LEARNT_MOTIONS = 100
 WINDOWS = (20, 200)
 """Means are taken over so many motions."""
 LATEST_MOTIONS = 5
-STANDARD_ERRORS = 7.0
+STANDARD_ERRORS = 6.0
+NEIGHBOURS = 2.0
+"""A mean of motions that are like their neighbours has up to so many times the variance of one of independent ones: a
+figure of friction shares a motion with the next one."""
 OUTLIER_SIGMAS = 4.0
 """A single motion counts as no farther away than this."""
 LIKE = 1.3
@@ -298,7 +301,7 @@ class Shadow:
         """Return the mean of the last motions with its limits."""
         off, usual = (float(np.mean(list(each)[-window:])) for each in (self._off[name], self._usual[name]))
         # what was learnt has an error of its own
-        error = learnt.sigma * float(np.sqrt(1 / window + 1 / LEARNT_MOTIONS))
+        error = learnt.sigma * float(np.sqrt(NEIGHBOURS * (1 / window + 1 / LEARNT_MOTIONS)))
         limit = max(STANDARD_ERRORS * error, self._least(name))
         low = usual - limit if name is not FigureName.MISFIT else -np.inf
         return Alarm(
