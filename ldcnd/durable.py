@@ -17,7 +17,7 @@ def state_file(kind: str, rig: str, axis: str) -> Path:
 def replace(path: Path, text: str) -> None:
     """Replace a file whole; it is on the disk when this returns.
 
-    A link stays one, and who might read the file may still read it, and nobody else.
+    A link stays a link, and the file keeps its owner and mode.
 
     Raises:
         OSError: it cannot be written; the file is as it was.

@@ -292,13 +292,13 @@ class RigClient:
 
         They look alike. Who is not permitted to command gets no answer to a question of the same kind either.
         """
-        from ldcnd.model.events import ReadOutcome  # noqa: PLC0415 - for this rare question alone
+        from ldcnd.model.leases import ListHolders  # noqa: PLC0415 - clients that only read need no model of leases
 
-        payload, encoding = encode(ReadOutcome(command_id=what), Encoding.MSGPACK)
+        payload, encoding = encode(ListHolders(), Encoding.MSGPACK)
         try:
             await self.daemon()
             heard = await self.session.query(
-                self.keys.command(RIG_ITSELF, ReadOutcome.verb), payload, encoding=encoding
+                self.keys.command(RIG_ITSELF, ListHolders.verb), payload, encoding=encoding
             )
         except SessionError:
             return OutcomeUnknown(f"{what}: no answer, and no daemon serves rig {self.rig} now")

@@ -153,7 +153,7 @@ class Checklist:
                 await put_back(self._rig, kept, CLIENT)
 
     async def _put_back_or_say(self) -> None:
-        """Put back what a step has left in the drive; where that fails, they stay kept, and the person is told."""
+        """Put back the gains that a step has left in the drive; where that fails, say why: they stay kept."""
         try:
             await self.put_back_gains()
         except (LdcndError, TimeoutError) as error:

@@ -167,7 +167,7 @@ async def test_the_tour_of_the_readme_runs(tmp_path):
         ran = await run_all(tmp_path, *typed[:-1])
         with connect(endpoint) as session:
             async with asyncio.timeout(20):
-                while is_stopping(session, "x"):  # nobody types so fast
+                while is_stopping(session, "x"):  # a reset is refused until then
                     await asyncio.sleep(0.05)
         ran += await run_all(tmp_path, *typed[-1:])
 

@@ -93,7 +93,7 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
         return axis.model_copy(update={"smartstep": unit, "rates": rates})
 
     line, steps = config.bus
-    # what is about the traces alone polls the LDCN line so often that it stays up; each poll costs
+    # tests of traces poll the LDCN line only as often as keeps it up; each poll costs
     quiet = tuple(axis.model_copy(update={"rates": SELDOM}) for axis in line.axis)
     line = line.model_copy(update={"axis": quiet})
     steps = steps.model_copy(update={"axis": tuple(traced(axis) for axis in steps.axis)})

@@ -29,8 +29,8 @@ WINDOWS = (20, 200)
 LATEST_MOTIONS = 5
 STANDARD_ERRORS = 6.0
 NEIGHBOURS = 2.0
-"""A mean of motions that are like their neighbours has up to so many times the variance of one of independent ones: a
-figure of friction shares a motion with the next one."""
+"""Variance of a mean, relative to independent motions: neighbours correlate by up to one half, because a figure of
+friction shares a motion with the next one."""
 OUTLIER_SIGMAS = 4.0
 """A single motion counts as no farther away than this."""
 LIKE = 1.3
@@ -45,8 +45,8 @@ FALLEN_SHARE = 0.5
 """An alarm ends when the mean is within this share of its limit."""
 STALLED_SHARE = 0.5
 STALLED_FACTOR = 3.0
-"""An output that moves nothing is an alarm from this share of the output limit on, and no less than so many times the
-identified friction and load."""
+"""Least output of an axis at rest that is an alarm: this share of the output limit, and this multiple of the identified
+friction and load."""
 MOST_PLACES = 8
 MAD_TO_SIGMA = 1.4826
 SPEEDS_DIFFER = 1.1
