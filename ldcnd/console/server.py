@@ -33,8 +33,10 @@ from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 from ldcnd.messaging.zenoh_config import zenoh_config
 
-END_TIME_S = 1
-"""Time for open pages to close when the console ends, seconds."""
+END_TIME_S = 1.0
+"""Time for open pages to close when the console ends, seconds; then their connections are aborted."""
+ABORT_TIME_S = 2
+"""From then until uvicorn gives up what is left, whole seconds."""
 SENT_BYTES = 64 * 1024
 """Size of the kernel's send buffer for a page: frames in it would be shown late."""
 UNREAD_MS = 30_000
@@ -133,6 +135,16 @@ class _Server(uvicorn.Server):
         ]
         self.started = True
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End as uvicorn does, but a page that takes nothing is no error: uvicorn would log one with its traceback."""
+        abort = asyncio.get_running_loop().call_later(END_TIME_S, self._abort)
+        await super().shutdown(sockets)
+        abort.cancel()
+
+    def _abort(self) -> None:
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Capture none."""
@@ -153,7 +165,7 @@ def _config(app: ASGIApp, settings: ConsoleSettings) -> uvicorn.Config:
         access_log=False,
         proxy_headers=False,
         server_header=False,
-        timeout_graceful_shutdown=END_TIME_S,
+        timeout_graceful_shutdown=int(END_TIME_S) + ABORT_TIME_S,
         ssl_certfile=settings.certificate,
         ssl_keyfile=settings.key,
     )

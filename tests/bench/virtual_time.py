@@ -11,20 +11,25 @@ from itertools import pairwise
 from typing import TypeVar
 
 from ldcnd.bus.bus import Bus
+from ldcnd.client.lease import control
+from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.service import settle_heap
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.model.commands import MoveVelocity, Power
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.line import SimulatedLine
 from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.bench import commands_and_polls, trace_upload
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating, saturating_smartsteps
-from tests.support.rig import RunningRig
+from tests.support.rig import SIMULATED, RunningRig
 
 DRIVES = 31
 COMMANDS = 400
+SLOW = 1.0
+"""Of axes that move for a whole run within their limits, mm/s and deg/s."""
 ResultT = TypeVar("ResultT")
 
 
@@ -44,8 +49,10 @@ def rows(seconds: float) -> list[Row]:
     found = [replace(row, exact=True) for row in found]
     for drives in (1, 8, DRIVES):
         speed = _run(drives, lambda rig: _speed(rig, min(seconds, 10.0)))
-        found.append(Row(f"simulated line and daemon, {drives} drive(s): virtual seconds per second", speed, "x"))
-    return found
+        what = f"simulated line and daemon, {drives} drive(s), line saturated"
+        found.append(Row(f"{what}: virtual seconds per second", speed, "x"))
+    moving = on_jumping_clock(load_config(SIMULATED), lambda rig: _four_moving(rig, seconds))
+    return [*found, Row("config/simulated.toml, four drives moving: virtual seconds per second", moving, "x", 25.0)]
 
 
 def smartsteps_busy(seconds: float) -> float:
@@ -135,6 +142,15 @@ def _counted() -> Iterator[list[int]]:
     finally:
         gc.callbacks.remove(note)
         gc.unfreeze()
+
+
+async def _four_moving(rig: RunningRig, seconds: float) -> float:
+    await asyncio.sleep(1.0)  # until each drive has been polled
+    async with control(rig.client, "bench") as held:
+        for axis in held.lease.axes:
+            await held.command(axis, Power(on=True))
+            await held.command(axis, MoveVelocity(velocity=SLOW))
+        return await _speed(rig, seconds)
 
 
 async def _speed(rig: RunningRig, seconds: float) -> float:

@@ -64,7 +64,7 @@ async def connected(page, rig, *, wanted=True):
                 return seen
 
 
-async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_all_the_same():
+async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_without_a_complaint(capfd):
     async with bulky_rig() as (endpoint, publish), console("-e", endpoint) as running:
         browser = await running.stranger.enter(running.link)
         with hanging_page(browser):
@@ -81,6 +81,7 @@ async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_all_th
 
     assert stopped.document["rigs"]["sim"]["confirmed"] == ["x"]
     assert code == 0
+    assert not capfd.readouterr().err
 
 
 async def test_the_web_server_refuses_what_the_gate_refuses():
