@@ -18,6 +18,7 @@ from ldcnd.model.commands import (
     SetGains,
     SetPosition,
     SetPwm,
+    Why,
 )
 from ldcnd.model.samples import AxisState
 from ldcnd.sim.ldcn.power import Condition
@@ -137,6 +138,8 @@ async def test_a_jam_ends_in_a_position_error(dialect):
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert (codes(sample), sample.first.text) == (["position_error"], FaultCode.POSITION_ERROR.remedy)
+        why = await rig.rig.client.ask(Why(), AXIS)
+        assert (why.causes[0].code, why.causes[0].remedy) == ("drive_fault", "remove the cause, then send reset")
         assert (await rig.until(lambda state: state.state is AxisState.ERROR_STOP)).enabled is False
         rig.condition(Condition.STALLED, present=False)
         await rig.send(Reset())

@@ -3,6 +3,8 @@
 import asyncio
 from unittest.mock import Mock
 
+from structlog.testing import capture_logs
+
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.command.ledger import PAGE_BYTES, PUBLISHED_AFTER_S, UNPUBLISHED_EVENTS, Entry, EventLog
 from ldcnd.daemon.publish.publisher import Publisher
@@ -29,6 +31,16 @@ class Told:
     def published(self) -> list[tuple[int, int, int, str, str | None]]:
         events = [call.args[0] for call in self.publisher.publish_event.call_args_list]
         return [(event.t, event.seq, event.number, event.status.value, event.code) for event in events]
+
+
+async def test_a_command_is_logged_once_with_what_became_of_it():
+    told = Told()
+    with capture_logs() as records:
+        told.happens()
+        told.happens(CommandStatus.DONE)
+        await asyncio.sleep(2 * PUBLISHED_AFTER_S)
+
+    assert [(record["event"], record["status"]) for record in records] == [("command", "done")]
 
 
 async def test_events_are_told_together_with_the_instants_at_which_they_happened():

@@ -103,6 +103,7 @@ def test_what_can_move_a_motor_says_so(to):
         commands.no_operation(to),
         commands.clear_sticky_bits(to),
         commands.hard_reset(to),
+        commands.unanswered(0xFF, b"", QUIET_S, repeatable=False),
     )
 
     assert all(exchange.moves for exchange in moving)

@@ -365,10 +365,6 @@ class Permit:
         """Go on after a stop that this command has requested itself."""
         self._epoch = self._gate.epoch
 
-    def begun(self) -> None:
-        """Note that the first motion has begun: from now on `not_after` does not count."""
-        self._begun = True
-
     def ask(self) -> None:
         """Raise when the command must not be carried out any more.
 
@@ -466,7 +462,7 @@ class Permit:
 
     def _beginning(self, condition: Condition) -> only_while:
         """Return the context of the packets that begin a motion; from now on `not_after` does not count."""
-        self.begun()
+        self._begun = True
         return only_while(condition)
 
 
@@ -546,8 +542,6 @@ async def start_together(
 
     def about_to_start() -> None:
         ask_all()
-        for permit in permits:
-            permit.begun()
         announce()
 
     def ask_all() -> None:
