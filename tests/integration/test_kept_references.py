@@ -204,6 +204,19 @@ async def test_a_drive_that_lost_power_has_no_reference(tmp_path):
     assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its line was reset"])
 
 
+async def test_a_reference_that_is_lost_under_a_daemon_is_off_the_disk_before_it_ends(tmp_path):
+    chain = chain_of()
+    async with rig_on(chain, keeping(tmp_path)) as rig:
+        await set_out(rig)
+        kept = list(tmp_path.glob("references/*"))
+        drive(chain, 1).loop.renumber(0)  # as another program does
+        await rig.until("x", lambda state: not state.referenced)
+        await asyncio.sleep(2.0)
+        left = list(tmp_path.glob("references/*"))
+
+    assert (kept, left) == ([tmp_path / "references" / "x.json"], [])
+
+
 async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_reference(tmp_path):
     """Address, identity and rate are what they were, and even the counter is near where it was."""
 

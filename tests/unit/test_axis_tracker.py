@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis.state import MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
+from ldcnd.daemon.axis.state import JUMPED, MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
 from ldcnd.model.commands import Verb
@@ -343,8 +343,9 @@ def test_a_jump_is_a_fault_until_reset_and_loses_the_reference(moving):
     moving.observed(ON, at(2.5), 0)
     assert (moving.state, moving.referenced) == (AxisState.ERROR_STOP, False)
     assert moving.first_fault.source == "daemon"
+    moving.jumped()
     moving.observed(ON, at(2.6), 0)
-    assert moving.active_faults
+    assert [fault.code for fault in moving.active_faults] == [JUMPED.code]
 
     moving.cleared(3.0)
     moving.observed(ON, at(3.1), 0)
