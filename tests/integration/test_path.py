@@ -10,7 +10,7 @@ import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange
-from ldcnd.model.commands import Halt, Power, Stop
+from ldcnd.model.commands import Halt, Power, Reset, Stop
 from ldcnd.model.leases import Acquire, Release
 from ldcnd.model.rig_commands import AxisPath, PathReply, WalkPath
 from ldcnd.model.samples import AxisState, LinkState
@@ -43,9 +43,9 @@ def sc_chain() -> Chain:
 
 
 @asynccontextmanager
-async def two_sc(chain: Chain, *, leased: bool = False) -> AsyncIterator[ChainRig]:
+async def two_sc(chain: Chain, *, leased: bool = False, **group: object) -> AsyncIterator[ChainRig]:
     """Run a daemon on two PIC-SERVO SC of one group, with closed loops."""
-    config = simulated_config(group=[{"name": "plane", "axes": list(NAMES)}])
+    config = simulated_config(group=[{"name": "plane", "axes": list(NAMES), **group}])
     document = config.model_dump(mode="json", exclude_unset=True)
     table = document["bus"][0]
     table["axis"] = [{"name": name, "address": at + 1, **AXIS} for at, name in enumerate(NAMES)]
@@ -112,6 +112,17 @@ async def test_axes_on_a_path_stay_as_near_to_it_as_was_said_before(speed, corne
     assert [state.last_error for state in states] == [None, None]
     assert [state.state for state in states] == [AxisState.STANDSTILL] * 2
     assert math.dist(places(chain)[1], (corners["z"][-1], corners["c"][-1])) < 0.05
+
+
+@pytest.mark.parametrize("leader", NAMES)
+async def test_a_group_whose_leader_answers_for_it_walks_a_path_too(leader):
+    chain = sc_chain()
+    async with two_sc(chain, leader=leader) as rig:
+        said = await rig.client.ask(path(speed=15.0))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert [state.last_error for state in states] == [None, None]
+    assert math.dist(places(chain)[1], (TRIANGLE["z"][-1], TRIANGLE["c"][-1])) < 0.05
 
 
 async def test_a_path_beyond_a_limit_or_too_far_from_its_line_moves_nothing():
@@ -234,6 +245,10 @@ async def test_a_stop_at_any_instant_of_a_path_is_the_last_that_moves():
             await asyncio.sleep(1.0)
             assert await rests(chain), f"stopped after {0.02 * tenth:.2f} s"
             assert not any(module.loop.trajectory.path.running for module in (drive(chain, 1), drive(chain, 2)))
+            for name in NAMES:
+                await rig.client.command(name, Reset())
+                await rig.client.command(name, Power(on=True))
+            await rig.client.ask(path(speed=15.0))  # nothing of the earlier one is left in a drive
 
 
 async def test_polls_go_on_while_a_path_is_fed():

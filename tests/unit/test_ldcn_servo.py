@@ -11,7 +11,7 @@ from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins
 from ldcnd.drivers.ldcn.packet import Command, StatusItem
 from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.errors import DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
+from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
 from ldcnd.model.commands import HomeMethod, PinMode
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition
@@ -370,3 +370,16 @@ def test_readings_ask_for_no_more_than_is_wanted() -> None:
 
     assert drive.axis.reading(frozenset()) is drive.axis.reading(frozenset())
     assert len(set(mask.values())) == 2
+
+
+@pytest.mark.parametrize("missing", ["position", "home"])
+async def test_half_a_status_proves_nothing(missing):
+    drive = await powered()
+    execute = drive.bus.execute
+
+    async def half(exchange, lane):
+        return replace(await execute(exchange, lane), **{missing: None})
+
+    drive.bus.execute = half
+    with pytest.raises(BadReply, match="lacks position or home"):
+        await drive.axis.evidence()
