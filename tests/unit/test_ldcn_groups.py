@@ -6,9 +6,10 @@ import pytest
 
 from ldcnd.drivers.driver import AxisSpec, Gains, Motion, StopMode
 from ldcnd.drivers.ldcn.addressing import EVERYBODY, GroupPlan
+from ldcnd.drivers.ldcn.commands import Group, save_home
 from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.profiles import PIC_SERVO_V4
+from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.network import GroupSpec
 from ldcnd.errors import DriveFault, NotSupported, OutcomeUnknown, ReplyTimeout, StopLatched, WrongState
@@ -40,7 +41,7 @@ class Addressing:
 class Pair:
     """Two powered drives in one group."""
 
-    def __init__(self, plan: GroupPlan | None = None) -> None:
+    def __init__(self, plan: GroupPlan | None = None, *, snapshots: bool = False) -> None:
         self.host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("picservo-v4"), ModuleSpec("picservo-v4")))))
         self.host.address_all()
         self.bus = DirectBus(self.host)
@@ -51,7 +52,7 @@ class Pair:
         names = {1: "a", 2: "b"}
         self.addressing = Addressing(self.host)
         plan = plan or GroupPlan((GroupSpec("pair", ("a", "b")),), names)
-        self.groups = Groups(self.bus, plan, self.addressing, self.drives, snapshots=False)
+        self.groups = Groups(self.bus, plan, self.addressing, self.drives, snapshots=snapshots)
 
     async def up(self, *, power: bool = True, proven: bool = True) -> "Pair":
         for drive in self.drives.values():
@@ -228,3 +229,34 @@ async def test_members_that_are_there_already_have_started():
     await pair.groups.start({"a": here, "b": THERE}, wanted)
 
     assert pair.run_on() == [False, True]
+
+
+async def test_a_snapshot_of_a_line_with_other_modules_names_the_group_and_never_everybody():
+    pair = await Pair(snapshots=True).up()
+    sent = []
+
+    async def freeze(exchange):
+        sent.append(exchange.request)
+        raise ReplyTimeout("that is enough")
+
+    pair.bus.execute_timed = freeze
+    with pytest.raises(ReplyTimeout, match="enough"):
+        await pair.groups.snapshot(lambda: None)
+
+    assert sent == [save_home(Group(GROUP)).request]
+
+
+async def test_a_path_that_is_refused_when_its_turn_on_the_line_comes_is_no_unknown_outcome():
+    pair = await Pair().up()
+    asked = []
+
+    async def refuse(exchange, *_lane):
+        asked.append(exchange)
+        raise StopLatched("axis a: a stop is latched")
+
+    pair.drives["a"].profile = PIC_SERVO_SC
+    pair.bus.execute = refuse
+    with pytest.raises(StopLatched):
+        await pair.groups.start_path(frozenset(MOTIONS), lambda: None)
+
+    assert len(asked) == 1

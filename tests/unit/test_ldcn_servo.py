@@ -383,3 +383,25 @@ async def test_half_a_status_proves_nothing(missing):
     drive.bus.execute = half
     with pytest.raises(BadReply, match="lacks position or home"):
         await drive.axis.evidence()
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+async def test_a_counter_is_set_back_only_once_what_is_kept_of_it_is_void(allowed):
+    drive = await powered()
+    drive.module.loop.renumber(2_000_000_000)
+    since = len(drive.bus.packets)
+
+    async def void() -> None:
+        assert Command.RESET_POSITION not in drive.bus.commands(since)
+        if not allowed:
+            raise WrongState("the disk cannot forget it")
+
+    drive.axis.about_to_renumber = void
+    beyond = Motion(2_300_000_000, 20_000.0, 100_000.0)
+    if allowed:
+        await drive.axis.load(beyond)
+    else:
+        with pytest.raises(WrongState, match="cannot forget"):
+            await drive.axis.load(beyond)
+
+    assert (Command.RESET_POSITION in drive.bus.commands(since)) is allowed
