@@ -18,7 +18,8 @@ from ldcnd import durable
 from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.drivers.ldcn.received import PlainCommand, ResetPosition
-from ldcnd.errors import LdcndError, NotReferenced, RequestRefused, WrongState
+from ldcnd.drivers.ldcn.servo import LdcnAxis
+from ldcnd.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
 from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
 from ldcnd.model.events import CommandStatus, ReadEvents
 from ldcnd.model.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
@@ -177,6 +178,45 @@ async def test_turns_of_a_rotary_axis_outlive_the_daemon(tmp_path):
         after = await position_of(rig, "c")
 
     assert (after.turns, after.value) == (2, pytest.approx(90.0, abs=0.1))
+
+
+async def test_a_motion_is_written_once_however_long_it_takes(tmp_path, monkeypatch):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        replace, written = durable.replace, []
+
+        def counted(path: Path, text: str) -> None:
+            written.append(json.loads(text))
+            replace(path, text)
+
+        monkeypatch.setattr(durable, "replace", counted)
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=1.0))
+        await asyncio.sleep(45.0)
+        in_motion = list(written)
+
+    assert [(kept["low"], kept["high"]) for kept in in_motion] == [
+        (pytest.approx(36 * COUNTS, abs=12), pytest.approx(86 * COUNTS, abs=12))
+    ]
+
+
+async def test_one_reading_that_proves_a_reference_is_enough(tmp_path, monkeypatch):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+    read, readings = LdcnAxis.evidence, []
+
+    async def once(axis: LdcnAxis) -> Any:
+        readings.append(axis)
+        if len(readings) > 1:
+            raise ReplyTimeout("no reply")
+        return await read(axis)
+
+    monkeypatch.setattr(LdcnAxis, "evidence", once)
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+
+    assert (state.referenced, said) == (True, [""])
 
 
 # -- what speaks against it ------------------------

@@ -236,6 +236,15 @@ def test_an_open_loop_on_purpose_is_no_position_error():
     assert [fault.code for fault in state.faults(searching)] == ["position_error"]
 
 
+def test_a_loop_that_was_closed_again_is_not_open_on_purpose():
+    state = DriveState("x", PIC_SERVO_V4)
+    state.loaded(absolute=False, opens_loop=True)
+    state.switched(pic_ae=True, closed=True)
+    tripped = status(flags=StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag.INDEX)
+
+    assert [fault.code for fault in state.faults(tripped)] == ["position_error"]
+
+
 def test_velocity_counts_in_the_ticks_of_the_servo_rate_divisor_but_not_on_sc():
     v4, sc = DriveState("x", PIC_SERVO_V4), DriveState("x", PIC_SERVO_SC)
     v4.servo_divisor = sc.servo_divisor = 4
