@@ -244,6 +244,16 @@ async def test_a_drive_that_lost_power_has_no_reference(tmp_path):
     assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its line was reset"])
 
 
+async def test_a_drive_that_lost_power_by_itself_has_no_reference(tmp_path):
+    def cut(module: Any) -> None:
+        now_s = asyncio.get_running_loop().time()
+        module.power(on=False, at_s=now_s)
+        module.power(on=True, at_s=now_s + 0.1)
+
+    chain = chain_of()
+    assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its drive had lost power"])
+
+
 async def test_a_reference_that_is_lost_under_a_daemon_is_off_the_disk_before_it_ends(tmp_path):
     chain = chain_of()
     async with rig_on(chain, keeping(tmp_path)) as rig:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange
+from ldcnd.errors import CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange, WrongState
 from ldcnd.model.commands import Halt, Power, Reset, Stop
 from ldcnd.model.leases import Acquire, Release
 from ldcnd.model.rig_commands import AxisPath, PathReply, WalkPath
@@ -249,6 +249,56 @@ async def test_a_stop_at_any_instant_of_a_path_is_the_last_that_moves():
                 await rig.client.command(name, Reset())
                 await rig.client.command(name, Power(on=True))
             await rig.client.ask(path(speed=15.0))  # nothing of the earlier one is left in a drive
+
+
+async def test_a_path_that_one_axis_leaves_before_it_starts_leaves_no_points_in_the_other_drive():
+    left_at = set()
+    for hundredth in range(1, 12):
+        chain = sc_chain()
+        async with two_sc(chain) as rig:
+            walking = asyncio.create_task(rig.client.ask(path(speed=15.0)))
+            await asyncio.sleep(0.01 * hundredth)
+            left_at.add(drive(chain, 2).loop.trajectory.path.points_left)
+            await rig.client.command("z", Stop())
+            await asyncio.wait([walking])
+            walking.exception()
+            assert await rests(chain), f"stopped after {0.01 * hundredth:.2f} s"
+            assert drive(chain, 2).loop.trajectory.path.points_left == 0, f"stopped after {0.01 * hundredth:.2f} s"
+
+    print(f"points when stopped: {sorted(left_at)}")
+    assert len(left_at) > 5
+
+
+async def test_an_axis_that_walks_more_slowly_is_not_ended_by_one_that_has_arrived(monkeypatch):
+    monkeypatch.setitem(AXIS, "settle", {"window": 1.0, "time_s": 0.0})
+    monkeypatch.setitem(AXIS, "rates", {"position": 50, "state": 50})
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        said = await rig.client.ask(path(speed=15.0))
+        await asyncio.sleep(said.duration_s - 0.3)
+        drive(chain, 2).loop.trajectory.path.add([0, 0, 0])
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert [state.last_error for state in states] == [None, None]
+
+
+async def test_a_path_that_is_refused_in_its_turn_leaves_the_axes_at_standstill_at_once(monkeypatch):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        announced = []
+
+        async def refuse(names: frozenset[str], _still_wanted: Callable[[], None]) -> None:
+            await asyncio.sleep(0.05)
+            announced.extend([(await rig.client.state(name)).state for name in sorted(names)])
+            raise WrongState("refused in its turn")
+
+        monkeypatch.setattr(rig.line.network, "start_path", refuse)
+        with pytest.raises(WrongState, match="in its turn"):
+            await rig.client.ask(path())
+        states = [await rig.client.state(name) for name in NAMES]
+
+    assert announced == [AxisState.DISCRETE_MOTION] * 2
+    assert [(state.state, state.command) for state in states] == [(AxisState.STANDSTILL, None)] * 2
 
 
 async def test_polls_go_on_while_a_path_is_fed():

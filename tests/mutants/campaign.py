@@ -41,8 +41,6 @@ LEAST_TESTS = 3
 """Fewest tests for a mutant, where so many run the line: the budget may be less than what one of them costs."""
 MEMORY_BYTES = 4 << 30
 """Address space of a fork: a mutant that appends for ever ends here."""
-FRESH_TESTS = 200
-"""Most tests for a mutant that needs a pytest of its own."""
 KILLED = RECORDS / "killed.jsonl"
 """What was killed by which test."""
 
@@ -152,10 +150,9 @@ class Campaign:
         tests = [test for test in covering if test in self._items]
         if not tests:
             return Verdict.UNCOVERED, ""
-        code = mutant.module(ROOT)
+        tests, code = self._affordable(tests), mutant.module(ROOT)
         if is_early or not self._is_replaceable(mutant, code):
             return _judged_freshly(mutant, tests)
-        tests = self._affordable(tests)
         while tests and (run := self._run(tests, mutant, code)).failed:
             alone = run if run.hung or run.failed == tests[0] else self._run([run.failed], mutant, code)
             if alone.failed and self._is_sound(run.failed):
@@ -280,7 +277,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 def _judged_freshly(mutant: Mutant, tests: Sequence[str]) -> tuple[Verdict, str]:
     """Judge a mutant in a pytest of its own, which imports the changed module."""
-    command = ("-q", "-x", "--no-header", "-rfE", "--tb=no", "-p", "tests.mutants.applied", *tests[:FRESH_TESTS])
+    command = ("-q", "-x", "--no-header", "-rfE", "--tb=no", "-p", "tests.mutants.applied", *tests)
     try:
         run = subprocess.run(  # noqa: S603
             (sys.executable, "-m", "pytest", *command), cwd=ROOT, timeout=600, check=False, capture_output=True,

@@ -9,6 +9,7 @@ import pytest
 from ldcnd.daemon.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
 from ldcnd.daemon.axis.guards import Right
 from ldcnd.drivers.driver import Fault, StopMode
+from ldcnd.drivers.network import BringUpReport
 from ldcnd.errors import (
     BusDown,
     CommandExpired,
@@ -622,6 +623,29 @@ async def test_a_start_that_was_not_taken_ends_the_command_at_once():
         assert bench.ended[-1] == ("first", CommandStatus.FAILED, "no reply")
         await asyncio.sleep(0)
         assert bench.published(TelemetryItem.STATE).state is AxisState.STANDSTILL
+
+
+@pytest.mark.parametrize(
+    ("reset", "restarted", "interrupted"),
+    [
+        (False, {"x", "y"}, "its drive had lost power"),
+        (False, {"y"}, ""),
+        (False, set(), ""),
+        (True, set(), "its line was reset"),
+    ],
+)
+async def test_a_kept_reference_is_recalled_with_what_has_reset_the_drive(monkeypatch, reset, restarted, interrupted):
+    told = []
+
+    async def recall(baud: int, identity: str, why: str) -> tuple[None, str]:
+        told.append((baud, identity, why))
+        return None, ""
+
+    async with axis_bench() as bench:
+        monkeypatch.setattr(bench.axis.reference, "recall", recall)
+        await bench.axis.recall(BringUpReport(19200, {"x": "a drive"}, reset=reset, restarted=frozenset(restarted)))
+
+    assert told == [(19200, "a drive", interrupted)]
 
 
 def _reading(bench: AxisBench, **changes):

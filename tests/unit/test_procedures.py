@@ -547,6 +547,26 @@ async def test_a_jog_that_the_drive_cut_short_has_failed():
     assert [reason for _, _, reason in bench.ended if reason and "switch" in reason]
 
 
+async def test_a_held_jog_is_renewed_by_nobody_while_it_is_being_stopped():
+    held, refused = Jog(velocity=5.0, hold_s=1.0), []
+    async with axis_bench() as bench:
+
+        async def renew() -> None:
+            try:
+                bench.axis.renew_jog(held, "held")
+            except LeaseExpired as error:
+                refused.append(error)
+
+        bench.axis.begin_hold("held", held)
+        await bench.send(held, "held")
+        await renew()
+        assert refused == []
+        bench.drive.during["stop"] = renew
+        await bench.pass_s(0.1, cut_short="the drive stopped at the forward limit switch", **RUNNING)
+
+    assert len(refused) == 1
+
+
 async def test_a_jog_that_was_lost_from_sight_is_stopped_until_it_is_seen_at_rest():
     async with axis_bench() as bench:
         await jogging(bench)

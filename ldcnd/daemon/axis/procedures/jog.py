@@ -172,7 +172,6 @@ class HeldJog(Procedure):
         if reading.cut_short:
             return await self._stop(reading.cut_short)
         if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
-            self._over()
             motion.tracker.finished()
             return False
         if self._phase is not _Phase.RESTS and not motion.driver.retargets:
@@ -243,9 +242,6 @@ class HeldJog(Procedure):
         self._phase = _Phase.SLOWS
 
     async def _stop(self, reason: str) -> bool:
-        self._over()
+        self._hold.over = True  # nobody renews it while the packets of the stop are under way
         await self._motion.end(self.permit, reason)
         return False
-
-    def _over(self) -> None:
-        self._hold.over = True

@@ -291,7 +291,6 @@ class PathMember(Procedure):
             ]
             self.plan = plans[-1]
             status = await walking(motion.driver).path_status()
-            self.permit.ask_to_move()
             if status.points or status.running or not status.enabled:
                 raise WrongState(
                     f"axis {motion.config.name}: {status.points} points of an earlier path are left in the drive",
