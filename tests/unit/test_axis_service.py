@@ -648,6 +648,20 @@ async def test_a_kept_reference_is_recalled_with_what_has_reset_the_drive(monkey
     assert told == [(19200, "a drive", interrupted)]
 
 
+async def test_a_kept_reference_is_in_force_once_the_line_is_up_and_not_the_next_time(monkeypatch):
+    async def recall(*_proof: object) -> tuple[float, str]:
+        return 1500.0, ""
+
+    async with axis_bench() as bench:
+        monkeypatch.setattr(bench.axis.reference, "recall", recall)
+        await bench.axis.recall(BringUpReport(19200, {}, reset=False))
+        bench.axis.connected(placed=False)
+        bench.show(position_counts=2500)
+        assert (bench.tracker.referenced, bench.published(TelemetryItem.POSITION).value) == (True, 1.0)
+        bench.axis.connected(placed=False)
+        assert not bench.tracker.referenced
+
+
 def _reading(bench: AxisBench, **changes):
     return replace(bench.drive.shown, **changes)
 
