@@ -656,8 +656,7 @@ async def test_a_kept_reference_is_in_force_once_the_line_is_up_and_not_the_next
         monkeypatch.setattr(bench.axis.reference, "recall", recall)
         await bench.axis.recall(BringUpReport(19200, {}, reset=False))
         bench.axis.connected(placed=False)
-        bench.show(position_counts=2500)
-        assert (bench.tracker.referenced, bench.published(TelemetryItem.POSITION).value) == (True, 1.0)
+        assert (bench.tracker.referenced, bench.axis.telemetry.position(2500)) == (True, 1.0)
         bench.axis.connected(placed=False)
         assert not bench.tracker.referenced
 
