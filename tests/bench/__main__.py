@@ -65,7 +65,7 @@ def main() -> None:
     """Run the whole bench, or the parts of it that the options leave."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--rounds", type=int, default=9, help="interleaved rounds at the full rate, half of them elsewhere"
+        "--rounds", type=int, default=45, help="short interleaved rounds at the full rate, fewer elsewhere"
     )
     parser.add_argument("--virtual-seconds", type=float, default=30.0, help="length of a run on the jumping clock")
     parser.add_argument("--before", type=Path, help="another checkout, whose daemon is measured in the same rounds")
@@ -100,7 +100,7 @@ def main() -> None:
 
 def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> dict[str, Callable[[], list[Row]]]:
     """Return what measures each part; one that the machine is too busy for leaves the figures of the others."""
-    fewer = max(2, rounds // 2 + 1)
+    fewer, slow = max(2, rounds // 2 + 1), max(2, rounds // 5)
     programs = cache(partial(build_programs, folder))
 
     def efficiency(conditions: Conditions, rounds: int) -> list[Row]:
@@ -110,7 +110,8 @@ def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> 
     found: tuple[Callable[[], list[Row]], ...] = (
         partial(console.rows, folder, CONSOLE_S, CONSOLE_ROUNDS),
         partial(efficiency, FAST, rounds),
-        *(partial(efficiency, each, fewer) for each in (SLOW, *MORE)),
+        partial(efficiency, SLOW, slow),
+        *(partial(efficiency, each, rounds) for each in MORE),
         lambda: system_calls.rows(programs()[0], folder),
         lambda: saturated_command.rows(programs()[0], folder),
         lambda: scaling.rows(programs()[0], folder, fewer),

@@ -4,7 +4,7 @@ A processor that was idle runs slowly for up to a second, here by 1.8 times, so 
 
 Figures of time are compared within a run only. A machine whose own speed changes during the run, because others use it
 or because it throttles, spoils that too: then the bench prints such rows and judges none of them. Ratios of paired
-rounds are judged by how far the rounds scatter.
+rounds say themselves how well they are known.
 """
 
 import os
@@ -67,13 +67,9 @@ class MachineSpeed:
         ]
 
     def judged(self, rows: Sequence[Row]) -> list[Row]:
-        """Return the rows as they may be judged: times if the machine kept its speed, paired ratios if they agree."""
+        """Return the rows as they may be judged: times only if the machine kept its speed."""
         return [replace(row, doubt=row.doubt or self._doubt(row)) for row in rows]
 
     def _doubt(self, row: Row) -> str:
-        if row.exact:
-            return ""
-        if row.spread is not None:
-            return f"the rounds scatter by {row.spread:.0%}" if row.spread > MOST_VARIATION else ""
-        varied = self.variation > MOST_VARIATION
+        varied = self.variation > MOST_VARIATION and not (row.exact or row.between)
         return f"the machine's speed varied by {self.variation:.0%} during the run" if varied else ""

@@ -1,8 +1,12 @@
 """What the bench prints: one row for each figure, with its target where there is one."""
 
+import math
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
+
+NORMAL_95 = 1.96
+"""Standard deviations of a normal distribution to either side that hold 95 of 100."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,8 +16,8 @@ class Row:
     Attributes:
         at_most: the target is an upper limit; otherwise a lower one.
         exact: a count, or measured on the jumping clock: the same on any machine at any hour.
-        spread: of a ratio of paired rounds: the width of the middle half of the rounds, as a share of the value. What
-            others do to the machine acts on both of a pair, so this judges the ratio, and not the machine's speed.
+        between: of a ratio of paired rounds: the interval that holds their median in 95 of 100 runs. What others do to
+            the machine acts on both of a pair, so this says how well the ratio is known, whatever the machine's speed.
         doubt: why the figure says little of the daemon in this run; it is not judged then.
     """
 
@@ -23,7 +27,7 @@ class Row:
     target: float | None = None
     at_most: bool = False
     exact: bool = False
-    spread: float | None = None
+    between: tuple[float, float] | None = None
     doubt: str = ""
 
     @property
@@ -33,15 +37,19 @@ class Row:
             return ""
         if self.doubt:
             return f"not judged: {self.doubt}"
+        if self.between and self.between[0] < self.target < self.between[1]:
+            return "not judged: the rounds leave it open"
         met = self.value <= self.target if self.at_most else self.value >= self.target
         return "met" if met else "MISSED"
 
 
 def paired(name: str, ratios: Iterable[float], target: float | None = None, *, at_most: bool = False) -> Row:
-    """Return the row of the ratios of paired rounds, of which there are at least two."""
-    found = list(ratios)
-    low, middle, high = statistics.quantiles(found, n=4, method="inclusive")
-    return Row(name, middle, "", target, at_most, spread=(high - low) / middle)
+    """Return the row of the ratios of paired rounds: their median, and its interval by order statistics."""
+    found = sorted(ratios)
+    off = NORMAL_95 / 2 * math.sqrt(len(found))
+    first = max(0, math.floor(len(found) / 2 - off))
+    between = found[first], found[len(found) - 1 - first]
+    return Row(name, statistics.median(found), "", target, at_most, between=between)
 
 
 def table(rows: list[Row]) -> str:
@@ -49,8 +57,8 @@ def table(rows: list[Row]) -> str:
     lines = ["| figure | value | target | |", "|---|---|---|---|"]
     for row in rows:
         target = "" if row.target is None else f"{'≤' if row.at_most else '≥'} {row.target:g}"
-        spread = "" if row.spread is None else f" ({row.spread:.0%})"
-        lines.append(f"| {row.name} | {_shown(row.value)} {row.unit}{spread} | {target} | {row.verdict} |")
+        between = f" ({_shown(row.between[0])} to {_shown(row.between[1])})" if row.between else ""
+        lines.append(f"| {row.name} | {_shown(row.value)} {row.unit}{between} | {target} | {row.verdict} |")
     return "\n".join(lines)
 
 
