@@ -26,7 +26,7 @@ from tests.bench import (
 from tests.bench.bus_efficiency import FLOOR, FLOORS, MINIMAL, Conditions, Result
 from tests.bench.machine_speed import MachineSpeed
 from tests.bench.processes import TooBusy, build_programs
-from tests.bench.report import Row, paired, table
+from tests.bench.report import LEAST_ROUNDS, Row, paired, table
 from tests.bench.sources import NoCompiler
 
 BUSY, BUSY_US = f"{FLOOR}: turn-around, 99 %", 1000
@@ -72,6 +72,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=" ".join(PARTS))
     parser.add_argument("--json", type=Path, help="keep the figures here")
     options = parser.parse_args()
+    if options.rounds < LEAST_ROUNDS:
+        parser.error(f"--rounds {options.rounds}: {LEAST_ROUNDS} at least, fewer do not tell how well a ratio is known")
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
 
     rows: list[Row] = []
@@ -100,7 +102,7 @@ def main() -> None:
 
 def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> dict[str, Callable[[], list[Row]]]:
     """Return what measures each part; one that the machine is too busy for leaves the figures of the others."""
-    fewer, slow = max(2, rounds // 2 + 1), max(2, rounds // 5)
+    fewer, slow = max(LEAST_ROUNDS, rounds // 2 + 1), max(LEAST_ROUNDS, rounds // 5)
     programs = cache(partial(build_programs, folder))
 
     def efficiency(conditions: Conditions, rounds: int) -> list[Row]:

@@ -3,9 +3,6 @@
 How well the line is used is compared with a program in C. What that costs the processor is compared with the least that
 a Python program does (`tests.bench.minimal_master`): the same interpreter, the same sort of system calls, so that the
 ratio says what our code adds, on any machine and at any hour.
-
-Rounds are short and many: what others do to the machine, and whether the processor slept, changes from second to
-second, and acts alike only on those whose turns are close together.
 """
 
 import random
@@ -23,15 +20,13 @@ from tests.bench.processes import (
     ROOT,
     SUBJECT_CPU,
     Subject,
-    TooBusy,
+    Turn,
     config_text,
     daemon,
     free_endpoint,
     paced_lines,
     process,
-    settle,
     subscriber,
-    told,
 )
 
 MODULES = 8
@@ -42,11 +37,6 @@ STATUS_ITEMS, REPLY_BYTES = 0x0F, 10
 FLOOR = "C floor"
 MINIMAL = "minimal Python master"
 FLOORS = (FLOOR, MINIMAL)
-SETTLE_S = 0.15
-"""What a daemon needs that was stopped in the middle of an exchange."""
-ROUND_BITS = 24_000
-"""Length of a turn in bits on the line: some hundred exchanges, 0.2 s at 115200 baud."""
-TRIES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +52,6 @@ class Conditions:
     baud: int
     in_one_piece: bool = False
     awake: bool = False
-
-    @property
-    def round_s(self) -> float:
-        """Return how long each subject's turn is: as many exchanges at any rate."""
-        return ROUND_BITS / self.baud
 
     def __str__(self) -> str:
         in_one_piece = ", replies in one piece" if self.in_one_piece else ""
@@ -135,8 +120,8 @@ def measure(
         endpoint = free_endpoint()
         arguments = (*line.terminals, str(baud), str(MODULES), str(STATUS_ITEMS), endpoint)
         command = (sys.executable, "-m", "tests.bench.minimal_master", *arguments)
-        subjects.append(Subject(MINIMAL, stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10)), line))
-        listeners = {MINIMAL: stack.enter_context(subscriber(endpoint))}
+        running = stack.enter_context(process(command, cpu=SUBJECT_CPU, nice=-10))
+        subjects.append(Subject(MINIMAL, running, line, stack.enter_context(subscriber(endpoint))))
         for subject in subjects:
             subject.stop()
         checkouts = [("ldcnd", ROOT), *([("before", before)] if before else [])]
@@ -150,54 +135,33 @@ def measure(
             config.write_text(rig)
             endpoint = free_endpoint()
             running = stack.enter_context(daemon(config, endpoint, root))
-            listeners[name] = stack.enter_context(subscriber(endpoint))
-            subjects.append(Subject(name, running, line))
+            subjects.append(Subject(name, running, line, stack.enter_context(subscriber(endpoint))))
             subjects[-1].stop()
-        return _summary(conditions, _rounds(subjects, listeners, rounds, conditions.round_s))
+        return _summary(conditions, _rounds(subjects, rounds, baud))
 
 
-def _rounds(subjects, listeners, rounds, round_s) -> list[dict[str, Round]]:
+def _rounds(subjects, rounds, baud) -> list[dict[str, Round]]:
     dice = random.Random(1)
     done = []
     for _ in range(rounds):
         order = subjects[:]
         dice.shuffle(order)
-        done.append({subject.name: _round(subject, listeners.get(subject.name), round_s) for subject in order})
+        done.append({subject.name: _round(subject.turn(baud)) for subject in order})
     return done
 
 
-def _round(subject: Subject, listener, round_s: float) -> Round:
-    for _ in range(TRIES):  # one that was stopped in the middle of an exchange may need a while
-        subject.resume()
-        settle(SETTLE_S)
-        before = _received(listener)
-        cpu_s = subject.cpu_s()
-        subject.lines.figures()
-        settle(round_s)
-        (figures,) = subject.lines.figures()
-        cpu_s = subject.cpu_s() - cpu_s
-        if figures.exchanges:
-            break
-    else:
-        raise TooBusy(f"{subject.name} sent nothing for {TRIES} times {round_s:.2g} s")
-    samples = _received(listener) - before
-    subject.stop()
+def _round(turn: Turn) -> Round:
+    (line,) = turn.lines
     return Round(
-        exchanges_per_s=figures.exchanges / figures.elapsed_s,
-        efficiency=figures.efficiency,
-        wall_efficiency=figures.wall_efficiency,
-        turnaround_p50_us=figures.turnaround_p50_us,
-        turnaround_p99_us=figures.turnaround_p99_us,
-        cpu_us=cpu_s / figures.exchanges * 1e6,
-        line_late_p99_us=figures.late_p99_us,
-        samples=samples / figures.exchanges,
+        exchanges_per_s=line.exchanges / line.elapsed_s,
+        efficiency=line.efficiency,
+        wall_efficiency=line.wall_efficiency,
+        turnaround_p50_us=line.turnaround_p50_us,
+        turnaround_p99_us=line.turnaround_p99_us,
+        cpu_us=turn.cpu_us,
+        line_late_p99_us=line.late_p99_us,
+        samples=turn.samples / line.exchanges,
     )
-
-
-def _received(listener) -> int:
-    if listener is None:
-        return 0
-    return int(told(listener))
 
 
 def _summary(conditions: Conditions, rounds: list[dict[str, Round]]) -> list[Result]:

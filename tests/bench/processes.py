@@ -20,6 +20,11 @@ ROOT = Path(__file__).parents[2]
 LINE_CPU, SUBJECT_CPU = 0, -1
 """The line spins on one processor, everything that is measured shares another one."""
 PATIENCE_S = 60.0
+SETTLE_S = 0.15
+"""What a daemon needs that was stopped in the middle of an exchange."""
+TURN_BITS = 24_000
+"""Length of a turn in bits on the line: some hundred exchanges, 0.2 s at 115200 baud."""
+TRIES = 10
 
 
 class TooBusy(RuntimeError):
@@ -140,14 +145,56 @@ def paced_lines(
         yield PacedLines(running)
 
 
-class Subject:
-    """A host under measurement, with its lines; stopped between its rounds."""
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """What a subject did while it ran: figures of each line, none of them silent, processor time, samples received."""
 
-    def __init__(self, name: str, running: subprocess.Popen, lines: PacedLines) -> None:
+    lines: tuple[LineFigures, ...]
+    cpu_s: float
+    samples: int
+
+    @property
+    def cpu_us(self) -> float:
+        """Return the processor time of an exchange."""
+        return self.cpu_s / sum(line.exchanges for line in self.lines) * 1e6
+
+
+class Subject:
+    """A host under measurement, with its lines and whoever hears it; stopped between its turns.
+
+    Turns are short, so that there are many: what others do to the machine, and whether the processor slept, changes
+    from second to second, and acts alike only on those whose turns are close together.
+    """
+
+    def __init__(
+        self, name: str, running: subprocess.Popen, lines: PacedLines, listener: subprocess.Popen | None = None
+    ) -> None:
         self.name = name
         self.pid = running.pid
         self.lines = lines
         self._running = running
+        self._listener = listener
+
+    def turn(self, baud: int) -> Turn:
+        """Let it run and measure it, with as many exchanges at any rate; again if a line was silent meanwhile."""
+        round_s = TURN_BITS / baud
+        self.resume()
+        for _ in range(TRIES):
+            settle(SETTLE_S)
+            received = self._received()
+            cpu_s = self.cpu_s()
+            self.lines.figures()
+            settle(round_s)
+            figures = self.lines.figures()
+            cpu_s = self.cpu_s() - cpu_s
+            if all(line.exchanges for line in figures):
+                received = self._received() - received
+                self.stop()
+                return Turn(figures, cpu_s, received)
+        raise TooBusy(f"{self.name}: a line was silent for {TRIES} times {round_s:.2g} s")
+
+    def _received(self) -> int:
+        return int(told(self._listener)) if self._listener else 0
 
     def stop(self) -> None:
         """Freeze it."""

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 NORMAL_95 = 1.96
 """Standard deviations of a normal distribution to either side that hold 95 of 100."""
+LEAST_ROUNDS = 6
+"""Of fewer, not even the whole range holds the median in 95 of 100 runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +40,13 @@ class Row:
         if self.doubt:
             return f"not judged: {self.doubt}"
         if self.between and self.between[0] < self.target < self.between[1]:
-            return "not judged: the rounds leave it open"
+            return "not judged: the rounds leave it open, more of them would tell (--rounds)"
         met = self.value <= self.target if self.at_most else self.value >= self.target
         return "met" if met else "MISSED"
 
 
 def paired(name: str, ratios: Iterable[float], target: float | None = None, *, at_most: bool = False) -> Row:
-    """Return the row of the ratios of paired rounds: their median, and its interval by order statistics."""
+    """Return the row of the ratios of at least `LEAST_ROUNDS` paired rounds: their median, its interval by their order."""
     found = sorted(ratios)
     off = NORMAL_95 / 2 * math.sqrt(len(found))
     first = max(0, math.floor(len(found) / 2 - off))

@@ -6,10 +6,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tests.bench.bus_efficiency import ROUND_BITS, SETTLE_S, TRIES
 from tests.bench.processes import (
     Subject,
     TooBusy,
+    Turn,
     config_text,
     daemon,
     free_endpoint,
@@ -27,7 +27,6 @@ ALL_ITEMS = ("position", "velocity", "adc", "state")
 ITEMS = ALL_ITEMS[:3]
 LEAST_EXCHANGES = 10
 """A line that is polled has more in half a second, however busy the machine is."""
-ROUND_S = ROUND_BITS / BAUD
 LATE_US = 100.0
 """Lines that are later than this in one of a hundred bytes measure themselves."""
 
@@ -141,7 +140,7 @@ def _measure(
             subjects[shape].stop()
         for _ in range(rounds):
             for shape in dice.sample(shapes, len(shapes)):
-                loads[shape].append(_round(subjects[shape]))
+                loads[shape].append(_load(subjects[shape].turn(BAUD)))
     return loads
 
 
@@ -155,25 +154,12 @@ def _until_polled(subject: Subject) -> None:
     raise TooBusy(f"{subject.name}: not every line came up")
 
 
-def _round(subject: Subject) -> Load:
-    subject.resume()
-    for _ in range(TRIES):
-        settle(SETTLE_S)
-        cpu_s = subject.cpu_s()
-        subject.lines.figures()
-        settle(ROUND_S)
-        figures = subject.lines.figures()
-        cpu_s = subject.cpu_s() - cpu_s
-        if all(each.exchanges for each in figures):
-            break
-    else:
-        raise TooBusy(f"{subject.name}: a line was silent for {TRIES} times {ROUND_S:.2g} s")
-    subject.stop()
+def _load(turn: Turn) -> Load:
     return Load(
-        efficiency=statistics.fmean(each.efficiency for each in figures),
-        cpu_us=cpu_s / sum(each.exchanges for each in figures) * 1e6,
-        core=cpu_s / max(each.elapsed_s for each in figures),
-        late_us=max(each.late_p99_us for each in figures),
+        efficiency=statistics.fmean(line.efficiency for line in turn.lines),
+        cpu_us=turn.cpu_us,
+        core=turn.cpu_s / max(line.elapsed_s for line in turn.lines),
+        late_us=max(line.late_p99_us for line in turn.lines),
     )
 
 

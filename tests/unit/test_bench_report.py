@@ -7,6 +7,7 @@ import pytest
 from tests.bench.report import paired
 
 SEED = 26
+OPEN = "not judged: the rounds leave it open, more of them would tell (--rounds)"
 
 
 @pytest.mark.parametrize("rounds", [6, 9, 23, 45])
@@ -16,9 +17,10 @@ def test_the_interval_holds_the_true_median_in_95_of_100_runs(rounds: int) -> No
     runs, held = 2000, 0
     for _ in range(runs):
         ratios = [dice.lognormvariate(0.0, 1.0 if dice.random() < 0.2 else 0.05) for _ in range(rounds)]
-        low, high = paired("ratio", ratios).between or (0, 0)
-        held += low <= 1.0 <= high
-    assert held / runs >= 0.945, f"seed {SEED}"
+        row = paired("ratio", ratios)
+        assert row.between
+        held += row.between[0] <= 1.0 <= row.between[1]
+    assert 0.945 <= held / runs <= 0.985, f"seed {SEED}"
 
 
 @pytest.mark.parametrize(
@@ -26,10 +28,10 @@ def test_the_interval_holds_the_true_median_in_95_of_100_runs(rounds: int) -> No
     [
         (3.0, True, "met"),
         (1.0, True, "MISSED"),
-        (2.0, True, "not judged: the rounds leave it open"),
+        (2.0, True, OPEN),
         (1.0, False, "met"),
         (3.0, False, "MISSED"),
-        (2.0, False, "not judged: the rounds leave it open"),
+        (2.0, False, OPEN),
     ],
 )
 def test_a_ratio_is_judged_when_its_whole_interval_is_on_one_side(
