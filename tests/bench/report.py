@@ -46,7 +46,7 @@ class Row:
 
 
 def paired(name: str, ratios: Iterable[float], target: float | None = None, *, at_most: bool = False) -> Row:
-    """Return the row of the ratios of at least `LEAST_ROUNDS` paired rounds: their median, its interval by their order."""
+    """Return the row of the ratios of `LEAST_ROUNDS` paired rounds or more: their median and its interval, by rank."""
     found = sorted(ratios)
     off = NORMAL_95 / 2 * math.sqrt(len(found))
     first = max(0, math.floor(len(found) / 2 - off))
