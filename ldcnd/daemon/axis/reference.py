@@ -188,12 +188,10 @@ class ReferenceKeeper:
 
     # -- at the start ------------------------------------------------------------------------------------------------
 
-    async def recall_faults(self) -> None:
+    async def _recall_faults(self, files: KeptFiles) -> None:
         """Read the faults that an earlier daemon has kept."""
-        if self._files is None:
-            return
         try:
-            kept = await self._files.faults(self._config.name)
+            kept = await files.faults(self._config.name)
         except (OSError, ValueError) as error:
             log.warning("kept faults not read", axis=self._config.name, reason=_words(error))
             return
@@ -250,7 +248,7 @@ class ReferenceKeeper:
         """Keep what is known on the disk until cancelled."""
         if self._files is None:
             return
-        await self.recall_faults()
+        await self._recall_faults(self._files)
         while not self._closed:
             await self._woken_within(CHECK_S)
             self.woken.clear()
