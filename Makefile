@@ -34,6 +34,7 @@ check: .venv/ready
 
 fix: .venv/ready
 	.venv/bin/ldcnd schema client
+	.venv/bin/ruff format .
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
 	.venv/bin/ldcnd schema write

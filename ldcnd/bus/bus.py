@@ -80,21 +80,16 @@ class MuteNodes:
 class PollTransaction(Transaction):
     """A poll; it is never sent again, because the next poll comes soon enough."""
 
-    __slots__ = ("order", "poller")
+    __slots__ = ("poller",)
 
-    def __init__(
-        self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float, order: PhaseOrder | None = None
-    ) -> None:
+    def __init__(self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float) -> None:
         self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
         self.then_baud = self.at_baud = None
         self.slow_to_deliver = poller.slow_to_deliver
         self.poller = poller
-        self.order = order
 
     @override
     def completed(self, reply: bytes, timing: Timing) -> None:
-        if self.order and reply:
-            self.order.observe(self.exchange.node, timing)
         try:
             value = self.exchange.decode(reply)
         except BadReply as error:
@@ -400,15 +395,17 @@ class Bus(Users):
 
     @override
     def take(self, now_s: float) -> Transaction | None:
-        job = self._queue.take_job(now_s)
-        while job and not job.may_go():
-            job = self._queue.take_job(now_s)
+        while job := self._queue.take_job(now_s):
+            if job.condition and self._line and self._line.undelivered:
+                self._line.deliver()  # permission is asked of all that the drives have said by now
+            if job.may_go():
+                break
         if job is None:
             poller = self._queue.polls.take(now_s)
             if poller is None:
                 return None
             wanted_at_s = poller.due_at_s
-            return PollTransaction(poller, poller.next_exchange(now_s), wanted_at_s, self._order)
+            return PollTransaction(poller, poller.next_exchange(now_s), wanted_at_s)
         job.attempts_left -= 1
         if isinstance(job, StopProbe):
             self.statistics.stop_wait.add(now_s - job.wanted_at_s)
@@ -441,8 +438,10 @@ class Bus(Users):
         return self._mute.failing()
 
     @override
-    def answered(self, transaction: Transaction) -> None:
+    def answered(self, transaction: Transaction, timing: Timing | None = None) -> None:
         exchange, mute = transaction.exchange, self._mute
+        if self._order and timing and transaction.lane is POLL:
+            self._order.observe(exchange.node, timing)
         if not exchange.reply_bytes or exchange.node not in mute.misses:
             return
         if (also := mute.answered(exchange.node)) is not None:

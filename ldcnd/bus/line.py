@@ -1,7 +1,8 @@
 """An open line: keeps exactly one exchange outstanding and gets back in step after a loss.
 
 Reply-driven: when a reply is complete and intact, the next request goes on the wire first; only then is the old reply
-noted, decoded and delivered. No task and no timer per exchange.
+noted, decoded and delivered. No task and no timer per exchange. On a line that is busy with polls their replies are
+delivered several at a time (`BusSettings.coalesce_s`), in order, and before anything but a poll has its outcome.
 
 No reply is ever credited to a later request. Replies of these lines carry no sequence number, so the line relies on
 three facts: bytes that arrive sooner than the wire can carry them belong to something older; nothing but the reply may
@@ -9,6 +10,7 @@ follow a request; after any loss the line is resynchronised (`Quarantine`) befor
 """
 
 import asyncio
+from collections import deque
 from enum import Enum
 from typing import Protocol
 
@@ -68,8 +70,8 @@ class Users(Protocol):
     def failing(self) -> set[int]:
         """Return the nodes that did not reply to their last exchange."""
 
-    def answered(self, transaction: Transaction) -> None:
-        """Note that the transaction's node replied, or that no reply was due."""
+    def answered(self, transaction: Transaction, timing: Timing | None = None) -> None:
+        """Note that the transaction's node replied, and when if the reply is accepted, or that no reply was due."""
 
     def missed(self, transaction: Transaction, now_s: float) -> None:
         """Note that the transaction's node did not reply; called before the transaction's own `lost`."""
@@ -95,6 +97,7 @@ class Line(Receiver):
     Attributes:
         phase: its state.
         wire: its end on the host.
+        undelivered: replies to polls that wait to be delivered with those after them, oldest first.
     """
 
     def __init__(
@@ -122,6 +125,8 @@ class Line(Receiver):
         self._pieces = Pieces()
         self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain transaction
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
+        self.undelivered: deque[tuple[Transaction, bytes, Timing]] = deque()
+        self._coalesce_s, self._deliver_by_s = settings.coalesce_s, NEVER_S
         transport.attach(self)
 
     def on_time(self, now_s: float) -> bool:
@@ -142,13 +147,23 @@ class Line(Receiver):
         """Resynchronise before another reply is accepted: a reply may have belonged to an older request.
 
         Every later reply then belongs to the request before it; so the reply on the wire is not accepted either, unless
-        its exchange must not be repeated.
+        its exchange must not be repeated, nor are those that were not delivered yet.
         """
+        while self.undelivered:
+            transaction = self.undelivered.popleft()[0]
+            transaction.lost(BadReply(f"node {transaction.exchange.node}: the reply may be to something older"))
         if self.phase is Phase.IDLE:
             self._quarantine.require()
             self._begin_quarantine(self._loop.time())
         elif self.phase is Phase.REPLY and self._transaction and self._transaction.exchange.repeatable:
             self._distrusted, self._missing = True, NOT_PLAIN
+
+    def deliver(self) -> None:
+        """Deliver the replies that wait, oldest first."""
+        undelivered = self.undelivered
+        while undelivered:
+            transaction, reply, timing = undelivered.popleft()
+            transaction.completed(reply, timing)
 
     def close(self, reason: str, *, for_good: bool = False) -> None:
         """Leave the line; the transaction on the wire, if any, is lost. Safe to call twice.
@@ -161,6 +176,7 @@ class Line(Receiver):
             return
         self.phase = Phase.CLOSED
         self._watchdog.cancel()
+        self.deliver()
         transaction, self._transaction = self._transaction, None
         if for_good and transaction and transaction.lane is POLL:
             transaction = None
@@ -256,25 +272,32 @@ class Line(Receiver):
 
     def _complete_plain(self, transaction: Transaction, reply: bytes, arrived: bytes, now_s: float) -> None:
         """Write the next request before anything else: until then the wire is idle, afterwards there is time."""
-        sent_at_s, failure, users = self._sent_at_s, "", self._users
+        sent_at_s, failure, users, slow = self._sent_at_s, "", self._users, transaction.slow_to_deliver
         following = users.take(now_s)
         if following is not None and not following.at_baud:
             failure = self._put(following, self._loop.time())
-            if transaction.slow_to_deliver and self._transport.pushes:
+            if slow and self._transport.pushes:
                 self._transport.push()
         else:
             self._transaction, self.phase = None, Phase.IDLE
         self._statistics.bytes_in += len(arrived)
         self._log.add(now_s, WireEvent.RECEIVED, arrived)
         timing = self.wire.replied(transaction, reply, sent_at_s, now_s)
-        users.answered(transaction)
+        users.answered(transaction, timing)
+        undelivered, waits = self.undelivered, False
+        if not undelivered:
+            self._deliver_by_s = now_s + self._coalesce_s
+        undelivered.append((transaction, reply, timing))
         if following is None:
             self._next(AT_ONCE)
         elif following.at_baud:
             self._send(following, now_s, AT_ONCE[following.lane])
         else:
-            self._attend(following, AT_ONCE[following.lane], failure, early=transaction.slow_to_deliver)
-        transaction.completed(reply, timing)
+            # the next reply should come in about the time that this one took
+            waits = slow and following.lane is POLL and now_s + now_s - sent_at_s < self._deliver_by_s
+            self._attend(following, AT_ONCE[following.lane], failure, early=slow and not waits)
+        if not waits:
+            self.deliver()
         if self._missing and transaction.lane is POLL and (following := self._transaction):
             # callers that wait for a reply got it first
             byte_s = self.wire.byte_s
@@ -286,9 +309,11 @@ class Line(Receiver):
         if isinstance(transaction, Probe):
             self._probed(transaction, reply, timing, now_s)
             return
-        self._users.answered(transaction)
         self._release(transaction, transaction.then_baud)
         self._next(AT_ONCE)
+        self._users.answered(transaction, timing)
+        if self.undelivered:
+            self.deliver()
         transaction.completed(reply, timing)
 
     def _release(self, transaction: Transaction, then_baud: int | None = None) -> None:
@@ -300,6 +325,7 @@ class Line(Receiver):
     def _rejected(self, transaction: Transaction) -> None:
         """The node did not execute our packet: the line is in step, and sending again is always safe."""
         self._statistics.rejected_packets += 1
+        self.deliver()
         self._users.answered(transaction)
         if transaction.rejected():
             self._send_again(transaction)
@@ -314,6 +340,7 @@ class Line(Receiver):
 
     def _lose(self, transaction: Transaction, error: BusError, now_s: float) -> None:
         """Settle the transaction whose reply cannot be valid any more, and resynchronise the line."""
+        self.deliver()
         self._users.missed(transaction, now_s)
         if not isinstance(transaction, Probe):
             self._quarantine.require()

@@ -43,7 +43,8 @@ class Poller(ABC, Generic[ReplyT]):
         deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
         priority: its rank while the line cannot carry all polls; does not change while it waits for a slot.
         rates_hz: rate at which it reads each telemetry item; empty for one that reads none.
-        slow_to_deliver: processing a reply takes long, so the next request is sent first; see `Line`.
+        slow_to_deliver: processing a reply takes long, so the next request is sent first, and several may be processed
+            together; see `Line`.
     """
 
     node: int

@@ -35,6 +35,8 @@ class BusSettings:
         bits_per_byte: 10 for 8N1 and for 7E1.
         margin_s: added to every reply's deadline: host scheduling and adapter latency.
         attempts: how often a repeatable command is sent in all.
+        coalesce_s: how long the reply to a poll may wait to be processed together with those after it, while the line
+            is busy with polls; 0 to process each at once.
         echo: the adapter returns our own bytes before the reply.
         paced: bytes take real time on this line, so that bytes that come too early are foreign; false only for
             far ends that answer faster than the baud rate allows.
@@ -48,6 +50,7 @@ class BusSettings:
     bits_per_byte: int = 10
     margin_s: float = 0.005
     attempts: int = 3
+    coalesce_s: float = 0.0
     echo: bool = False
     paced: bool = True
     cycle: ServoCycle | None = None

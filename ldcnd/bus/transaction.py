@@ -56,7 +56,7 @@ class Transaction(ABC):
         wanted_at_s: when it was queued or due, in loop time.
         then_baud: the rate to use from the end of this exchange on; None for the present one.
         at_baud: the rate of this exchange alone; None for the line's.
-        slow_to_deliver: processing the reply takes long.
+        slow_to_deliver: processing the reply takes long, and can wait for those after it.
     """
 
     __slots__ = ("at_baud", "exchange", "lane", "slow_to_deliver", "then_baud", "wanted_at_s")

@@ -25,6 +25,8 @@ FIRST_NUMBER = 0x8000
 NODES = 3
 LATENCY_S = 0.0008
 """Below the settling time of the quarantine: what an adapter keeps longer, no quarantine can keep out."""
+COALESCE_S = 0.02
+"""Long enough for all polls of a burst to wait for each other."""
 HEALED_S = 30.0
 
 
@@ -104,6 +106,7 @@ class WatchfulPoller(toy.ToyPoller):
 
     def __init__(self, node: int, due_at_s: float, reply_bytes: int) -> None:
         super().__init__(node, 0.02, due_at_s)
+        self.slow_to_deliver = True
         self.reply_bytes = reply_bytes
         self.miscredited: list[tuple[int, int]] = []
         self.removed = False
@@ -132,9 +135,10 @@ class UnrulyLine(RuleBasedStateMachine):
 
     line = BusSettings("toy", 115_200)
 
-    @initialize(bytewise=st.booleans(), holds_back=st.booleans())
-    def start(self, *, bytewise: bool, holds_back: bool) -> None:
+    @initialize(bytewise=st.booleans(), holds_back=st.booleans(), coalesces=st.booleans())
+    def start(self, *, bytewise: bool, holds_back: bool, coalesces: bool) -> None:
         self.bytewise, self.holds_back = bytewise, holds_back
+        self.settings = replace(self.line, coalesce_s=COALESCE_S if coalesces else 0.0)
         self.runner = asyncio.Runner(loop_factory=JumpingLoop)
         self.faults: deque[Fault] = deque()
         self.fault_of: dict[int, Fault] = {}  # for the first reply to a caller; `faults` spoil the others
@@ -151,7 +155,7 @@ class UnrulyLine(RuleBasedStateMachine):
 
     async def _open(self) -> None:
         self.opener = ScriptedOpener(self._answer)
-        self.bus = Bus(self.line, self.opener)
+        self.bus = Bus(self.settings, self.opener)
         self.bus.resync = toy.RESYNC
         # the owner lives across many runs of the loop, so no group of one run can hold it
         self.owner = asyncio.get_running_loop().create_task(self.bus.run(), name="bus")
@@ -305,6 +309,7 @@ class UnrulyLine(RuleBasedStateMachine):
             for poller in self.pollers:
                 outcomes = len(poller.delivered) + len(poller.errors)
                 assert outcomes == len(poller.asked_at_s)
+                assert poller.timings == sorted(poller.timings, key=lambda timing: timing.sent_at_s)
         finally:
             self.runner.close()
 

@@ -21,9 +21,9 @@ BYTE_S = 10 / 115_200
 class Rig:
     """A bus on a scripted line."""
 
-    def __init__(self, script: Script = toy.answer):
+    def __init__(self, script: Script = toy.answer, settings: BusSettings = SETTINGS):
         self.opener = ScriptedOpener(script)
-        self.bus = Bus(SETTINGS, self.opener)
+        self.bus = Bus(settings, self.opener)
         self.bus.resync = toy.RESYNC
 
     @property

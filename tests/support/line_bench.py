@@ -80,7 +80,7 @@ class PlainUsers:
     def failing(self) -> set[int]:
         return self.mute
 
-    def answered(self, transaction: Transaction) -> None:
+    def answered(self, transaction: Transaction, timing: Timing | None = None) -> None:
         self.story.append(f"answered {transaction.exchange.node}")
 
     def missed(self, transaction: Transaction, now_s: float) -> None:

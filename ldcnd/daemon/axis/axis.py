@@ -351,7 +351,8 @@ class AxisService:
             arrivals.reading = reading
         if reading.altered != self._altered or not reading.profile_done:  # a call less for each poll of what stands
             self._audit(reading, timing)
-        tracker.observed(reading, timing, self._clock.now_ns())
+        t, t_error_ns = self._clock.stamp(timing)
+        tracker.observed(reading, timing, t)
         if was_away and self.returned:
             self.returned()
         if was_referenced and not tracker.referenced:
@@ -364,7 +365,6 @@ class AxisService:
                 self._queue.wake()
         if self._inherited:
             self._end_what_has_no_end(reading, timing.sent_at_s)
-        t, t_error_ns = self._clock.stamp(timing)
         if arrivals.over:
             asked |= END_ITEMS
         self.telemetry.reading(reading, asked, t, t_error_ns)

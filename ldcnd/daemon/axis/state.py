@@ -334,7 +334,7 @@ class AxisTracker:
     # -- what was observed -------------------------------------------------------------------------------------------
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
-        """Digest a reading; `now_ns` stamps the faults that it brings up."""
+        """Digest a reading; `now_ns`, when it was true in UTC, stamps the faults that it brings up."""
         faults = (*reading.faults, *self._own_now()) if self._own else reading.faults
         if reading.altered and DRIVE_CHANGED not in faults:
             faults = (*faults, DRIVE_CHANGED)

@@ -30,12 +30,13 @@ class Topic:
         values: what was published last; None before.
     """
 
-    __slots__ = ("_model", "_pack", "_sample", "_send", "seq", "values")
+    __slots__ = ("_model", "_pack", "_sample", "_sampled", "_send", "seq", "values")
 
     def __init__(self, model: type[Sample], pack: Pack, send: PublishValue) -> None:
         self.seq = 0
         self.values: Values | None = None
         self._sample: Sample | None = None
+        self._sampled: Values | None = None  # what that was built from
         self._model = model
         self._pack = pack
         self._send = send
@@ -47,7 +48,7 @@ class Topic:
         """
         values["seq"] = seq = self.seq
         self.seq = seq + 1
-        self.values, self._sample = values, None
+        self.values = values
         self._send(self._pack(values), values["t"])
 
     def publish_sample(self, sample: Sample) -> None:
@@ -62,7 +63,7 @@ class Topic:
 
     def forget(self) -> bool:
         """Keep no last sample any more; return whether there was one."""
-        had, self.values, self._sample = self.values is not None, None, None
+        had, self.values = self.values is not None, None
         return had
 
     @property
@@ -73,8 +74,10 @@ class Topic:
     @property
     def sample(self) -> Sample | None:
         """The last sample; built on first use."""
-        if self._sample is None and self.values is not None:
-            self._sample = self._model.model_construct(set(self.values), **self.values)
+        values = self.values
+        if values is not self._sampled:
+            self._sample = None if values is None else self._model.model_construct(set(values), **values)
+            self._sampled = values
         return self._sample
 
 

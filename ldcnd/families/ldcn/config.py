@@ -91,6 +91,9 @@ class LdcnBusConfig(BusConfig):
 None where polls would miss their turns for it."""
     order: Literal["deadline", "phase"] = "phase"
     """Between polls that are equally urgent: who is due longest, or whose servo cycle ends first, so that more fit."""
+    coalesce_ms: float = Field(default=5.0, ge=0, le=50)
+    """How long a reading may wait, while the line is busy with polls, to be processed with those after it: several at \
+a time take less processor time. 0 for one at a time."""
     start: StartPolicy = StartPolicy.RESET
     """Whether the drives are reset at start, or taken over as they are; a line that was lost is always taken over."""
     adopt_fallback: AdoptFallback = AdoptFallback.REFUSE

@@ -176,7 +176,7 @@ def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None, chain:
     if opener is None and chain is not None:
         opener = _simulated(chain, baud)
     bus = Bus(
-        bus_settings(settings, baud, cycle=servo_cycle(settings)),
+        bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),
         opener or port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.transmitter),
     )
     return Line(bus, LdcnNetwork(bus, tuple(axis.spec() for axis in settings.axis), settings.baud, settings.spec()))
