@@ -294,6 +294,8 @@ MOST_MODULES = 32
 ADDRESSING_ATTEMPTS = 3
 END_ATTEMPTS = 2
 """The chain is expected to end here: each attempt to find one more module costs a time-out."""
+BURST_S = 0.02
+"""Pause between two copies of what must not be lost: longer than a burst of interference, 15 ms (IEC 61000-4-4)."""
 DRAIN_S = 0.005
 """Silence after which no reply can come to a half-received packet that nulls have filled up."""
 
@@ -327,16 +329,18 @@ class Addressing:
                 await self.without_leaders()
                 await self.rate.everybody_to(self.rate.at_reset)
         for baud in self.rate.candidates:
-            await self._reset_at(baud, commands.RESET_SETTLE_S if baud == self.rate.at_reset else NULLS_SETTLE_S)
+            if baud != self.rate.at_reset:
+                await self._reset_at(baud, NULLS_SETTLE_S, NULLS_SETTLE_S)
+        await self._reset_at(self.rate.at_reset, BURST_S, commands.RESET_SETTLE_S)
         await self._bus.execute(nulls(DRAIN_S))
 
-    async def _reset_at(self, baud: int, restart_s: float) -> None:
+    async def _reset_at(self, baud: int, *pauses_s: float) -> None:
         if not await self.rate.host_to(baud):
             return
         packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
-        burst = self.rate.spaced(packets)
-        for settle_s in (NULLS_SETTLE_S, restart_s):
-            await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
+        packet = self.rate.spaced(packets)
+        for pause_s in pauses_s:
+            await self._bus.execute(unanswered(EVERYBODY, packet, pause_s, repeatable=False))
 
     async def address_all(self, expected: int) -> dict[int, Identity]:
         """Give the modules addresses 1, 2, ... in the order of the chain; return who is where.
