@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ldcnd.cli.connection import DEFAULT_ENDPOINT
-from ldcnd.cli.typed import address_option
+from ldcnd.cli.served_at import CONSOLE_ADDRESS, address_option
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
@@ -18,7 +18,6 @@ from ldcnd.messaging.zenoh_settings import ZenohSettings
 if TYPE_CHECKING:
     from ldcnd.console.server import MoreRoutes
 
-DEFAULT_ADDRESS = "127.0.0.1:8470"
 FILE = click.Path(path_type=Path, dir_okay=False)
 
 
@@ -28,7 +27,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option("--config", type=FILE, help="Zenoh configuration file to start from, for each endpoint.")
 @click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
-@address_option("--listen", DEFAULT_ADDRESS)
+@address_option("--listen", CONSOLE_ADDRESS)
 @click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
 @click.option("--certificate", type=FILE, help="PEM file: serve HTTPS with this certificate.")
 @click.option("--key", type=FILE, help="PEM file with its key.")

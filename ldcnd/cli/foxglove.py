@@ -6,7 +6,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
-from ldcnd.cli.typed import address_option
+from ldcnd.cli.served_at import address_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli.console import DEFAULT_ADDRESS
 from ldcnd.cli.ending import Terminal
-from ldcnd.cli.first_steps import show_first_steps
-from ldcnd.cli.typed import parsed_address
+from ldcnd.cli.served_at import CONSOLE_ADDRESS, parsed_address
 from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.daemon.process.assembly import open_daemon
 from ldcnd.daemon.process.daemon import Daemon
@@ -34,10 +32,10 @@ log = get_logger("run")
 @click.option(
     "--console",
     is_flag=False,
-    flag_value=DEFAULT_ADDRESS,
+    flag_value=CONSOLE_ADDRESS,
     metavar="[HOST:PORT]",
     callback=parsed_address,
-    help=f"Serve the console beside it, at {DEFAULT_ADDRESS} unless said otherwise, and say what to type next.",
+    help=f"Serve the console beside it, at {CONSOLE_ADDRESS} unless said otherwise, and say what to type next.",
 )
 @click.option("--log-json", is_flag=True, help="Log JSON lines instead of text.")
 @click.option(
@@ -104,6 +102,8 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig], console: ListenAd
                 async with asyncio.TaskGroup() as group:
                     beside = [group.create_task(senders_wait(), name="senders wait")]
                     if console:
+                        from ldcnd.cli.first_steps import show_first_steps  # noqa: PLC0415 - for a newcomer only
+
                         beside.append(group.create_task(show_first_steps(daemon, rig, console), name="console"))
                     try:
                         await service.run()

@@ -1,15 +1,13 @@
-"""Typed input: names with the nearest right one, finite numbers, addresses to serve at."""
+"""Typed input: names with the nearest right one, finite numbers."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from difflib import get_close_matches
-from typing import TypeVar
 
 import click
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError, UnknownAxis
-from ldcnd.listen_address import ListenAddress, parse_listen_address
+from ldcnd.errors import UnknownAxis
 from ldcnd.model.meta import AxisInfo
 
 NEAR = 0.4
@@ -54,28 +52,3 @@ class Finite(click.FloatRange):
     def _describe_range(self) -> str:
         """Return its limits for help; nothing without limits."""
         return "" if self.min is None and self.max is None else super()._describe_range()
-
-
-CommandT = TypeVar("CommandT", bound=Callable[..., object])
-
-
-def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
-    """Return an option of that name, whose value is a `ListenAddress`; anything but HOST:PORT is wrong usage."""
-    return click.option(
-        name,
-        callback=parsed_address,
-        default=default,
-        show_default=True,
-        metavar="HOST:PORT",
-        help="Where to serve; port 0 is any.",
-    )
-
-
-def parsed_address(_context: click.Context, _parameter: click.Parameter, value: str | None) -> ListenAddress | None:
-    """Return what is written as HOST:PORT; None for nothing."""
-    if value is None:
-        return None
-    try:
-        return parse_listen_address(value)
-    except ConfigError as error:
-        raise click.BadParameter(error.message) from error

@@ -37,7 +37,7 @@ class RecorderConfig(Frozen):
     seconds: float = Field(default=300.0, ge=1, le=86_400)
     """How far back it reaches."""
     memory_mb: int = Field(default=16, ge=1, le=4096)
-    """The oldest packets go sooner when all take more; 16 MB are about 35000 exchanges."""
+    """The oldest packets go sooner when all take more; 16 MB are about 200000 exchanges."""
 
 
 class Rs485Config(Frozen):

@@ -25,7 +25,7 @@ from ldcnd.families.known import FAMILIES
 from ldcnd.log import get_logger
 from ldcnd.version import version
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
-from ldcnd.wirelog.recorder import WireEntry, WireRecord
+from ldcnd.wirelog.recorder import WireEntries, WireRecord
 
 log = get_logger("captures")
 
@@ -119,11 +119,11 @@ class Snapshot:
     zero_ns: int
     until_s: float
     added: int
-    entries: tuple[WireEntry, ...]
+    entries: WireEntries
 
 
 def snapshot_of(line: BusService, clock: Clock) -> Snapshot:
-    """Take what a line's flight recorder holds: about a millisecond for a full one."""
+    """Take what a line's flight recorder holds: less than a millisecond for a full one."""
     log = line.bus.wire_log
     return Snapshot(
         bus=line.bus.settings.name,

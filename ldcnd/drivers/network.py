@@ -78,6 +78,7 @@ class LineSpec:
         alternate_divisors: use the other family of baud rate divisors.
         clock_hz: of the modules.
         snapshot: positions may be frozen at one instant, which overwrites the drives' home registers.
+        proves_places: find out at a reset which drives stand where they were powered on, see `BringUpReport.placed`.
         modules: what is on the line besides the axes.
         groups: at most one for each axis.
     """
@@ -87,6 +88,7 @@ class LineSpec:
     alternate_divisors: bool = False
     clock_hz: int = 20_000_000
     snapshot: bool = False
+    proves_places: bool = False
     modules: tuple[ModuleEntry, ...] = ()
     groups: tuple[GroupSpec, ...] = ()
 
@@ -125,7 +127,8 @@ class BringUpReport:
         identities: what was found, by axis name.
         reset: the drives were reset, so their positions count from 0.
         remarks: what differs from the configuration or deserves attention.
-        placed: axes whose drives were powered on where they stood at that reset, so that 0 is that place.
+        placed: axes whose drives were powered on where they stood at that reset, so that 0 is that place;
+            empty unless the line proves places.
         open_loops: axes whose drives an earlier host has left with an open loop: nothing in them would end a raw duty.
         restarted: axes whose drives had lost power, on a line that was not reset.
     """

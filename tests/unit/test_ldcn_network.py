@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from dataclasses import replace
 
 import pytest
 
@@ -399,3 +400,67 @@ async def test_on_a_port_with_one_rate_newcomers_are_looked_for_only_at_the_rate
 
         assert found == ({"a2"} if hears else set())
         assert bool(line.sent(seen)) is hears
+
+
+FOUR = specs(*["ls-182ap"] * 4)
+
+
+async def seconds_to_bring_up(chain, spec=None):
+    loop = asyncio.get_running_loop()
+    async with bare_network(chain, FOUR, line=spec) as line:
+        began_s = loop.time()
+        report = await line.network.bring_up()
+        return loop.time() - began_s, report, line
+
+
+async def test_drives_that_were_powered_on_are_up_in_a_third_of_a_second():
+    took_s, report, line = await seconds_to_bring_up(chain_of(*["ls182ap"] * 4))
+
+    assert took_s < 0.33
+    assert report.reset
+    assert line.bus.statistics.timeouts == 2  # whether one more module waits behind the last one, asked twice
+
+
+async def test_where_drives_stand_is_asked_only_for_axes_that_use_it():
+    took_s, report, _ = await seconds_to_bring_up(chain_of(*["ls182ap"] * 4))
+    proven_s, proven, _ = await seconds_to_bring_up(chain_of(*["ls182ap"] * 4), LineSpec(proves_places=True))
+
+    assert report.placed == frozenset()
+    assert proven.placed == {"a1", "a2", "a3", "a4"}
+    assert 0.08 < proven_s - took_s < 0.13
+
+
+@pytest.mark.parametrize("restart_s", [0.02, 0.099, 0.25])
+async def test_drives_that_take_long_to_restart_are_addressed_when_they_have(restart_s):
+    chain = build_chain(ChainSpec(tuple(ModuleSpec("ls182ap") for _ in FOUR)))
+    for module in chain.modules:
+        module.settings = replace(module.settings, reset_dead_s=restart_s)
+
+    took_s, report, line = await seconds_to_bring_up(chain)
+
+    assert len(report.identities) == 4
+    assert (line.bus.statistics.timeouts == 2) is (restart_s <= 0.1)
+    assert took_s < 0.33 + max(0.0, restart_s - 0.1) + 0.05
+
+
+class MumblesOnce(SimulatedDrive):
+    """A drive whose first reply while it waits for an address is lost."""
+
+    _mumbled = False
+
+    def _obey(self, packet, at_s):
+        reply = super()._obey(packet, at_s)
+        if packet.command is Command.READ_STATUS and self.address == 0 and not self._mumbled:
+            self._mumbled = True
+            return None
+        return reply
+
+
+async def test_one_lost_reply_does_not_hide_a_module_behind_the_configured_ones():
+    drives = [SimulatedDrive(LS_182AP, ModuleSettings(20), MotorPlant()) for _ in FOUR]
+    chain = Chain([*drives, MumblesOnce(PIC_SERVO_V4, ModuleSettings(4), MotorPlant())])
+
+    _, report, line = await seconds_to_bring_up(chain)
+
+    assert len(line.network.modules) == 5
+    assert any("address 5" in remark for remark in report.remarks)

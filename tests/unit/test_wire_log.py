@@ -1,9 +1,11 @@
+import tracemalloc
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ldcnd.errors import MalformedRequest
-from ldcnd.wirelog.recorder import RECORD_BYTES, WireEvent, WireLog, WireRecord, parse_record, parse_records
+from ldcnd.wirelog.recorder import BLOCK, RECORD_BYTES, WireEvent, WireLog, WireRecord, parse_record, parse_records
 
 
 def test_records_come_oldest_first():
@@ -91,3 +93,59 @@ def test_what_is_no_record_is_refused_with_the_line(line):
         parse_record(line)
 
     assert repr(line) in refused.value.message
+
+
+@given(
+    steps=st.lists(st.tuples(st.floats(0.0, 0.05), st.binary(max_size=4), st.sampled_from(["", "poll"])), max_size=600),
+    kept_s=st.sampled_from([0.5, 3.0, 1e6]),
+)
+def test_packed_records_are_those_that_were_added(steps, kept_s):
+    log, added, at_s = WireLog(kept_s=kept_s), [], 0.0
+
+    for after_s, data, note in steps:
+        at_s += after_s
+        log.add(at_s, WireEvent.RECEIVED, data, note)
+        added.append(WireRecord(at_s, WireEvent.RECEIVED, data, note))
+    kept = [record for record in added if record.at_s >= at_s - kept_s]
+
+    assert log.records() == kept
+    assert len(log.entries()) == len(kept)
+    assert log.added == len(added)
+
+
+def test_what_was_taken_from_a_log_stays_as_it_was():
+    log = WireLog(kept_s=2.0)
+    log.add(0.0, WireEvent.SENT, b"\x01")
+    taken = log.entries()
+
+    for number in range(3 * BLOCK):
+        log.add(float(number), WireEvent.SENT)
+
+    assert list(taken) == [(0.0, WireEvent.SENT, b"\x01", "")]
+    assert (0.0, WireEvent.SENT, b"\x01", "") in taken
+
+
+def test_packed_records_are_dropped_when_they_take_too_much_memory():
+    log = WireLog(kept_s=1e6, kept_bytes=4 * BLOCK * RECORD_BYTES)
+
+    for number in range(20 * BLOCK):
+        log.add(float(number), WireEvent.SENT)
+
+    assert 3 * BLOCK <= len(log.records()) <= 4 * BLOCK
+    assert log.records()[-1].at_s == 20 * BLOCK - 1
+    assert log.added == 20 * BLOCK
+
+
+def test_a_record_takes_as_much_memory_as_is_said():
+    log = WireLog()
+    requests = [bytes([0xAA, address, 0x13, 0x4D, 0x60 + address]) for address in range(4)]
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        for number in range(40 * BLOCK):
+            log.add(number / 100, WireEvent.SENT, requests[number % 4], " at once")
+        taken = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+
+    assert 0.75 < taken / (40 * BLOCK * (RECORD_BYTES + 5)) <= 1.0

@@ -293,9 +293,11 @@ class LineRate:
 MOST_MODULES = 32
 ADDRESSING_ATTEMPTS = 3
 END_ATTEMPTS = 2
-"""The chain is expected to end here: each attempt to find one more module costs two time-outs."""
-DRAIN_S = 0.05
-"""Silence after which no reply to earlier traffic can come any more."""
+"""The chain is expected to end here: each attempt to find one more module costs a time-out."""
+BURST_S = 0.02
+"""Pause between two copies of what must not be lost: longer than a burst of interference, 15 ms (IEC 61000-4-4)."""
+DRAIN_S = 0.005
+"""Silence after which no reply can come to a half-received packet that nulls have filled up."""
 
 
 class Addressing:
@@ -315,8 +317,8 @@ class Addressing:
     async def reset_all(self) -> None:
         """Hard Reset at every rate the drives may be at, twice each, ending at the rate they restart with.
 
-        Time to restart is given at that last rate only: a module that obeyed at another one restarts meanwhile, and
-        receives nothing that it would have to obey.
+        Time to restart is given after the last reset only: a module that obeyed an earlier one restarts meanwhile, and
+        receives nothing that it would have to obey. The line is silent then for longer than any late reply takes.
 
         A module that is reset makes the next one deaf, so one that is left at a rate of its own would split the chain:
         all are called to one rate first, which leaves their address outputs as they are. PIC-SERVO version 4 obeys only
@@ -327,16 +329,18 @@ class Addressing:
                 await self.without_leaders()
                 await self.rate.everybody_to(self.rate.at_reset)
         for baud in self.rate.candidates:
-            await self._reset_at(baud, commands.RESET_SETTLE_S if baud == self.rate.at_reset else NULLS_SETTLE_S)
+            if baud != self.rate.at_reset:
+                await self._reset_at(baud, NULLS_SETTLE_S, NULLS_SETTLE_S)
+        await self._reset_at(self.rate.at_reset, BURST_S, commands.RESET_SETTLE_S)
         await self._bus.execute(nulls(DRAIN_S))
 
-    async def _reset_at(self, baud: int, settle_s: float) -> None:
+    async def _reset_at(self, baud: int, *pauses_s: float) -> None:
         if not await self.rate.host_to(baud):
             return
         packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
-        burst = self.rate.spaced(packets)
-        for _ in range(2):
-            await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
+        packet = self.rate.spaced(packets)
+        for pause_s in pauses_s:
+            await self._bus.execute(unanswered(EVERYBODY, packet, pause_s, repeatable=False))
 
     async def address_all(self, expected: int) -> dict[int, Identity]:
         """Give the modules addresses 1, 2, ... in the order of the chain; return who is where.
@@ -377,10 +381,13 @@ class Addressing:
         return False
 
     async def _address_unexpected(self, address: int) -> bool:
-        """Address an unsupported module; return whether there was one."""
+        """Address an unsupported module; return whether there was one.
+
+        Whether one waits for an address is read first: a lost reply to that leaves nothing open.
+        """
         for _ in range(END_ATTEMPTS):
-            if await self._set_address(UNADDRESSED, address) or await self.rate.who_is(address):
-                return True
+            if await self.rate.who_is(UNADDRESSED.address):
+                return await self.address_next(address)
         return False
 
     async def regroup(self, address: int) -> bool:

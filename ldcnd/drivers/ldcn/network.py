@@ -260,7 +260,8 @@ class LdcnNetwork(Network):
                 remedy=f'set the far end to {self._rate.at_reset} baud, or use start = "adopt"',
             )
         heard = self._bus.statistics.bytes_in
-        places_known = not (self._was_up or self._disturbed) and await self._all_wait()
+        first = not (self._was_up or self._disturbed)
+        places_known = self._line.proves_places and first and await self._all_wait()
         try:
             if self._disturbed:
                 await self._addressing.reset_all()

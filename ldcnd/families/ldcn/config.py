@@ -166,6 +166,7 @@ a time take less processor time. 0 for one at a time."""
             alternate_divisors=self.divisors == "alternate",
             clock_hz=self.clock_hz,
             snapshot=self.snapshot,
+            proves_places=any(axis.reference == "at_reset" for axis in self.axis),
             modules=tuple(
                 ModuleEntry(
                     module.address, module.model, module.identity, module.name or "", module.outputs, module.rate
