@@ -294,8 +294,6 @@ MOST_MODULES = 32
 ADDRESSING_ATTEMPTS = 3
 END_ATTEMPTS = 2
 """The chain is expected to end here: each attempt to find one more module costs a time-out."""
-BURST_S = 0.02
-"""Pause between two copies of what must not be lost: longer than a burst of interference, 15 ms (IEC 61000-4-4)."""
 DRAIN_S = 0.005
 """Silence after which no reply can come to a half-received packet that nulls have filled up."""
 
@@ -317,7 +315,7 @@ class Addressing:
     async def reset_all(self) -> None:
         """Hard Reset at every rate the drives may be at, twice each, ending at the rate they restart with.
 
-        Time to restart is given after the last reset only: a module that obeyed an earlier one restarts meanwhile, and
+        Time to restart is given at that last rate only: a module that obeyed at another one restarts meanwhile, and
         receives nothing that it would have to obey. The line is silent then for longer than any late reply takes.
 
         A module that is reset makes the next one deaf, so one that is left at a rate of its own would split the chain:
@@ -329,18 +327,16 @@ class Addressing:
                 await self.without_leaders()
                 await self.rate.everybody_to(self.rate.at_reset)
         for baud in self.rate.candidates:
-            if baud != self.rate.at_reset:
-                await self._reset_at(baud, NULLS_SETTLE_S, NULLS_SETTLE_S)
-        await self._reset_at(self.rate.at_reset, BURST_S, commands.RESET_SETTLE_S)
+            await self._reset_at(baud, commands.RESET_SETTLE_S if baud == self.rate.at_reset else NULLS_SETTLE_S)
         await self._bus.execute(nulls(DRAIN_S))
 
-    async def _reset_at(self, baud: int, *pauses_s: float) -> None:
+    async def _reset_at(self, baud: int, settle_s: float) -> None:
         if not await self.rate.host_to(baud):
             return
         packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
-        packet = self.rate.spaced(packets)
-        for pause_s in pauses_s:
-            await self._bus.execute(unanswered(EVERYBODY, packet, pause_s, repeatable=False))
+        burst = self.rate.spaced(packets)
+        for _ in range(2):
+            await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
 
     async def address_all(self, expected: int) -> dict[int, Identity]:
         """Give the modules addresses 1, 2, ... in the order of the chain; return who is where.
