@@ -6,11 +6,13 @@ text instead of bytes. A line that is empty or starts with a number sign is a co
 """
 
 from array import array
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import accumulate, chain, islice, takewhile
+from itertools import accumulate, islice
+from operator import itemgetter
 
 from ldcnd.errors import MalformedRequest
 
@@ -143,7 +145,7 @@ class WireEntries(Collection[WireEntry]):
         else:
             too_old_s = self._blocks[-1].times_s[-1] - kept_s if self._blocks else 0.0
         self._left_out = 0
-        self._left_out = sum(1 for _ in takewhile(lambda entry: entry[0] < too_old_s, self))
+        self._left_out = self.first_since(too_old_s)
 
     def __len__(self) -> int:
         """Return how many they are."""
@@ -151,7 +153,25 @@ class WireEntries(Collection[WireEntry]):
 
     def __iter__(self) -> Iterator[WireEntry]:
         """Yield the fields of each."""
-        return islice(chain(chain.from_iterable(self._blocks), self._latest), self._left_out, None)
+        return self.behind(0)
+
+    def first_since(self, at_s: float) -> int:
+        """Return how many are older than an instant; takes as long as there are blocks, not records."""
+        older = -self._left_out
+        for block in self._blocks:
+            if block.times_s[-1] >= at_s:
+                return max(0, older + bisect_left(block.times_s, at_s))
+            older += len(block)
+        return max(0, older + bisect_left(self._latest, at_s, key=itemgetter(0)))
+
+    def behind(self, skipped: int) -> Iterator[WireEntry]:
+        """Yield the fields of those behind so many, which are not unpacked."""
+        skipped += self._left_out
+        for block in self._blocks:
+            if skipped < len(block):
+                yield from islice(block, skipped, None)
+            skipped = max(0, skipped - len(block))
+        yield from islice(self._latest, skipped, None)
 
     def __contains__(self, entry: object) -> bool:
         """Tell whether a record is among them."""

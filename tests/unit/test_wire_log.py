@@ -5,7 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ldcnd.errors import MalformedRequest
-from ldcnd.wirelog.recorder import BLOCK, RECORD_BYTES, WireEvent, WireLog, WireRecord, parse_record, parse_records
+from ldcnd.wirelog.recorder import (
+    BLOCK,
+    RECORD_BYTES,
+    WireEvent,
+    WireLog,
+    WireRecord,
+    _Block,
+    parse_record,
+    parse_records,
+)
 
 
 def test_records_come_oldest_first():
@@ -98,8 +107,10 @@ def test_what_is_no_record_is_refused_with_the_line(line):
 @given(
     steps=st.lists(st.tuples(st.floats(0.0, 0.05), st.binary(max_size=4), st.sampled_from(["", "poll"])), max_size=600),
     kept_s=st.sampled_from([0.5, 3.0, 1e6]),
+    since_s=st.floats(0.0, 12.0),
+    skipped=st.integers(0, 600),
 )
-def test_packed_records_are_those_that_were_added(steps, kept_s):
+def test_packed_records_are_those_that_were_added(steps, kept_s, since_s, skipped):
     log, added, at_s = WireLog(kept_s=kept_s), [], 0.0
 
     for after_s, data, note in steps:
@@ -108,9 +119,28 @@ def test_packed_records_are_those_that_were_added(steps, kept_s):
         added.append(WireRecord(at_s, WireEvent.RECEIVED, data, note))
     kept = [record for record in added if record.at_s >= at_s - kept_s]
 
+    entries = log.entries()
     assert log.records() == kept
-    assert len(log.entries()) == len(kept)
+    assert len(entries) == len(kept)
     assert log.added == len(added)
+    assert entries.first_since(since_s) == len([record for record in kept if record.at_s < since_s])
+    assert [WireRecord(*entry) for entry in entries.behind(skipped)] == kept[skipped:]
+
+
+def test_a_page_of_a_long_log_is_found_without_unpacking_what_is_before_it(monkeypatch):
+    log = WireLog(kept_s=1e6)
+    for number in range(100 * BLOCK):
+        log.add(float(number), WireEvent.SENT, b"\x01")
+    unpacked = []
+    monkeypatch.setattr(_Block, "__iter__", lambda block: (unpacked.append(block), iter([(block.times_s[0],)]))[1])
+
+    entries = log.entries()
+    skipped = entries.first_since(50.5 * BLOCK)
+
+    assert skipped == 50.5 * BLOCK
+    assert not unpacked
+    assert next(entries.behind(51 * BLOCK)) == (51.0 * BLOCK,)
+    assert len(unpacked) == 1
 
 
 def test_what_was_taken_from_a_log_stays_as_it_was():

@@ -480,14 +480,13 @@ def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:
     """
     service = rig.lines[request.bus]
     log = service.bus.wire_log
-    records = log.records()
-    oldest = log.added - len(records)
+    entries = log.entries()
+    oldest = log.added - len(entries)
     if request.from_record is None:
-        since_s = clock.now_s() - request.seconds
-        skipped = next((at for at, record in enumerate(records) if record.at_s >= since_s), len(records))
+        skipped = entries.first_since(clock.now_s() - request.seconds)
     else:
-        skipped = min(max(0, request.from_record - oldest), len(records))
-    page = _page(records[skipped:])
+        skipped = min(max(0, request.from_record - oldest), len(entries))
+    page = _page(WireRecord(*entry) for entry in entries.behind(skipped))
     return WireLogReply(
         bus=request.bus,
         family=service.family,
