@@ -87,7 +87,8 @@ class Ledger:
             CommandIdReused: the id belongs to another command, or to one whose answer was evicted.
         """
         entry = self._entries.get(command_id)
-        if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
+        is_senders = entry is None and command.command_id is not None  # what the daemon has chosen is new
+        if is_senders and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
             raise CommandIdReused(
                 f"command id {command_id!r} was taken before, its answer is not kept; it is not carried out again",
                 axis=axis,
