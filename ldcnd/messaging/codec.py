@@ -203,10 +203,13 @@ _SUSPICIOUS = re.compile(
 )
 
 
+_BACKSLASH, _DELETE = b"\\\x7f"
+
+
 def _is_suspicious(text: bytes) -> bool:
     """Tell whether JSON may have texts with unprintable characters."""
-    if text.isascii() and b"\\" not in text and b"\x7f" not in text:
-        return False  # nearly every one, in a fifth of the time of the search
+    if text.isascii() and _BACKSLASH not in text and _DELETE not in text:
+        return False  # nearly every one, in a tenth of the time of the search
     return _SUSPICIOUS.search(text) is not None
 
 
