@@ -31,7 +31,7 @@ SECONDS = 8.0
 ROUND_S = 0.02
 SETTLED_S = 1.5
 RECORDING = """
-import asyncio, sys, threading, time
+import asyncio, gc, sys, threading, time
 from pathlib import Path
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
@@ -39,6 +39,7 @@ from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder
 
 async def main():
+    gc.freeze()  # as the command line does
     loop = asyncio.get_running_loop()
     with Recorder(Path(sys.argv[2]), {}, time.time_ns, 10**9) as recorder:
 
