@@ -74,7 +74,7 @@ def rows() -> list[Row]:
 
 def _rig(port: Path) -> RigConfig:
     """Return a rig with one axis that is hardly polled: waiting for another exchange is not what is measured."""
-    rates = {"position": 0.0, "velocity": 0.0, "adc": 0.0, "state": 1.0}
+    rates = {"position": 0.0, "velocity": 0.0, "adc": 0.0, "state": 0.2}
     axis = {"name": "x", "address": 1, "model": "ls-182ap", "velocity": 1.0, "acceleration": 1.0, "rates": rates}
     bus = {"name": "line0", "port": str(port), "baud": 115_200, "stop_probe_hz": 0.0, "axis": [axis]}
     return RigConfig.model_validate({"rig": "bench", "bus": [bus]})

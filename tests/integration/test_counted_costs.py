@@ -35,10 +35,10 @@ class Bound:
 
 POLL = Bound(calls=60, turns=3.4, bytecodes=2490)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
-COMMAND = Bound(calls=1250, turns=76.5)
+COMMAND = Bound(calls=1230, turns=76.2)
 """A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;
 permission is asked again as the turn of each packet comes."""
-STOP = Bound(calls=233, turns=10.5)
+STOP = Bound(calls=223, turns=10.5)
 SAMPLE = Bound(calls=13.1, turns=2.0)
 """From what a session delivers to what a program's loop over samples has in its hands."""
 
