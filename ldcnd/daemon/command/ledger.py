@@ -87,8 +87,7 @@ class Ledger:
             CommandIdReused: the id belongs to another command, or to one whose answer was evicted.
         """
         entry = self._entries.get(command_id)
-        is_senders = entry is None and command.command_id is not None  # what the daemon has chosen is new
-        if is_senders and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
+        if entry is None and self._is_remembered(command_id):
             raise CommandIdReused(
                 f"command id {command_id!r} was taken before, its answer is not kept; it is not carried out again",
                 axis=axis,
@@ -176,6 +175,12 @@ class Ledger:
         )
         if news:
             self._changed(entry, error)
+
+    def _is_remembered(self, command_id: str) -> bool:
+        """Tell whether a sender has chosen this id within `REPLAYED_WITHIN_S`."""
+        if not self._until_s:
+            return False  # no sender chooses ids: a command need not wait for a fingerprint
+        return self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
 
     def _remember(self, entry: Entry) -> None:
         command = entry.command
