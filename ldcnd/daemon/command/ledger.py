@@ -87,7 +87,7 @@ class Ledger:
             CommandIdReused: the id belongs to another command, or to one whose answer was evicted.
         """
         entry = self._entries.get(command_id)
-        if entry is None and self._is_remembered(command_id):
+        if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
             raise CommandIdReused(
                 f"command id {command_id!r} was taken before, its answer is not kept; it is not carried out again",
                 axis=axis,
@@ -175,12 +175,6 @@ class Ledger:
         )
         if news:
             self._changed(entry, error)
-
-    def _is_remembered(self, command_id: str) -> bool:
-        """Tell whether a sender has chosen this id within `REPLAYED_WITHIN_S`."""
-        if not self._until_s:
-            return False  # no sender chooses ids: a command need not wait for a fingerprint
-        return self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
 
     def _remember(self, entry: Entry) -> None:
         command = entry.command
