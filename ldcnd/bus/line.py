@@ -287,7 +287,8 @@ class Line(Receiver):
         undelivered, waits = self.undelivered, False
         if not undelivered:
             self._deliver_by_s = now_s + self._coalesce_s
-        undelivered.append((transaction, reply, timing))
+        if joins := slow or bool(undelivered):
+            undelivered.append((transaction, reply, timing))
         if following is None:
             self._next(AT_ONCE)
         elif following.at_baud:
@@ -296,7 +297,9 @@ class Line(Receiver):
             # the next reply should come in about the time that this one took
             waits = slow and following.lane is POLL and now_s + now_s - sent_at_s < self._deliver_by_s
             self._attend(following, AT_ONCE[following.lane], failure, early=slow and not waits)
-        if not waits:
+        if not joins:
+            transaction.completed(reply, timing)
+        elif not waits:
             self.deliver()
         if self._missing and transaction.lane is POLL and (following := self._transaction):
             # callers that wait for a reply got it first

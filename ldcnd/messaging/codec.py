@@ -85,7 +85,7 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
         request = model.model_validate_json(text, strict=True)
     except pydantic.ValidationError as error:
         raise explained(error, model) from None
-    if _SUSPICIOUS.search(text):
+    if _is_suspicious(text):
         _refuse_unprintable(request)
     return request
 
@@ -107,7 +107,7 @@ def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> Model
     """
     text = as_json(payload, encoding, MAX_RECEIVED_BYTES)
     try:
-        if _SUSPICIOUS.search(text):
+        if _is_suspicious(text):
             text = _with_escapes(text)
         return model.model_validate_json(text, strict=True, extra="ignore")
     except pydantic.ValidationError as error:
@@ -121,7 +121,7 @@ def read_received(payload: bytes, encoding: str) -> tuple[object, bytes]:
         PayloadTooLarge: the payload is too long.
         MalformedRequest: it cannot be read.
     """
-    if _encoding_of(payload, encoding) is Encoding.MSGPACK and 0 < len(payload) <= MAX_RECEIVED_BYTES:
+    if (_named(encoding) or _detected(payload)) is Encoding.MSGPACK and 0 < len(payload) <= MAX_RECEIVED_BYTES:
         value, text = _from_msgpack(payload)
     else:
         text = as_json(payload, encoding)
@@ -129,7 +129,7 @@ def read_received(payload: bytes, encoding: str) -> tuple[object, bytes]:
             value = pydantic_core.from_json(text)
         except ValueError as error:
             raise MalformedRequest(f"the payload is not valid JSON: {_short(str(error))}") from None
-    return value, _with_escapes(text) if _SUSPICIOUS.search(text) else text
+    return value, _with_escapes(text) if _is_suspicious(text) else text
 
 
 def decode_error(payload: bytes, encoding: str) -> LdcndError:
@@ -203,6 +203,16 @@ _SUSPICIOUS = re.compile(
 )
 
 
+_BACKSLASH, _DELETE = b"\\\x7f"
+
+
+def _is_suspicious(text: bytes) -> bool:
+    """Tell whether JSON may have texts with unprintable characters."""
+    if text.isascii() and _BACKSLASH not in text and _DELETE not in text:
+        return False  # nearly every one, in a tenth of the time of the search
+    return _SUSPICIOUS.search(text) is not None
+
+
 def _with_escapes(text: bytes) -> bytes:
     """Return JSON whose texts have no unprintable characters but line feeds."""
     try:
@@ -265,7 +275,8 @@ def as_json(payload: bytes, encoding: str, longest: int = MAX_RECEIVED_BYTES) ->
         )
     if not payload:
         return b"{}"
-    return _from_msgpack(payload)[1] if _encoding_of(payload, encoding) is Encoding.MSGPACK else payload
+    is_msgpack = (_named(encoding) or _detected(payload)) is Encoding.MSGPACK
+    return _from_msgpack(payload)[1] if is_msgpack else payload
 
 
 @lru_cache(maxsize=64)
@@ -276,10 +287,8 @@ def _named(encoding: str) -> Encoding | None:
         return None
 
 
-def _encoding_of(payload: bytes, encoding: str) -> Encoding:
-    """Detect the encoding from the payload when it is not named: clients often send bytes and say no more."""
-    if named := _named(encoding):
-        return named
+def _detected(payload: bytes) -> Encoding:
+    """Detect an encoding that is not named from the payload: clients often send bytes and say no more."""
     return Encoding.JSON if payload[:1] == b"{" or payload[:1] in _WHITE_SPACE else Encoding.MSGPACK
 
 

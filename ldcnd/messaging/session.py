@@ -6,9 +6,9 @@ bounded: a subscription keeps its newest samples, a queryable refuses what is to
 
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
+from typing import NamedTuple
 
 from ldcnd.messaging.hand_over import Answer, Load, OnQuery, OnRead, OnToken
 
@@ -39,9 +39,8 @@ class SampleKind(StrEnum):
     DELETE = "delete"
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """A value that was published, or the deletion of a key."""
+class Sample(NamedTuple):
+    """A value that was published, or the deletion of a key; a tuple, as recorders take 50,000 a second."""
 
     key: str
     payload: bytes

@@ -146,6 +146,8 @@ class ZenohSession(Session):
         self._reads = Reads(self._loop)
         self._declared: list[_Declared] = []
         self._outlets: dict[str, _Outlet] = {}
+        self._logins: dict[str, str | None] = {}
+        self._link_changes: object = None  # the listener, once a login was asked for
         self._stamps = Stamps(session.new_timestamp().get_id())
         self._closed = False
 
@@ -230,7 +232,7 @@ class ZenohSession(Session):
                     payload=b"" if asked.payload is None else asked.payload.to_bytes(),
                     encoding="" if asked.encoding is None else str(asked.encoding),
                     send=path.send,
-                    login=partial(self._login_of, source),
+                    login=partial(self._login_of, named),
                 )
             )
 
@@ -363,6 +365,7 @@ class ZenohSession(Session):
                 log.warning("left the network without a goodbye", reason=str(error) or "a peer takes nothing")
             finally:
                 self._declared.clear()
+                self._link_changes = None
                 await closer.stop(DRAIN_TIME_S / 10)
 
     async def _declare(
@@ -390,13 +393,26 @@ class ZenohSession(Session):
         finally:
             declared.stop()
 
-    def _login_of(self, source: zenoh.SourceInfo | None) -> str | None:
-        """Return who is at the other end of the link to the session that a query names."""
-        if source is None or self._closed:
+    def _login_of(self, source: str) -> str | None:
+        """Return who is at the other end of the link to the session that a query names.
+
+        A command waits for this, and Zenoh takes longer to list its links than the command to be decoded: what they
+        show is kept until one of them comes or goes.
+        """
+        if source in self._logins:
+            return self._logins[source]
+        if not source or self._closed:
             return None
-        zid = str(source.source_id.zid)
-        login = next((link.auth_identifier for link in self._session.info.links() if str(link.zid) == zid), None)
-        return login if login is None else printable(login)
+        if self._link_changes is None:  # before the links are listed, so that no change is missed
+            forget = Callback(self._forget_logins, indirect=False)
+            self._link_changes = self._session.info.declare_link_events_listener(forget)
+        for link in self._session.info.links():
+            login = link.auth_identifier
+            self._logins[str(link.zid)] = login if login is None else printable(login)
+        return self._logins.get(source)
+
+    def _forget_logins(self, _: zenoh.LinkEvent) -> None:
+        self._logins.clear()
 
     def _new_outlet(self, key: str, qos: Qos) -> _Outlet:
         return self._declare_outlet(key, _Outlet(qos))

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ldcnd.errors import ConfigError, LdcndError
+from ldcnd.errors import LdcndError
 from ldcnd.messaging.session import Sample, SampleKind
 from ldcnd.recording.mcap_file import Losses, McapFile
 from ldcnd.recording.messages import entry_of
@@ -26,7 +26,7 @@ class Recorder:
         path: the first file; those that follow have a number before the suffix.
         descriptions: of the rig, in JSON, attached to every file, by name.
         now_ns: the wall clock, UTC in ns since 1970.
-        rotate_bytes: size of a file at which the next one follows.
+        rotate_bytes: size of a file at which the next one follows, after at most `FLUSH_PERIOD_S`.
 
     Attributes:
         messages: how many values were recorded.
@@ -51,7 +51,7 @@ class Recorder:
         self._now_ns = now_ns
         self._rotate_bytes = rotate_bytes
         self._over = asyncio.Event()
-        self._problem: ConfigError | OSError | None = None
+        self._problem: OSError | None = None
         self._files = 0
         self._file = self._open()
 
@@ -94,6 +94,7 @@ class Recorder:
                     await self._over.wait()
             except TimeoutError:
                 self._file.flush()
+                self._rotate()
             self.too_slow = gave_way()
         if self._problem:
             raise self._problem
@@ -103,25 +104,26 @@ class Recorder:
         if sample.kind is SampleKind.DELETE or self._problem:
             return
         try:
-            self._record(sample)
-        except (ConfigError, OSError) as error:
-            self._problem = error
-            self.end()
-
-    def _record(self, sample: Sample) -> None:
-        try:
             entry = entry_of(sample)
         except LdcndError:
             self.not_understood += 1
             return
         if entry is None:
             return
+        try:
+            self._file.add(sample.key, entry, self._now_ns())
+        except OSError as error:
+            self._problem = error
+            self.end()
+            return
+        self.messages += 1
+        self.losses.saw(f"/{sample.key}", entry.seq)
+
+    def _rotate(self) -> None:
+        """Begin the next file if this one is full."""
         if self._file.size_bytes >= self._rotate_bytes:
             full, self._file = self._file, self._open()
             full.complete(self._facts())
-        self._file.add(sample.key, entry, self._now_ns())
-        self.messages += 1
-        self.losses.saw(f"/{sample.key}", entry.seq)
 
     def _open(self) -> McapFile:
         number = self._files + 1

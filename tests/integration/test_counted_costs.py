@@ -34,12 +34,12 @@ class Bound:
     bytecodes: float = 0.0
 
 
-POLL = Bound(calls=60, turns=3.45, bytecodes=2505)
+POLL = Bound(calls=60, turns=3.45, bytecodes=2510)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
-COMMAND = Bound(calls=1250, turns=77)
+COMMAND = Bound(calls=1231, turns=77)
 """A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;
 permission is asked again as the turn of each packet comes."""
-STOP = Bound(calls=233, turns=10.5)
+STOP = Bound(calls=223, turns=10.5)
 SAMPLE = Bound(calls=13.1, turns=2.0)
 """From what a session delivers to what a program's loop over samples has in its hands."""
 

@@ -319,3 +319,21 @@ async def test_a_query_that_names_no_link_of_the_daemon_has_no_login(pair: Pair)
     await served(pair.client, KEYS.command("x", "halt"))  # over a link without a certificate
 
     assert set(logins) == {None}
+
+
+async def test_what_a_link_shows_of_its_login_is_kept_until_it_goes(endpoint: str) -> None:
+    def take(query: Query) -> None:
+        assert query.login is None
+        echo(query)
+
+    async with open_zenoh_session(ZenohSettings(listen=(endpoint,))) as server:
+        await server.serve(KEYS.all_commands, take, complete=True)
+        async with open_zenoh_session(ZenohSettings(connect=(endpoint,), mode="client")) as client:
+            await served(client, KEYS.command("x", "halt"))
+
+            assert set(server._logins.values()) == {None}
+
+        async def forgotten() -> bool:
+            return not server._logins
+
+        await until(forgotten)

@@ -471,8 +471,8 @@ class AxisService:
                 axis=self.config.name,
                 value=command.verb.value,
             )
-        permit.ask()
         if not self._queue.free:
+            permit.ask()
             return await self._queue.wait(permit, command)
         try:
             async with self._queue.at_work:

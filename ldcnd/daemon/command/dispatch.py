@@ -356,7 +356,9 @@ class Dispatcher:
         self._ledger.open(Entry(command_id, axis_name, command, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
-            return await self._execute(axis, command, permit)
+            if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
+                return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit))
+            return await self._start(axis, command, permit)
         except LdcndError as error:
             self._ledger.answered(command_id, error, _status(error))
             raise
@@ -368,14 +370,6 @@ class Dispatcher:
             over.set()
             if hold and not hold.begun:
                 hold.over = True
-
-    async def _execute(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
-        def start() -> Awaitable[CommandReply]:
-            return self._start(axis, command, permit)
-
-        if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
-            return await axis.in_turn(command, permit, start)
-        return await start()
 
     async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)

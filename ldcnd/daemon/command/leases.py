@@ -96,7 +96,10 @@ class Authority:
 
     def holder(self, axis: str) -> Lease | None:
         """Return the lease on an axis."""
-        return next((lease for lease in self._leases.values() if axis in lease.axes), None)
+        for lease in self._leases.values():
+            if axis in lease.axes:
+                return lease
+        return None
 
     def next_end_s(self) -> float:
         """Return when the next lease ends unless it is renewed; infinity when there is none."""
