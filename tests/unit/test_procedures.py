@@ -725,7 +725,7 @@ async def test_a_set_point_whose_sender_has_lost_the_axis_leaves_the_stream_as_i
 
         def holds() -> None:
             asked.append(1)
-            if len(asked) > 2:  # admitted, then lost
+            if len(asked) > 1:  # admitted, then lost
                 raise LeaseExpired("the lease has ended")
 
         with pytest.raises(LeaseExpired):
