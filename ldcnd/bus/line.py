@@ -315,9 +315,11 @@ class Line(Receiver):
         self._release(transaction, transaction.then_baud)
         self._next(AT_ONCE)
         self._users.answered(transaction, timing)
-        if self.undelivered:
+        if self.undelivered:  # only polls follow those that wait, so it is one
+            self.undelivered.append((transaction, reply, timing))
             self.deliver()
-        transaction.completed(reply, timing)
+        else:
+            transaction.completed(reply, timing)
 
     def _release(self, transaction: Transaction, then_baud: int | None = None) -> None:
         """Free the line, at the rate that it has from now on."""
