@@ -296,7 +296,7 @@ class Line(Receiver):
         else:
             # the next reply should come in about the time that this one took
             waits = slow and following.lane is POLL and now_s + now_s - sent_at_s < self._deliver_by_s
-            self._attend(following, AT_ONCE[following.lane], failure, early=slow and not waits)
+            self._attend(following, AT_ONCE[following.lane], failure, early=slow and not self._coalesce_s)
         if not joins:
             transaction.completed(reply, timing)
         elif not waits:

@@ -1,16 +1,20 @@
-"""What code costs in counts that no machine changes: calls, bytecodes, turns of the loop."""
+"""What code costs in counts that no machine changes: calls, bytecodes, memory kept, turns of the loop, system calls."""
 
 import asyncio
+import gc
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType, FrameType
+from types import BuiltinFunctionType, CodeType, FrameType
 
 import ldcnd
 
 PACKAGE = str(Path(ldcnd.__file__).parent)
+SYSTEM_CALLS = frozenset({"posix.read", "posix.write", "posix.sched_yield", "fcntl.ioctl", "epoll.poll"})
+"""Functions of the interpreter that are one system call each, by module or type."""
 OF_DRIVES = ("PacketReader.", "encode_status", "received_command", "_decode", "_decode_network")
 """Codecs that only simulated drives use while a rig works."""
 
@@ -23,11 +27,13 @@ class Count:
         calls: of functions of ours.
         bytecodes: executed in them; 0 unless they were asked for.
         turns: of the event loop: what wakes a process that has nothing else to do.
+        kept: blocks of memory that were allocated and are still in use, less those that were freed.
     """
 
     calls: int = 0
     bytecodes: int = 0
     turns: int = 0
+    kept: int = 0
 
 
 def is_daemons(code: CodeType) -> bool:
@@ -51,6 +57,25 @@ def counted_calls() -> Iterator[Count]:
             yield count
         finally:
             sys.setprofile(None)
+
+
+@contextmanager
+def counted_system_calls() -> Iterator[Counter[str]]:
+    """Count the system calls by which this thread serves ports and waits, by name; see `SYSTEM_CALLS`."""
+    counted: Counter[str] = Counter()
+
+    def see(_frame: FrameType, event: str, function: object) -> None:
+        if event == "c_call" and isinstance(function, BuiltinFunctionType):
+            owner = function.__self__
+            name = f"{getattr(owner, '__name__', type(owner).__name__)}.{function.__name__}"
+            if name in SYSTEM_CALLS:
+                counted[name] += 1
+
+    sys.setprofile(see)
+    try:
+        yield counted
+    finally:
+        sys.setprofile(None)
 
 
 @contextmanager
@@ -89,7 +114,11 @@ def _turns(count: Count) -> Iterator[None]:
         return select(timeout)
 
     selector.select = counting
+    gc.collect()
+    before = sys.getallocatedblocks()
     try:
         yield
     finally:
         del selector.select
+        gc.collect()
+        count.kept = sys.getallocatedblocks() - before
