@@ -27,13 +27,11 @@ class Count:
         calls: of functions of ours.
         bytecodes: executed in them; 0 unless they were asked for.
         turns: of the event loop: what wakes a process that has nothing else to do.
-        kept: blocks of memory that were allocated and are still in use, less those that were freed.
     """
 
     calls: int = 0
     bytecodes: int = 0
     turns: int = 0
-    kept: int = 0
 
 
 def is_daemons(code: CodeType) -> bool:
@@ -114,11 +112,13 @@ def _turns(count: Count) -> Iterator[None]:
         return select(timeout)
 
     selector.select = counting
-    gc.collect()
-    before = sys.getallocatedblocks()
     try:
         yield
     finally:
         del selector.select
-        gc.collect()
-        count.kept = sys.getallocatedblocks() - before
+
+
+def blocks_in_use() -> int:
+    """Return how many blocks of memory the interpreter has allocated and not freed."""
+    gc.collect()
+    return sys.getallocatedblocks()
