@@ -45,7 +45,7 @@ struct line {
     int addressed, divisor;
     unsigned char packet[32], reply[32];
     int have, reply_bytes, sent;
-    double reply_starts, node_byte, request_over;
+    double heard_until, reply_starts, node_byte, request_over;
     int64_t reply_over, exchange_count, late_count, gap_count, began;
     double ideal_sum;
     float gap_us[RECORDS], late_us[RECORDS];
@@ -157,8 +157,10 @@ static void take(struct line *l, int64_t at)
     double ratio = 1e10 / byte / module_baud;
     if (l->reply_over && at - l->reply_over < LONGEST_GAP_NS && l->gap_count < RECORDS)
         l->gap_us[l->gap_count++] = (at - l->reply_over) * 1e-3;
+    l->reply_over = 0; /* what comes next may be the rest of this request */
     if (ratio < 0.955 || ratio > 1.045) { l->have = 0; return; }
     for (ssize_t i = 0; i < count; i++) {
+        l->heard_until = (l->heard_until > at ? l->heard_until : at) + byte;
         if (l->have == 0 && data[i] != 0xAA) continue;
         l->packet[l->have++] = data[i];
         if (l->have < 4 || l->have < 4 + (l->packet[2] >> 4)) continue;
@@ -168,9 +170,9 @@ static void take(struct line *l, int64_t at)
         l->have = 0;
         if ((sum & 0xFF) != l->packet[bytes - 1]) continue;
         l->reply_bytes = 0;
-        obey(l, at + (i + 1) * byte);
+        obey(l, l->heard_until);
         if (l->reply_bytes) {
-            l->ideal_sum += (i + 1) * byte + (l->reply_starts - l->request_over) + l->reply_bytes * l->node_byte;
+            l->ideal_sum += bytes * byte + (l->reply_starts - l->request_over) + l->reply_bytes * l->node_byte;
             l->exchange_count++;
         }
     }

@@ -86,6 +86,8 @@ def process(
         except subprocess.TimeoutExpired:
             running.kill()
             running.wait()
+        if running.stdout:
+            running.stdout.close()
 
 
 def told(running: subprocess.Popen) -> str:
@@ -218,13 +220,14 @@ def config_text(
     hz: float,
     items: Sequence[str],
     drive: Drive = LS_182AP,
+    line_keys: str = "margin_ms = 20",
 ) -> str:
     """Return the configuration of a daemon that polls its lines at a rate, or as often as they allow."""
     rates = ", ".join(f"{item} = {hz if item in items else 0}" for item in ("position", "velocity", "adc"))
     rates += f", state = {hz if 'state' in items else 1}"
     text = f'rig = "bench"\n[daemon]\nuvloop = {str(uvloop).lower()}\n'
     for line, terminal in enumerate(terminals):
-        text += f'[[bus]]\nname = "line{line}"\nport = "{terminal}"\nbaud = {baud}\nmargin_ms = 20\noverload = "skip"\n'
+        text += f'[[bus]]\nname = "line{line}"\nport = "{terminal}"\nbaud = {baud}\n{line_keys}\noverload = "skip"\n'
         for number in range(1, modules + 1):
             text += (
                 f'[[bus.axis]]\nname = "a{number + line * modules}"\naddress = {number}\nmodel = "{drive.model}"\n'

@@ -12,7 +12,7 @@ from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.guest.machine import Adapter, Bench, booted_guest, far_end, why_no_guest
-from tests.guest.rigs import FAST, STEPS, USB
+from tests.guest.rigs import COST_PORTS, FAST, STEPS, USB
 from tests.support.package import package, why_no_package
 from tests.support.plugged_rig import ENDLESS
 
@@ -46,7 +46,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         steps_end = stack.enter_context(far_end(steps, baud_check=False))
         adapters = (Adapter(USB, ends[0]), Adapter(FAST, ends[1]), Adapter(STEPS, steps_end))
         began_s = time.monotonic()
-        guest = stack.enter_context(booted_guest(deb, adapters, ends[2].path, (7447, 7448)))
+        guest = stack.enter_context(booted_guest(deb, adapters, ends[2].path, (7447, 7448, *COST_PORTS)))
         FOUND.append(
             f"image made ready and guest booted in {time.monotonic() - began_s:.0f} s, boot {guest.boot_s:.0f} s"
         )

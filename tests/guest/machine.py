@@ -41,7 +41,10 @@ TOOLS = {
     "mke2fs": "e2fsprogs",
 }
 SECTOR_BYTES = 512
-BOOT_ARGUMENTS = "console=ttyS0 quiet net.ifnames=0 mitigations=off nokaslr audit=0 apparmor=0 selinux=0 no_timer_check"
+BOOT_ARGUMENTS = (
+    "console=ttyS0 quiet net.ifnames=0 mitigations=off nokaslr audit=0 apparmor=0 selinux=0 no_timer_check"
+    " 8250.nr_uarts=8"  # four of them on board, whether there or not
+)
 TRIAL_S = 15.0
 """A kernel that is truly accelerated has booted without a root by then."""
 TAKEN_WITHIN_S = 0.5
@@ -142,6 +145,33 @@ class Adapter:
             "always-plugged": True,
         }
 
+    @property
+    def node(self) -> str:
+        """Its terminal in the guest."""
+        return f"/dev/ldcn-{self.serial}-00"
+
+
+@dataclass(frozen=True)
+class Card:
+    """A PCI card with one 16550A, with a far end on the host."""
+
+    slot: int
+    far_end: FarEnd
+
+    @property
+    def id(self) -> str:
+        return f"card{self.slot}"
+
+    @property
+    def device(self) -> dict[str, object]:
+        """As QEMU plugs it in."""
+        return {"driver": "pci-serial", "id": self.id, "chardev": f"far-{self.id}", "addr": f"{self.slot:#x}"}
+
+    @property
+    def node(self) -> str:
+        """A pattern of the folder that is named as its terminal in the guest."""
+        return f"/sys/bus/pci/devices/0000:00:{self.slot:02x}.0/tty/ttyS*"
+
 
 class Monitor:
     """QEMU's own control socket."""
@@ -221,6 +251,19 @@ class Guest:
         """Plug it in."""
         self._monitor.execute("device_add", self._adapters[serial].device)
 
+    @contextmanager
+    def plugged(self, port: Adapter | Card) -> Iterator[str]:
+        """Plug in a port until the context ends, when nobody may send on it any more; yields its terminal."""
+        backend = {"type": "serial", "data": {"device": str(port.far_end.path)}}
+        self._monitor.execute("chardev-add", {"id": f"far-{port.id}", "backend": backend})
+        self._monitor.execute("device_add", port.device)
+        try:
+            self.until(f"ls -d {port.node}", "/")
+            yield f"/dev/{Path(self.must(f'readlink -f {port.node}')).name}"
+        finally:
+            self._monitor.execute("device_del", {"id": port.id}, until="DEVICE_DELETED")
+            self._monitor.execute("chardev-remove", {"id": f"far-{port.id}"})
+
     def send_break(self, chardev: str) -> None:
         """Let a break arrive at a UART."""
         self._monitor.execute("chardev-send-break", {"id": chardev})
@@ -296,7 +339,7 @@ def booted_guest(
             *("-device", "virtio-rng-pci"),
             *("-serial", f"file:{place / 'console'}"),
             *("-chardev", f"serial,id=uart,path={uart}", "-serial", "chardev:uart"),
-            *("-device", "qemu-xhci,id=usb"),
+            *("-device", "qemu-xhci,id=usb,p2=8"),
             *("-qmp", f"unix:{place / 'monitor'},server=on,wait=off"),
         ]
         for adapter in adapters:

@@ -2,6 +2,8 @@
 
 USB, FAST, STEPS = "FT4ABCDE", "FT4FAST0", "FT4STEPS"
 """Serial numbers of the adapters."""
+COST_PORTS = (7451, 7452, 7453)
+"""Where the programs listen whose processor time is compared."""
 
 AXIS = """
 [[bus.axis]]
