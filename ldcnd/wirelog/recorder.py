@@ -165,7 +165,7 @@ class WireEntries(Collection[WireEntry]):
         return max(0, older + bisect_left(self._latest, at_s, key=itemgetter(0)))
 
     def behind(self, skipped: int) -> Iterator[WireEntry]:
-        """Yield the fields of those behind so many, which are not unpacked."""
+        """Yield the fields of the records after the first `skipped`, which are not unpacked."""
         skipped += self._left_out
         for block in self._blocks:
             if skipped < len(block):

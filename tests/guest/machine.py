@@ -253,7 +253,7 @@ class Guest:
 
     @contextmanager
     def plugged(self, port: Adapter | Card) -> Iterator[str]:
-        """Plug in a port until the context ends, when nobody may send on it any more; yields its terminal."""
+        """Plug in a port until the context ends, and yield its terminal; no program may send on it after that."""
         backend = {"type": "serial", "data": {"device": str(port.far_end.path)}}
         self._monitor.execute("chardev-add", {"id": f"far-{port.id}", "backend": backend})
         self._monitor.execute("device_add", port.device)
