@@ -5,6 +5,7 @@ from tests.reverts.revert import revert
 LOSS = "tests/integration/test_loss_of_control.py::"
 PENDING = "tests/integration/test_pending_stops.py::"
 LEDGER = "tests/unit/test_ledger.py::"
+AXIS = "tests/unit/test_axis_service.py::"
 PERMISSION = "tests/integration/test_permission.py::"
 START = "tests/integration/test_start_policies.py::"
 
@@ -206,8 +207,7 @@ REVERTS = (
         "            self._bus.distrust()  # another drive's reply that came late would be followed by others\n",
         "            pass\n",
         (
-            "tests/unit/test_axis_service.py"
-            "::test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost",
+            AXIS + "test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost",
         ),
     ),
 )
