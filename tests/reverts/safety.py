@@ -206,8 +206,6 @@ REVERTS = (
         "ldcnd/daemon/axis/axis.py",
         "            self._bus.distrust()  # another drive's reply that came late would be followed by others\n",
         "            pass\n",
-        (
-            AXIS + "test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost",
-        ),
+        (AXIS + "test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost",),
     ),
 )
