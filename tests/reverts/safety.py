@@ -8,6 +8,8 @@ LEDGER = "tests/unit/test_ledger.py::"
 AXIS = "tests/unit/test_axis_service.py::"
 PERMISSION = "tests/integration/test_permission.py::"
 START = "tests/integration/test_start_policies.py::"
+PLAUSIBILITY = "tests/unit/test_plausibility.py::"
+ROUGH = "tests/integration/test_rough_lines.py::test_a_rough_line_shows_no_false_position_and_lets_stops_through"
 
 REVERTS = (
     # -- lost control
@@ -207,5 +209,32 @@ REVERTS = (
         "            self._bus.distrust()  # another drive's reply that came late would be followed by others\n",
         "            pass\n",
         (AXIS + "test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost",),
+    ),
+    revert(
+        "ldcnd/daemon/axis/polling.py",
+        "            if self._agreeing >= ROUNDS or not jumped:\n",
+        "            if True:\n",
+        (
+            PLAUSIBILITY + "test_late_replies_of_another_drive_are_not_believed_though_they_agree",
+            ROUGH + "[agreeing]",
+        ),
+    ),
+    revert(
+        "ldcnd/daemon/axis/polling.py",
+        "        return not self._is_jump(seen, reading, timing.true_until_s)",
+        "        return True",
+        (
+            PLAUSIBILITY + "test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_is_back",
+            ROUGH + "[after_a_gap]",
+        ),
+    ),
+    revert(
+        "ldcnd/daemon/axis/axis.py",
+        "                if not self._plausibility.is_out_of_reach(reading, self._clock.now_s()):\n",
+        "                if True:\n",
+        tuple(
+            AXIS + "test_nothing_is_planned_from_two_readings_that_agree_where_no_motion_can_have_led" + case
+            for case in ("[command0]", "[command1]")
+        ),
     ),
 )

@@ -8,9 +8,11 @@ import pytest
 
 from ldcnd.daemon.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
 from ldcnd.daemon.axis.guards import Right
+from ldcnd.daemon.axis.polling import ROUNDS
 from ldcnd.drivers.driver import Fault, StopMode
 from ldcnd.drivers.network import BringUpReport
 from ldcnd.errors import (
+    BadReply,
     BusDown,
     CommandExpired,
     LdcndError,
@@ -34,6 +36,7 @@ from ldcnd.model.commands import (
     Power,
     QuickStop,
     Reset,
+    SetPosition,
     Stop,
     Verb,
 )
@@ -460,7 +463,7 @@ async def test_the_first_reading_of_an_axis_is_no_return():
 
 async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away():
     async with axis_bench() as bench:
-        for counts in (0, 0, 500_000, 500_000):
+        for counts in (0, 0, *[500_000] * ROUNDS):
             asks_again = bench.axis.judged(_reading(bench, position_counts=counts), frozenset(), now())
             await asyncio.sleep(0.05)
 
@@ -472,7 +475,7 @@ async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away(
 async def test_a_jump_during_a_command_is_left_to_the_command():
     async with axis_bench() as bench:
         await moving(bench)
-        for counts in (0, 0, 500_000, 500_000):
+        for counts in (0, 0, *[500_000] * ROUNDS):
             slow = _reading(bench, position_counts=counts, velocity_counts_per_s=0.0)
             bench.axis.judged(slow, frozenset(), now())
             await asyncio.sleep(0.05)
@@ -492,7 +495,7 @@ async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(g
         else:
             for _ in range(3):
                 bench.axis.missed(LOST)
-        for counts in (500_000, 500_000):
+        for counts in [500_000] * ROUNDS:
             bench.axis.judged(_reading(bench, position_counts=counts), frozenset(), now())
             await asyncio.sleep(0.05)
 
@@ -509,6 +512,22 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
         assert bench.bus.distrusted == 4
         assert bench.tracker.link is LinkState.DEGRADED
         assert bench.drive.shown.position_counts == 0
+
+
+@pytest.mark.parametrize("command", [MoveRelative(distance=1.0), SetPosition(position=0.0)])
+async def test_nothing_is_planned_from_two_readings_that_agree_where_no_motion_can_have_led(command):
+    async with axis_bench() as bench:
+        for _ in range(2):
+            bench.axis.judged(bench.drive.shown, frozenset(), now())
+        origin = bench.axis.telemetry.origin_counts
+        bench.drive.shown = _reading(bench, position_counts=60_000)
+
+        with pytest.raises(BadReply, match="contradict"):
+            await bench.send(command)
+
+        assert bench.drive.told == []
+        assert bench.axis.telemetry.origin_counts == origin
+        assert bench.bus.distrusted == 1
 
 
 async def test_a_shaft_that_is_turned_by_hand_is_believed_where_its_velocity_leads():

@@ -721,7 +721,7 @@ class AxisService:
         """Read the drive's state out of turn, until two readings agree.
 
         Raises:
-            BadReply: they do not.
+            BadReply: they do not, or agree on a place that no motion can have led to, as late replies of another drive.
             BusError: the line failed.
         """
         exchange = self._moves.reading(frozenset())
@@ -729,7 +729,10 @@ class AxisService:
         for _ in range(ROUNDS):
             reading = await self._bus.execute(exchange)
             if agree(before, reading):
-                return reading
+                if not self._plausibility.is_out_of_reach(reading, self._clock.now_s()):
+                    return reading
+                self._bus.distrust()
+                break
             before = reading
         raise BadReply(
             f"axis {self.config.name}: its readings contradict each other; nothing was started",

@@ -39,7 +39,7 @@ OPEN_LOOP_SPEEDS = 8.0
 APART_S = 0.1
 """Longest time between two consecutive readings, seconds, unless commands delay the line."""
 ROUNDS = 4
-"""Consecutive contradicting readings that count as one lost reply."""
+"""Consecutive contradicting readings that count as one lost reply, and those that must agree on a jump."""
 
 _COUNTER, _HALF = 1 << 32, 1 << 31
 
@@ -192,7 +192,7 @@ class PlausibilityGate:
         self.withheld = 0
         self._known: _Seen | None = None
         self._unconfirmed: _Seen | None = None
-        self._rounds = 0
+        self._rounds = self._agreeing = 0
         self._sure = False  # nothing jumps away from the very first reading, which is accepted as it is
         self.reconfigure(config)
 
@@ -225,15 +225,21 @@ class PlausibilityGate:
             self._sure = True
             self._known, self._unconfirmed, self._rounds = (reading, timing), None, 0
             return Verdict.BELIEVED
+        jumped = self._is_jump(known, reading, timing.true_until_s)
         if self._unconfirmed and self._follows(self._unconfirmed, reading, timing, None):
-            self.jumped = self._sure and self._is_jump(known, reading, timing)
-            self.zeroed = self._sure and self._is_zeroed(known, reading, timing)
-            self._sure = True
-            self.confirmed = self._unconfirmed
-            return self._believe(reading, timing)
+            self._agreeing += 1
+            # late replies of another drive agree as well
+            if self._agreeing >= ROUNDS or not jumped:
+                self.jumped = self._sure and jumped
+                self.zeroed = self._sure and self._is_zeroed(known, reading, timing)
+                self._sure = True
+                self.confirmed = self._unconfirmed
+                return self._believe(reading, timing)
+        else:
+            self._agreeing = 1
         self._unconfirmed = reading, timing
         self._rounds += 1
-        self.foreign = self._is_jump(known, reading, timing)
+        self.foreign = jumped
         if self._rounds < ROUNDS:
             return Verdict.ASK_AGAIN
         self.withheld += self._rounds
@@ -280,17 +286,24 @@ class PlausibilityGate:
         velocities = reading.velocity_counts_per_s + before.velocity_counts_per_s
         resolution = reading.velocity_resolution_counts_per_s
         reach = NOISE_COUNTS + 2 * resolution * passed_s + self._acceleration * passed_s * passed_s / 4
-        return abs(_way(before, reading) - velocities / 2 * passed_s) <= reach
+        if abs(_way(before, reading) - velocities / 2 * passed_s) > reach:
+            return False
+        # long after the other one, what it may accelerate leads anywhere
+        return not self._is_jump(seen, reading, timing.true_until_s)
 
     def _is_zeroed(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
         """Tell whether the counter was reset to 0: a shaft that happens to come to rest at its 0 shows a velocity."""
         return reading.begun_anew and not seen[0].begun_anew and not self._led_there(seen, reading, timing)
 
-    def _is_jump(self, seen: _Seen, reading: AxisReading, timing: Timing) -> bool:
+    def is_out_of_reach(self, reading: AxisReading, by_s: float) -> bool:
+        """Tell whether no motion can have led to a reading by then, in loop time, from the last one believed."""
+        return self._known is not None and self._is_jump(self._known, reading, by_s)
+
+    def _is_jump(self, seen: _Seen, reading: AxisReading, by_s: float) -> bool:
         """Tell whether an axis cannot have come from the one reading to the other by moving."""
         speeds = JUMP_SPEEDS if reading.enabled else OPEN_LOOP_SPEEDS
         before, seen_at = seen
-        reach = speeds * self._speed * (timing.true_until_s - seen_at.true_from_s) + self._following + NOISE_COUNTS
+        reach = speeds * self._speed * (by_s - seen_at.true_from_s) + self._following + NOISE_COUNTS
         return abs(_way(before, reading)) > reach
 
 
