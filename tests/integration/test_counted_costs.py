@@ -41,9 +41,9 @@ class Bound:
     kept: float
 
 
-POLL = Bound(calls=60, turns=3.45, bytecodes=2512, kept=2.5)
+POLL = Bound(calls=60, turns=3.45, bytecodes=2515, kept=2.5)
 """One poll of position, velocity, A/D value, state and faults, from its turn until all are published."""
-COMMAND = Bound(calls=1236, turns=77, bytecodes=30580, kept=55)
+COMMAND = Bound(calls=1236, turns=77, bytecodes=30620, kept=55)
 """A move that aborts the one before: planned, halted, asked where the axis is, loaded, permitted and started;
 permission is asked again as the turn of each packet comes."""
 STOP = Bound(calls=223, turns=10.5, bytecodes=7440, kept=27)

@@ -224,7 +224,8 @@ REVERTS = (
         "        return not self._is_jump(seen, reading, timing.true_until_s)",
         "        return True",
         (
-            PLAUSIBILITY + "test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_is_back",
+            PLAUSIBILITY
+            + "test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_was_not_read_for_a_while",
             ROUGH + "[after_a_gap]",
         ),
     ),

@@ -260,10 +260,11 @@ async def test_a_motor_that_must_be_off_first_is_switched_off():
 
 async def test_a_reading_from_a_drive_that_owes_a_confirmation_calls_for_the_stop():
     async with axis_bench() as bench:
+        bench.axis.judged(bench.drive.shown, frozenset(), now())
         bench.axis.switch_off()
         bench.axis.stop_wanted.clear()
 
-        bench.show()
+        assert bench.axis.judged(_reading(bench, position_counts=60_000), frozenset(), now())  # not believed yet
 
         assert bench.axis.stop_wanted.is_set()
 

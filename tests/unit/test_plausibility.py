@@ -153,10 +153,9 @@ def test_late_replies_of_another_drive_are_not_believed_though_they_agree(runs: 
         assert not axis.gate.jumped
 
 
-def test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_is_back():
+def test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_was_not_read_for_a_while():
     """What the axis may accelerate would lead there in that time."""
     axis = Axis()
-    axis.gate.after_gap()
 
     assert axis.read(at(47_000), 0.38, standing=False) is Verdict.ASK_AGAIN
     assert axis.gate.foreign
@@ -176,6 +175,17 @@ def test_a_counter_that_wraps_has_not_jumped():
     axis = Axis(at(2**31 - 3))
 
     assert axis.read(at(-(2**31) + 4), POLL_S) is Verdict.BELIEVED
+
+
+def test_a_drive_that_is_back_is_believed_at_once_only_where_it_was():
+    axis = Axis()
+    axis.gate.after_gap()
+    assert axis.read(at(1000 + NOISE_COUNTS), 5.0, standing=False) is Verdict.BELIEVED
+
+    axis.gate.after_gap()
+    assert axis.read(at(1500), 5.0, standing=False) is Verdict.ASK_AGAIN
+    assert axis.gate.foreign
+    assert axis.read(at(1500), standing=False) is Verdict.BELIEVED
 
 
 def test_after_a_gap_another_position_is_confirmed_and_is_no_jump():

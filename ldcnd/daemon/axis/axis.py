@@ -321,6 +321,8 @@ class AxisService:
     def judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
         tracker, gate = self.tracker, self._plausibility
+        if self._pending is not None and tracker.stop_pending:
+            self.stop_wanted.set()  # it replies again, whatever it says
         verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
         if verdict is Verdict.BELIEVED:
             if gate.confirmed:  # items that only the first of two readings has are valid as well
@@ -344,8 +346,6 @@ class AxisService:
         tracker, arrivals = self.tracker, self._arrivals
         was_away = self._seen and tracker.link is LinkState.DOWN
         self._seen = True
-        if self._pending is not None and tracker.stop_pending:
-            self.stop_wanted.set()  # it replies again
         was_referenced = tracker.referenced
         if tracker.command:
             arrivals.reading = reading

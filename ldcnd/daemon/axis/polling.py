@@ -179,7 +179,8 @@ class PlausibilityGate:
     Attributes:
         jumped: no motion can have led from the accepted reading before the last one to the last one.
         zeroed: the drive's counter has gone to about 0, and no motion has led there: reset; with `confirmed`.
-        foreign: the last reading was not accepted, and no motion can have led to it: it may be another drive's.
+        foreign: the last reading was not accepted, and it may be another drive's: no motion can have led to it, or the
+            drive was out of reach and shows another place.
         confirmed: the reading that the last accepted one has confirmed, and when; None if it needed none.
         withheld: number of readings not accepted so far.
     """
@@ -193,7 +194,9 @@ class PlausibilityGate:
         self._known: _Seen | None = None
         self._unconfirmed: _Seen | None = None
         self._rounds = self._agreeing = 0
-        self._sure = False  # nothing jumps away from the very first reading, which is accepted as it is
+        self._sure = self._was_away = (
+            False  # nothing jumps away from the very first reading, which is accepted as it is
+        )
         self.reconfigure(config)
 
     def reconfigure(self, config: AxisConfig) -> None:
@@ -204,8 +207,11 @@ class PlausibilityGate:
         self._following = config.gains.el if config.gains else 0
 
     def after_gap(self) -> None:
-        """The drive was out of reach, and may have been moved: no jump is called one until two readings agree again."""
-        self._unconfirmed, self._rounds, self._sure = None, 0, False
+        """The drive was out of reach, and may have been moved.
+
+        Until two readings agree again, another place than before is not believed at once, and no jump is called one.
+        """
+        self._unconfirmed, self._rounds, self._sure, self._was_away = None, 0, False, True
 
     def judge(self, reading: AxisReading, timing: Timing, *, standing: bool) -> Verdict:
         """Judge a reading.
@@ -219,10 +225,10 @@ class PlausibilityGate:
         self.jumped, self.confirmed, self.foreign = False, None, False
         if known is None:
             return self._believe(reading, timing)
-        if self._follows(known, reading, timing, NOISE_COUNTS if standing else None):
+        if self._follows(known, reading, timing, NOISE_COUNTS if standing or self._was_away else None):
             if self._unconfirmed:
                 self.withheld += self._rounds
-            self._sure = True
+            self._sure, self._was_away = True, False
             self._known, self._unconfirmed, self._rounds = (reading, timing), None, 0
             return Verdict.BELIEVED
         jumped = self._is_jump(known, reading, timing.true_until_s)
@@ -239,7 +245,7 @@ class PlausibilityGate:
             self._agreeing = 1
         self._unconfirmed = reading, timing
         self._rounds += 1
-        self.foreign = jumped
+        self.foreign = jumped or (self._was_away and abs(_way(known[0], reading)) > NOISE_COUNTS)
         if self._rounds < ROUNDS:
             return Verdict.ASK_AGAIN
         self.withheld += self._rounds
@@ -248,7 +254,7 @@ class PlausibilityGate:
 
     def _believe(self, reading: AxisReading, timing: Timing) -> Verdict:
         self._known = reading, timing
-        self._unconfirmed, self._rounds = None, 0
+        self._unconfirmed, self._rounds, self._was_away = None, 0, False
         return Verdict.BELIEVED
 
     def _follows(self, seen: _Seen, reading: AxisReading, timing: Timing, within_counts: int | None) -> bool:
