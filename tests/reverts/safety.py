@@ -226,8 +226,19 @@ REVERTS = (
         (
             PLAUSIBILITY
             + "test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_was_not_read_for_a_while",
-            ROUGH + "[after_a_gap]",
         ),
+    ),
+    revert(
+        "ldcnd/daemon/axis/polling.py",
+        "NOISE_COUNTS if standing or self._was_away else None",
+        "NOISE_COUNTS if standing else None",
+        (PLAUSIBILITY + "test_a_drive_that_is_back_is_believed_at_once_only_where_it_was",),
+    ),
+    revert(
+        "ldcnd/daemon/axis/axis.py",
+        "            self.stop_wanted.set()  # it replies again, whatever it says\n",
+        "            pass\n",
+        (AXIS + "test_a_reading_from_a_drive_that_owes_a_confirmation_calls_for_the_stop",),
     ),
     revert(
         "ldcnd/daemon/axis/axis.py",
