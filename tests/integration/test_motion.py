@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from ldcnd.config.rig import load_config
 from ldcnd.errors import NotReferenced, PositionLimit, StopLatched, WrongState
 from ldcnd.model.commands import (
     Halt,
@@ -17,7 +18,7 @@ from ldcnd.model.commands import (
     SetPosition,
 )
 from ldcnd.model.samples import AxisState, Moving, PositionSample, TelemetryItem, VelocitySample
-from tests.support.rig import RunningRig, running_rig
+from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 
 async def powered(rig: RunningRig, axis: str) -> None:
@@ -315,3 +316,27 @@ async def test_an_axis_that_is_not_powered_says_how_to_power_it():
             await rig.client.command("x", MoveAbsolute(position=1.0))
 
         assert "power" in refusal.value.remedy
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 20.0])
+async def test_an_axis_without_limits_may_be_moved_faster_than_its_own_velocity(rate_hz):
+    config = load_config(SIMULATED)
+    x = config.bus[0].axis[0]
+    slow = {"velocity": 1.0, "limits": x.limits.model_copy(update={"velocity": None}), "approach": None}
+    rates = x.rates.model_copy(update={"position": rate_hz, "velocity": rate_hz, "state": rate_hz})
+    axes = (x.model_copy(update=slow | {"rates": rates}), *config.bus[0].axis[1:])
+    bus = config.bus[0].model_copy(update={"axis": axes})
+    async with running_rig(config.model_copy(update={"bus": (bus, *config.bus[1:])})) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Power(on=True))
+        statistics = rig.daemon.rig.buses[0].bus.statistics
+        before = statistics.resynchronisations
+        for place in (80.0, -80.0):
+            reply = await rig.client.command("x", MoveAbsolute(position=place, velocity=40.0, acceleration=200.0))
+            state = await rig.client.wait_for_end("x", reply.command_id)
+            assert state.state is AxisState.STANDSTILL
+        last = await rig.client.last("x", TelemetryItem.POSITION)
+
+    assert isinstance(last, PositionSample)
+    assert abs(last.value + 80.0) < 0.01
+    assert statistics.resynchronisations == before  # none of its readings was taken for another drive's

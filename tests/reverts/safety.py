@@ -230,6 +230,16 @@ REVERTS = (
     ),
     revert(
         "ldcnd/daemon/axis/polling.py",
+        ", JUMP_SPEEDS * shown)\n",
+        ", 0.0)\n",
+        (
+            PLAUSIBILITY + "test_a_motion_that_is_faster_than_the_velocity_of_an_axis_without_limits_is_believed[0.2]",
+            "tests/integration/test_motion.py"
+            "::test_an_axis_without_limits_may_be_moved_faster_than_its_own_velocity[20.0]",
+        ),
+    ),
+    revert(
+        "ldcnd/daemon/axis/polling.py",
         "NOISE_COUNTS if standing or self._was_away else None",
         "NOISE_COUNTS if standing else None",
         (PLAUSIBILITY + "test_a_drive_that_is_back_is_believed_at_once_only_where_it_was",),

@@ -171,6 +171,21 @@ def test_a_shaft_that_is_turned_by_hand_has_not_jumped():
         assert not axis.gate.jumped
 
 
+@pytest.mark.parametrize("poll_s", [0.02, 0.2, 1.0])
+def test_a_motion_that_is_faster_than_the_velocity_of_an_axis_without_limits_is_believed(poll_s: float):
+    config = CONFIG.model_copy(update={"limits": CONFIG.limits.model_copy(update={"velocity": None})})
+    axis = Axis()
+    axis.gate.reconfigure(config)
+    fast = 200_000.0  # ten times as fast
+
+    verdicts = [
+        axis.read(replace(at(round(1000 + fast * poll_s * number), fast), profile_done=False), poll_s, standing=False)
+        for number in range(1, 7)
+    ]
+
+    assert verdicts[2:] == [Verdict.BELIEVED] * 4
+
+
 def test_a_counter_that_wraps_has_not_jumped():
     axis = Axis(at(2**31 - 3))
 

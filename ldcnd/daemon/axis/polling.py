@@ -33,7 +33,7 @@ NOISE_COUNTS = 16
 ACCELERATIONS = 2.0
 """Highest acceleration accepted without a second reading, as a multiple of the axis's acceleration limit."""
 JUMP_SPEEDS = 2.0
-"""Highest speed of a closed loop, as a multiple of the highest velocity of its axis."""
+"""Highest speed of a closed loop, as a multiple of the highest velocity of its axis, or of the one that it shows."""
 OPEN_LOOP_SPEEDS = 8.0
 """The same for a shaft that is turned by hand, or by a load."""
 APART_S = 0.1
@@ -307,9 +307,11 @@ class PlausibilityGate:
 
     def _is_jump(self, seen: _Seen, reading: AxisReading, by_s: float) -> bool:
         """Tell whether an axis cannot have come from the one reading to the other by moving."""
-        speeds = JUMP_SPEEDS if reading.enabled else OPEN_LOOP_SPEEDS
         before, seen_at = seen
-        reach = speeds * self._speed * (by_s - seen_at.true_from_s) + self._following + NOISE_COUNTS
+        shown = max(abs(reading.velocity_counts_per_s), abs(before.velocity_counts_per_s))
+        # without a limit, a command may be faster than the axis's own velocity
+        speed = max((JUMP_SPEEDS if reading.enabled else OPEN_LOOP_SPEEDS) * self._speed, JUMP_SPEEDS * shown)
+        reach = speed * (by_s - seen_at.true_from_s) + self._following + NOISE_COUNTS
         return abs(_way(before, reading)) > reach
 
 
