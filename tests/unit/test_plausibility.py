@@ -31,7 +31,7 @@ class Axis:
 
     def __init__(self, reading: AxisReading = RESTING) -> None:
         self.gate = PlausibilityGate(CONFIG)
-        self.now_s = 0.0
+        self.now_s = 1000.0
         self.read(reading)
         moved = reading.position_counts + round(reading.velocity_counts_per_s * EXCHANGE_S)
         self.position_counts = moved
@@ -201,6 +201,40 @@ def test_a_drive_that_is_back_is_believed_at_once_only_where_it_was():
     assert axis.read(at(1500), 5.0, standing=False) is Verdict.ASK_AGAIN
     assert axis.gate.foreign
     assert axis.read(at(1500), standing=False) is Verdict.BELIEVED
+
+
+def test_what_leaves_the_place_that_was_confirmed_after_a_gap_has_jumped():
+    axis = Axis()
+    axis.gate.after_gap()
+    axis.read_until_believed(at(1500), 5.0)
+
+    axis.read_until_believed(at(30_000))
+
+    assert axis.gate.jumped
+
+
+@pytest.mark.parametrize(("counts", "readings"), [(9220, 2), (9240, 3)])
+def test_a_jump_is_farther_than_speed_and_following_error_and_noise_together(counts: int, readings: int):
+    """In 52.1 ms 5210 counts at twice the limit, 4000 and 16; each further reading is 2 ms later."""
+    axis = Axis()
+
+    assert axis.read_until_believed(at(1000 + counts), POLL_S) == readings
+
+
+@pytest.mark.parametrize(
+    ("begun_anew", "counts", "zeroed"),
+    [((False, True), 0, True), ((True, True), 0, False), ((False, True), 1000, False)],
+)
+def test_a_counter_that_has_restarted_shows_that_it_began_anew_where_no_motion_led(
+    begun_anew: tuple[bool, bool], counts: int, *, zeroed: bool
+):
+    before, after = begun_anew
+    axis = Axis(replace(RESTING, begun_anew=before))
+
+    reading = replace(at(counts), enabled=False, begun_anew=after)  # which is asked again, whatever it shows besides
+    axis.read_until_believed(reading, EXCHANGE_S)
+
+    assert axis.gate.zeroed is zeroed
 
 
 def test_after_a_gap_another_position_is_confirmed_and_is_no_jump():
