@@ -203,6 +203,22 @@ def test_a_drive_that_is_back_is_believed_at_once_only_where_it_was():
     assert axis.read(at(1500), standing=False) is Verdict.BELIEVED
 
 
+def test_a_velocity_that_no_acceleration_leads_to_is_asked_again_though_the_way_fits_it():
+    axis = Axis()
+
+    assert axis.read(at(1000 + 2755, 110_000.0), POLL_S, standing=False) is Verdict.ASK_AGAIN
+    assert not axis.gate.foreign
+
+
+@pytest.mark.parametrize(("counts", "foreign"), [(NOISE_COUNTS, False), (NOISE_COUNTS + 1, True)])
+def test_what_a_drive_that_is_back_shows_at_its_place_is_not_another_drives(counts: int, *, foreign: bool):
+    axis = Axis()
+    axis.gate.after_gap()
+
+    assert axis.read(replace(at(1000 + counts), enabled=False), 5.0, standing=False) is Verdict.ASK_AGAIN
+    assert axis.gate.foreign is foreign
+
+
 def test_what_leaves_the_place_that_was_confirmed_after_a_gap_has_jumped():
     axis = Axis()
     axis.gate.after_gap()
