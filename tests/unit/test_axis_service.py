@@ -523,9 +523,10 @@ async def test_nothing_is_planned_from_two_readings_that_agree_where_no_motion_c
         origin = bench.axis.telemetry.origin_counts
         bench.drive.shown = _reading(bench, position_counts=60_000)
 
-        with pytest.raises(BadReply, match="contradict"):
+        with pytest.raises(BadReply, match="no motion can have led") as refusal:
             await bench.send(command)
 
+        assert refusal.value.value == bench.axis.telemetry.position(60_000)
         assert bench.drive.told == []
         assert bench.axis.telemetry.origin_counts == origin
         assert bench.bus.distrusted == 1

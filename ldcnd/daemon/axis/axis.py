@@ -732,7 +732,14 @@ class AxisService:
                 if not self._plausibility.is_out_of_reach(reading, self._clock.now_s()):
                     return reading
                 self._bus.distrust()
-                break
+                place = self.telemetry.position(reading.position_counts)
+                raise BadReply(
+                    f"axis {self.config.name}: it shows {place:g} {self.config.unit}, where no motion can have led"
+                    " since its last reading; nothing was started",
+                    axis=self.config.name,
+                    value=place,
+                    remedy="send it again; if that fails as well, look for an adapter that holds replies back",
+                )
             before = reading
         raise BadReply(
             f"axis {self.config.name}: its readings contradict each other; nothing was started",

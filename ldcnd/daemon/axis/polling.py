@@ -194,9 +194,8 @@ class PlausibilityGate:
         self._known: _Seen | None = None
         self._unconfirmed: _Seen | None = None
         self._rounds = self._agreeing = 0
-        self._sure = self._was_away = (
-            False  # nothing jumps away from the very first reading, which is accepted as it is
-        )
+        # nothing jumps away from the very first reading, which is accepted as it is
+        self._sure = self._was_away = False
         self.reconfigure(config)
 
     def reconfigure(self, config: AxisConfig) -> None:
