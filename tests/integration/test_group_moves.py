@@ -245,3 +245,16 @@ async def test_a_member_of_a_line_beyond_its_limit_keeps_all_at_rest():
                 await rig.client.ask(request)
 
     assert starts(rig) == []
+
+
+async def test_a_start_that_takes_longer_than_members_wait_for_each_other_has_one_outcome(monkeypatch):
+    monkeypatch.setattr("ldcnd.daemon.axis.procedures.group.MEETING_S", 0.01)  # as on a slow and busy line
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+
+        replies = await together(rig, x=10.0, y=-10.0)
+        for reply in replies:
+            await rig.client.wait_for_end(reply.axis, reply.command_id)
+
+        assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx([10_000, -10_000], abs=60)

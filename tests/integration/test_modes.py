@@ -104,17 +104,17 @@ async def test_an_analog_move_is_refused_while_the_sensor_is_disconnected():
         assert (state.state, rig.drive.loop.trajectory.velocity) == (AxisState.STANDSTILL, 0)
 
 
-async def test_an_analog_move_stops_beyond_a_software_limit():
-    async with dialect_rig(LS_182AP, limits={"position_max": 3}) as rig:
+async def test_an_analog_move_stops_before_a_software_limit():
+    async with dialect_rig(LS_182AP, limits={"position_max": 4}) as rig:
         await rig.power_on()
 
         state = await rig.done(MoveAnalog(target=900, velocity=5.0))
 
         assert (state.state, state.last_error) == (
             AxisState.STANDSTILL,
-            "move_analog: stopped beyond a software limit",
+            "move_analog: stopped before a software limit",
         )
-        assert 3.0 < rig.position_mm < 4.0
+        assert 2.0 < rig.position_mm < 4.0
 
 
 DEAD_SENSOR = replace(PLANT, pot_span_counts=(-(1 << 40), 1 << 40), forward_limit_counts=1 << 30)

@@ -9,8 +9,8 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange, WrongState
-from ldcnd.model.commands import Halt, Power, Reset, Stop
+from ldcnd.errors import CommandExpired, CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange, WrongState
+from ldcnd.model.commands import Direction, Halt, MoveRelative, Power, Reset, Stop
 from ldcnd.model.leases import Acquire, Release
 from ldcnd.model.rig_commands import AxisPath, PathReply, WalkPath
 from ldcnd.model.samples import AxisState, LinkState
@@ -18,6 +18,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.wirelog.recorder import WireEvent
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+from tests.support.rig import EPOCH_NS
 
 NAMES = ("z", "c")
 GAINS = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "cl": 0, "el": 4000, "sr": 1, "deadband": 0}
@@ -43,12 +44,17 @@ def sc_chain() -> Chain:
 
 
 @asynccontextmanager
-async def two_sc(chain: Chain, *, leased: bool = False, **group: object) -> AsyncIterator[ChainRig]:
-    """Run a daemon on two PIC-SERVO SC of one group, with closed loops."""
+async def two_sc(
+    chain: Chain, *, leased: bool = False, turning: float | None = None, baud: int = 115_200, **group: object
+) -> AsyncIterator[ChainRig]:
+    """Run a daemon on two PIC-SERVO SC of one group, with closed loops; `turning` is the modulo of the second."""
     config = simulated_config(group=[{"name": "plane", "axes": list(NAMES), **group}])
     document = config.model_dump(mode="json", exclude_unset=True)
     table = document["bus"][0]
+    table["baud"] = baud
     table["axis"] = [{"name": name, "address": at + 1, **AXIS} for at, name in enumerate(NAMES)]
+    if turning:
+        table["axis"][1] |= {"modulo": turning, "limits": {}}
     for key in ("module", "simulate", "fault"):
         table.pop(key, None)
     document["authority"] = "leased" if leased else "open"
@@ -326,3 +332,49 @@ async def test_drives_without_path_mode_refuse():
             await rig.client.command(name, Power(on=True))
         with pytest.raises(NotSupported, match="path mode"):
             await rig.client.ask(path({"x": (1.0,), "y": (2.0,)}))
+
+
+@pytest.mark.parametrize(
+    ("via", "end", "direction", "ends_at"),
+    [(2.0, 9.0, None, 29.0), (2.0, 1.0, None, 31.0), (2.0, 1.0, Direction.POSITIVE, 41.0), (9.5, 0.5, None, 30.5)],
+)
+async def test_a_turning_axis_goes_the_short_way_from_corner_to_corner_or_as_it_is_asked(via, end, direction, ends_at):
+    chain = sc_chain()
+    async with two_sc(chain, turning=10.0) as rig:
+        reply = await rig.client.command("c", MoveRelative(distance=31.0))  # three turns lie behind it
+        await rig.client.wait_for_end("c", reply.command_id)
+
+        moves = (
+            AxisPath(axis="z", via=(1.0,), position=3.0),
+            AxisPath(axis="c", via=(via,), position=end, direction=direction),
+        )
+        reply = await rig.client.ask(WalkPath(moves=moves))
+        await rig.client.wait_for_end("c", reply.replies[1].command_id)
+
+        assert drive(chain, 2).shaft.position_counts == pytest.approx(1000 * ends_at, abs=30)
+
+
+@pytest.mark.parametrize("allowed_s", [0.05, 0.12, 0.2, 0.3, 2.0])
+async def test_a_path_begins_in_time_or_not_at_all_however_long_its_drives_are_fed(allowed_s):
+    chain = sc_chain()
+    async with two_sc(chain, baud=19_200) as rig:
+        loop = asyncio.get_running_loop()
+        latest_s = loop.time() + allowed_s
+        not_after = EPOCH_NS + round(latest_s * 1e9)
+        moves = tuple(AxisPath(axis=name, via=(2.0,), position=4.0, not_after=not_after) for name in NAMES)
+        asked = asyncio.create_task(rig.client.ask(WalkPath(moves=moves)))
+        began_s = None
+        while began_s is None and not asked.done():
+            await asyncio.sleep(0.001)
+            if any(drive(chain, at).loop.trajectory.path.running for at in (1, 2)):
+                began_s = loop.time()
+
+        if began_s is None:
+            with pytest.raises(CommandExpired):
+                await asked
+            await asyncio.sleep(1.0)
+            assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx([0, 0], abs=30)
+        else:
+            await asked
+            assert began_s <= latest_s + 0.01
+        assert began_s is not None or allowed_s < 2.0

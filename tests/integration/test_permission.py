@@ -22,11 +22,26 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.commands import BufferMode, Halt, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop, Track
+from ldcnd.messaging.keys import Keys
+from ldcnd.model.commands import (
+    BufferMode,
+    Halt,
+    Home,
+    Jog,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Stop,
+    Track,
+)
 from ldcnd.model.samples import AxisState
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 FIRST_TARGET = 20.0
+MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 
 
 def config(policy: LossPolicy = LossPolicy.RUN_TO_TARGET, authority: str = "leased") -> RigConfig:
@@ -110,10 +125,10 @@ async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         waiting = buffered(rig, held)
         await asyncio.sleep(0.5)
-        rig.daemon._dispatcher.rival = "other"
+        rig.daemon._dispatcher.rivals.add("other")
         with pytest.raises(DuplicateDaemon):
             await waiting
-        rig.daemon._dispatcher.rival = None
+        rig.daemon._dispatcher.rivals.clear()
         await stays_at_first_target(rig)
 
 
@@ -340,3 +355,43 @@ async def test_a_loop_that_waits_for_the_line_is_not_closed_once_its_lease_has_e
         state = await rig.until("x", lambda state: state.state is AxisState.DISABLED)
 
     assert not state.enabled
+
+
+async def test_nothing_is_moved_until_the_last_of_several_other_daemons_has_gone():
+    async with running_rig(config(authority="open")) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        keys = Keys(rig.daemon.rig.name)
+        second = await rig.session.declare_token(keys.alive("second"))
+        third = await rig.session.declare_token(keys.alive("third"))
+        await asyncio.sleep(0.1)
+        for others, gone in (("second, third", third), ("second", second)):
+            with pytest.raises(DuplicateDaemon, match=rf"\({others}\)"):
+                await rig.client.command("x", Power(on=True))
+            await gone.close()
+            await asyncio.sleep(0.1)
+
+        await rig.client.command("x", Power(on=True))
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.001, 0.003, 0.006, 0.01, 0.02, 0.05])
+@pytest.mark.parametrize("command", [Jog(velocity=5.0, hold_s=1.0), MoveVelocity(velocity=5.0), Home()], ids=lambda each: each.verb)
+async def test_no_motion_begins_once_the_daemon_ends(command, after_s, tmp_path):
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
+    settings = simulated_config(baud=19_200).model_copy(update={"state_dir": tmp_path})
+    async with rig_on(chain, settings) as rig:
+        await rig.until("z", lambda state: state.link == "up")
+        await rig.until("x", lambda state: state.link == "up")
+        for name in ("x", "z"):
+            await rig.client.command(name, Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=5.0))  # keeps the end waiting
+        commanded = asyncio.create_task(rig.client.command("z", command, 5.0))
+        await asyncio.sleep(after_s)
+        rig.daemon.end()
+        await asyncio.wait([rig.running])
+        await asyncio.wait([commanded])
+        commanded.exception()
+
+        await asyncio.sleep(1.0)
+        before = drive(chain, 3).shaft.position_counts
+        await asyncio.sleep(2.0)
+        assert drive(chain, 3).shaft.position_counts == pytest.approx(before, abs=5)

@@ -5,8 +5,9 @@ import asyncio
 import pytest
 
 from ldcnd.errors import PositionLimit, WrongState
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity, SetPwm
 from ldcnd.model.samples import AxisState
+from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, DialectRig, dialect_rig
 
 LIMITS = {"position_min": -15, "position_max": 15}
@@ -89,3 +90,51 @@ async def test_other_motions_are_not_changed_on_the_fly():
 
         with pytest.raises(WrongState):
             await rig.send(MoveVelocity(velocity=2.0))
+
+
+SLOW_RATES = {"position": 2, "velocity": 2, "adc": 0, "state": 2}
+EVER = {"jog_horizon_s": 60, "rates": SLOW_RATES, "limits": LIMITS}
+NEVER_A_SWITCH = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=2**40)
+
+
+@dialects
+@pytest.mark.parametrize("velocity", [20.0, -20.0, 7.0])
+async def test_a_changed_jog_ends_before_the_software_limit_however_seldom_its_axis_is_polled(dialect, velocity):
+    async with dialect_rig(dialect, NEVER_A_SWITCH, **EVER) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.2)
+
+        await rig.send(MoveVelocity(velocity=velocity))
+        await asyncio.sleep(6.0)
+
+        assert 5.0 < abs(rig.position_mm) < 15.05
+
+
+@pytest.mark.parametrize("duty", [0.9, 0.2, -0.2])
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_duty_ends_before_the_software_limit_however_seldom_its_axis_is_polled(dialect, duty):
+    limits = {"position_min": -200, "position_max": 200}
+    pwm = {"duty": 1.0, "duration_s": 20.0}
+    async with dialect_rig(dialect, NEVER_A_SWITCH, rates=SLOW_RATES, limits=limits, pwm=pwm, acceleration=4000) as rig:
+        await rig.power_on()
+
+        await rig.send(SetPwm(duty=duty, duration_s=10.0))
+        farthest = 0.0
+        for _ in range(1_200):
+            await asyncio.sleep(0.01)
+            rig.drive.catch_up(asyncio.get_running_loop().time())
+            farthest = max(farthest, abs(rig.position_mm))
+
+        assert 50.0 < farthest < 200.0
+        assert (await rig.rig.client.state(AXIS)).command is None
+
+
+async def test_a_duty_towards_a_limit_that_is_reached_is_refused():
+    async with dialect_rig(V4, limits={"position_max": 0.0}, pwm={"duty": 1.0}) as rig:
+        await rig.power_on()
+
+        with pytest.raises(PositionLimit):
+            await rig.send(SetPwm(duty=0.5, duration_s=1.0))
+
+        assert rig.drive.loop.pwm == 0

@@ -107,7 +107,7 @@ class Witness:
             return "nobody holds it"
         if tracker.stop_latched or tracker.stop_pending:
             return "a stop is latched"
-        return f"there is another daemon, {dispatcher.rival}" if dispatcher.rival else None
+        return f"there are other daemons, {dispatcher.rivals}" if dispatcher.rivals else None
 
     def _count(self, daemon: Daemon, name: str, now_s: float) -> None:
         command = daemon.rig.axes[name].tracker.command

@@ -200,7 +200,7 @@ async def test_a_command_that_is_cut_short_is_unknown_and_not_carried_out_again(
 async def test_what_brings_an_axis_to_rest_is_admitted_whatever_else_forbids():
     async with commanded(required=True) as rig:
         await rig.acquired("x", client="bob")
-        rig.dispatcher.rival = "another"
+        rig.dispatcher.rivals.add("another")
         for command in (Stop(not_after=1, instance="other"), Halt(not_after=1, instance="other")):
             await rig.x.pass_s(0.1, **RUNNING)
             await rig.send(command)
@@ -218,10 +218,10 @@ async def test_what_may_move_or_changes_a_drive_is_refused_without_a_right_to_it
         with pytest.raises(LeaseHeld):
             await rig.send(command.model_copy(update={"lease": other.lease}))
         mine = await rig.acquired("x")
-        rig.dispatcher.rival = "another"
+        rig.dispatcher.rivals.add("another")
         with pytest.raises(DuplicateDaemon):
             await rig.send(command.model_copy(update={"lease": mine.lease}))
-        rig.dispatcher.rival = None
+        rig.dispatcher.rivals.clear()
         past_ns = round((asyncio.get_running_loop().time() - 0.5) * 1e9)
         with pytest.raises(CommandExpired, match=r"0\.500 s later"):
             await rig.send(command.model_copy(update={"lease": mine.lease, "not_after": past_ns}))
@@ -273,7 +273,7 @@ async def test_a_buffered_move_is_refused_when_it_comes_too_late_or_a_rival_has_
             async with asyncio.TaskGroup() as group:
                 waiting = group.create_task(_outcome(rig.send(move)), name="next")
                 await asyncio.sleep(0.5)
-                rig.dispatcher.rival = None if late else "another"
+                rig.dispatcher.rivals = set() if late else {"another"}
                 await rig.x.settled()
             assert isinstance(waiting.result(), CommandExpired if late else DuplicateDaemon)
 
@@ -285,7 +285,7 @@ async def test_why_and_preview_tell_what_the_sender_would_be_refused_with_and_do
         mine = await rig.acquired("x")
         assert [cause.code for cause in (await rig.send(Why())).causes] == ["lease_held"]
         assert (await rig.send(Why(lease=mine.lease))).can_move
-        rig.dispatcher.rival = "another"
+        rig.dispatcher.rivals.add("another")
         assert [cause.code for cause in (await rig.send(Why(lease=mine.lease))).causes] == ["duplicate_daemon"]
         rig.x.tracker.referenced = False
         obstacles = (await rig.send(Preview(position=1.0))).obstacles
@@ -300,10 +300,10 @@ async def test_why_and_preview_tell_what_the_sender_would_be_refused_with_and_do
 async def test_a_loss_is_rehearsed_only_by_who_may_move_all_that_it_concerns(kind):
     async with commanded(required=True) as rig:
         mine = await rig.acquired("x")
-        rig.dispatcher.rival = "another"
+        rig.dispatcher.rivals.add("another")
         with pytest.raises(DuplicateDaemon):
             await rig.send(Rehearse(kind=kind, axis="x", lease=mine.lease), "_")
-        rig.dispatcher.rival = None
+        rig.dispatcher.rivals.clear()
         with pytest.raises((LeaseRequired, LeaseHeld)):
             await rig.send(Rehearse(kind=kind, axis="y"), "_")
         if kind is Rehearsal.BUS_LOSS:  # y is on the same line

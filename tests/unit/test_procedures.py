@@ -777,20 +777,20 @@ async def test_an_analog_move_ends_when_the_drive_says_so():
 
 
 @pytest.mark.parametrize(
-    ("seconds", "counts", "failure"),
+    ("seconds", "counts", "limit", "failure"),
     [
-        (0.5, 3100, "not there within 3 mm"),
-        (0.5, -3100, "not there within 3 mm"),
-        (2.5, 100, "not there within 2 s"),
-        (0.5, 2100, "stopped beyond a software limit"),
-        (0.5, -2100, "stopped beyond a software limit"),
-        (0.5, 3000, "not referenced"),
-        (0.5, 2000, None),
-        (0.5, -2000, None),
+        (0.5, 3100, 20.0, "not there within 3 mm"),
+        (0.5, -3100, 20.0, "not there within 3 mm"),
+        (2.5, 100, 20.0, "not there within 2 s"),
+        (0.5, 1900, 2.0, "stopped before a software limit"),
+        (0.5, -1900, 2.0, "stopped before a software limit"),
+        (0.5, 3000, 2.0, "not referenced"),
+        (0.5, 2000, 20.0, None),
+        (0.5, -2000, 20.0, None),
     ],
 )
-async def test_an_analog_move_is_stopped_at_each_of_its_bounds(seconds, counts, failure):
-    limits = {"position_min": -2.0, "position_max": 2.0}
+async def test_an_analog_move_is_stopped_at_each_of_its_bounds(seconds, counts, limit, failure):
+    limits = {"position_min": -limit, "position_max": limit}
     async with axis_bench(analog={"timeout_s": 2.0, "distance": 3.0}, limits=limits) as bench:
         bench.tracker.referenced = failure is None or "limit" in failure
         failure = None if failure == "not referenced" else failure

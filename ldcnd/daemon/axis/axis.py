@@ -270,11 +270,15 @@ class AxisService:
                     else:
                         await self._step()
         finally:
-            self._gate.close()
-            self._changed.set()
             if waiting:
                 waiting.refuse(self._gate.ending())
-            self._queue.refuse(self._gate.ending())
+            self.close()
+
+    def close(self) -> None:
+        """Begin no motion any more: the daemon ends. What waits is refused; stops go on."""
+        self._gate.close()
+        self._changed.set()
+        self._queue.refuse(self._gate.ending())
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
@@ -405,8 +409,8 @@ class AxisService:
 
     def _ask_in_time(self, at_s: float) -> None:
         """Have the drive read when the motion under way should end, and while it settles, whatever the rates."""
-        read_at_s = self.tracker.next_reading_s(at_s)
-        if read_at_s is not None and self.ask_at:
+        read_at_s = min(self.tracker.next_reading_s(at_s) or math.inf, at_s + self._commands.watch_s)
+        if self.ask_at and not math.isinf(read_at_s):
             self.ask_at(read_at_s)
 
     def missed(self, _error: BusError) -> None:
@@ -711,7 +715,9 @@ class AxisService:
         try:
             return await self._commands.carry_out(permit, command)
         finally:
-            if self.tracker.settle:  # the caller that waits for the reply goes first
+            if self.tracker.settle or not math.isinf(
+                self._commands.watch_s
+            ):  # the caller that waits for the reply goes first
                 asyncio.get_running_loop().call_later(FIRST_READING_DELAY_S, self._ask_soon)
 
     def _require_reachable(self) -> None:

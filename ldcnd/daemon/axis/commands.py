@@ -182,6 +182,11 @@ class AxisCommands:
             return NEVER_S
         return self.procedure.deadline_s if self._retry_s is None else self._retry_s
 
+    @property
+    def watch_s(self) -> float:
+        """Longest time between two readings that the procedure allows, in seconds; infinite without one."""
+        return self.procedure.watch_s if self.procedure else NEVER_S
+
     def observed(self, reading: AxisReading, timing: Timing) -> None:
         """Let the procedure under way take the latest reading, after the tracker has."""
         procedure = self.procedure

@@ -418,9 +418,16 @@ class Permit:
         with only_while(self.to_move()):
             await self._gate.driver.load(motion, home=home)
 
-    async def start(self) -> None:
-        """Start what was loaded; see `Moves.start`."""
-        with self._beginning(self.to_move()):
+    async def start(self, *, stays: bool = False) -> None:
+        """Start what was loaded; see `Moves.start`.
+
+        Args:
+            stays: what was loaded ends where the axis stands, so the motion of the command has yet to begin.
+        """
+        condition = self.to_move()
+        if not stays:
+            self.begin()
+        with only_while(condition):
             await self._gate.driver.start()
 
     async def track(self, position_counts: int) -> None:
@@ -428,14 +435,16 @@ class Permit:
         drive = self._gate.driver
         if not isinstance(drive, Tracks):
             raise cannot(drive.spec, "track")
-        with self._beginning(self.to_move()):
+        condition = self.to_move()
+        self.begin()
+        with only_while(condition):
             await drive.track(position_counts)
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
-        """Have the drive go on along a path; see `WalksPaths`."""
+        """Fill the drive's buffer of path points; see `WalksPaths`. A motion begins only with `start_path`."""
         drive = walking(self._gate.driver)
         self.ask_to_move()
-        with self._beginning(self.to_move()):
+        with only_while(self.to_move()):
             return await drive.add_points(steps)
 
     async def power_on(self) -> None:
@@ -443,7 +452,9 @@ class Permit:
         self._to_energise()()
         was_on = self._gate.tracker.enabled
         try:
-            with self._beginning(self._to_energise()):
+            condition = self._to_energise()
+            self.begin()
+            with only_while(condition):
                 await self._gate.driver.power(on=True)
             self.still_wanted()
         except RequestRefused:
@@ -460,10 +471,9 @@ class Permit:
         with only_while(self.ask):
             await drive.set_gains(gains)
 
-    def _beginning(self, condition: Condition) -> only_while:
-        """Return the context of the packets that begin a motion; from now on `not_after` does not count."""
+    def begin(self) -> None:
+        """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
         self._begun = True
-        return only_while(condition)
 
 
 class Gate:
@@ -521,6 +531,8 @@ async def start_path(network: Network, names: frozenset[str], permits: Sequence[
         for condition in conditions:
             condition()
 
+    for permit in permits:
+        permit.begin()
     with only_while(ask_all):
         await network.start_path(names, ask_all)
 

@@ -150,11 +150,19 @@ class AxisMotion:
         position = self.unwrapped(position)
         return round(position * self.counts_per_unit + self.telemetry.origin_counts)
 
-    def unwrapped(self, position: float, direction: Direction | None = None) -> float:
+    def unwrapped(
+        self, position: float, direction: Direction | None = None, *, from_counts: int | None = None
+    ) -> float:
         """Return the position, counted through all turns, to which a request means to go.
 
         Without a modulo that is the position itself. With one it is counted from the commanded position: a position
         equal to that, to a count, is no distance in any direction.
+
+        Args:
+            position: in axis units; any turn of it is meant.
+            direction: in which the axis turns; the shortest way if missing.
+            from_counts: where the axis will be when it turns there, in counts of the drive; the commanded position if
+                missing.
 
         Raises:
             NotSupported: a direction, and the axis has no modulo.
@@ -169,8 +177,9 @@ class AxisMotion:
                     remedy="leave direction out, or configure modulo",
                 )
             return position
-        here_counts = self.latest().position_counts if self.target_counts is None else self.target_counts
-        here = self.telemetry.position(here_counts)
+        if from_counts is None:
+            from_counts = self.latest().position_counts if self.target_counts is None else self.target_counts
+        here = self.telemetry.position(from_counts)
         forward = (position - here) % modulo
         count = 1.0 / abs(self.counts_per_unit)
         if forward < count or modulo - forward < count:

@@ -16,10 +16,12 @@ class Procedure(ABC):
     Attributes:
         permit: of the command that began it.
         deadline_s: when it takes a step without being called for, in loop time.
+        watch_s: longest time between two readings while it runs, seconds, whatever the poll rates.
     """
 
     permit: Permit
     deadline_s: float = NEVER_S
+    watch_s: float = NEVER_S
 
     @abstractmethod
     async def begin(self) -> CommandReply:

@@ -277,7 +277,7 @@ class Dispatcher:
         authority: the leases of the rig.
         leases: gives control and ends it.
         events: what happens to its commands.
-        rival: another daemon that serves the same rig; while there is one, nothing is moved.
+        rivals: instances of the other daemons that serve the same rig; while there is one, nothing is moved.
     """
 
     def __init__(
@@ -292,7 +292,7 @@ class Dispatcher:
         self.authority = authority
         self.leases = LeaseWatch(rig, authority, events, clock)
         self.events = events
-        self.rival: str | None = None
+        self.rivals: set[str] = set()
         self._journal = Journal(rig)
         self._instance = instance
         self._rig = rig
@@ -455,12 +455,13 @@ class Dispatcher:
             )
 
     def _refuse_rival(self, axis: str) -> None:
-        if self.rival:
+        if self.rivals:
+            others = ", ".join(sorted(self.rivals))
             raise DuplicateDaemon(
-                f"axis {axis}: another daemon ({self.rival}) serves rig {self._rig.name}; nothing is moved",
+                f"axis {axis}: rig {self._rig.name} is served by other daemons, too ({others}); nothing is moved",
                 axis=axis,
-                value=self.rival,
-                remedy="end one of the two daemons",
+                value=others,
+                remedy="end all but one of the daemons",
             )
 
 

@@ -153,6 +153,8 @@ class Daemon:
                 log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
                 await self._ending.wait()
                 requests.close()
+                for axis in self.rig.axes.values():
+                    axis.close()  # first: what waits now would begin behind the stop that its policy sends
                 await self._come_to_rest()
                 await self._keep_references()
                 if self._failure:
@@ -202,12 +204,12 @@ class Daemon:
         return Load(sum(load.waiting for load in loads), sum(load.lost for load in loads))
 
     def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
-        """Notice another daemon on the same rig: two of them would move every axis twice."""
+        """Note which other daemons serve this rig: two of them would move every axis twice."""
         address = self._keys.parse_alive(key)
         if address.axis is not None or address.instance == self._run.instance:
             return
         log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
-        self._dispatcher.rival = address.instance if alive else None
+        (self._dispatcher.rivals.add if alive else self._dispatcher.rivals.discard)(address.instance)
 
     async def _come_to_rest(self) -> None:
         """The daemon ends: do to each axis what its policy says; bounded."""

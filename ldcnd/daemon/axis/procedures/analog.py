@@ -5,25 +5,27 @@ Trajectory"): with a sensor that does not follow, for which a slipped coupling i
 limit switches stop it in the drive, where they are armed.
 """
 
+from typing_extensions import override
+
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
-from ldcnd.daemon.axis.procedure import Procedure
-from ldcnd.daemon.axis.state import AxisTracker, Completion
+from ldcnd.daemon.axis.procedures.endless import LATENCY_S, EndlessMotion
+from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import AnalogMotion, AxisReading
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.commands import CommandReply, MoveAnalog
 from ldcnd.model.samples import AxisState
 
 
-class AnalogMove(Procedure):
+class AnalogMove(EndlessMotion):
     """One such motion; it ends when the drive says so, and its only step is to stop at one of its bounds."""
 
     def __init__(self, motion: AxisMotion, permit: Permit, request: MoveAnalog) -> None:
         bounds = motion.config.analog
-        self.permit = permit
-        self._motion = motion
+        super().__init__(motion, permit)
         self._request = request
+        self._speed = 0.0
         self._timeout_s = request.timeout_s or bounds.timeout_s
         self._distance = request.distance or bounds.distance
         self._from_counts = 0
@@ -42,12 +44,13 @@ class AnalogMove(Procedure):
         self._check_target()
         speed = motion.config.velocity if request.velocity is None else request.velocity
         plan = motion.plan_at(speed, request.acceleration)
+        self._speed, self.acceleration = abs(plan.velocity), plan.acceleration
         self._distance = self._distance or abs(plan.velocity) * self._timeout_s
         self._from_counts = motion.latest().position_counts
         await self.permit.load(
             AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
         )
-        self.deadline_s = motion.clock.now_s() + self._timeout_s
+        self._until_s = motion.clock.now_s() + self._timeout_s
         self._failure = f"not there within {self._timeout_s:g} s"
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
         return motion.reply(self.permit, target=request.target, velocity=plan.velocity, acceleration=plan.acceleration)
@@ -61,25 +64,22 @@ class AnalogMove(Procedure):
         if self._distance is not None and travelled > self._distance:
             self._failure = f"not there within {self._distance:g} {motion.config.unit}"
             return True
-        if not tracker.referenced:
-            return False
-        position = motion.telemetry.position(reading.position_counts)
-        low, high = motion.config.limits.position_min, motion.config.limits.position_max
-        if (low is not None and position < low) or (high is not None and position > high):
-            self._failure = "stopped beyond a software limit"
+        if self.ends_before_limit(reading):
+            self._failure = "stopped before a software limit"
             return True
         return False
+
+    @override
+    def fastest(self, velocity: float) -> tuple[float, float]:
+        """See `EndlessMotion`: the drive chooses the direction."""
+        gained = self.acceleration * LATENCY_S
+        forward, backward = min(self._speed, velocity + gained), min(self._speed, gained - velocity)
+        return max(0.0, velocity, forward), max(0.0, -velocity, backward)
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
         await self._motion.end(self.permit, self._failure)
         return False
-
-    def outlived(self, tracker: AxisTracker) -> bool:
-        """See `Procedure`; without a command the drive may still run until it is seen at rest."""
-        if tracker.command is None:
-            return tracker.at_rest
-        return super().outlived(tracker)
 
     def _check_target(self) -> None:
         name, full_scale, target = (

@@ -5,6 +5,7 @@ others have arrived; then the line starts them together, or none of them moves.
 """
 
 import asyncio
+import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
@@ -24,7 +25,7 @@ from ldcnd.model.rig_commands import MoveTogetherReply
 from ldcnd.model.samples import AxisState
 
 MEETING_S = 2.0
-"""A member that has not got its turn by then keeps the whole group from moving."""
+"""Longest wait for the turns of all members, seconds; one that has not got it by then keeps the group from moving."""
 
 
 class GroupMoveRequest(MoveAbsolute):
@@ -77,6 +78,7 @@ class Rendezvous(ABC):
     def __init__(self, names: frozenset[str], *asked: object) -> None:
         self._asked = (names, *asked)
         self._missing = set(names)
+        self._met = asyncio.Event()  # all have come, or one cannot
         self._started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._started.add_done_callback(_retrieve)
 
@@ -97,19 +99,29 @@ class Rendezvous(ABC):
         """Keep the axes from moving: a member cannot; without effect once they were started."""
         if not self._started.done():
             self._started.set_exception(error)
+        self._met.set()
 
     async def _arrived(self, name: str) -> None:
-        """Wait for the others, or start all as the last one."""
+        """Wait for the others, or start all as the last one.
+
+        Only the wait for the others has a limit. From then on the bus bounds each packet, and the outcome of the start
+        is the outcome of every member: a slow line must not have some of them report that none was started.
+        """
         self._missing.discard(name)
         if not self._missing and not self._started.done():
+            self._met.set()
             await self._start()
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(MEETING_S):
-                await asyncio.shield(self._started)
-        except TimeoutError:
-            late = WrongState(f"axes {', '.join(sorted(self._missing))} did not get their turn, so no axis was started")
-            self.fail(late)
-            raise late from None
+                await self._met.wait()
+        if self._missing:
+            self.fail(
+                WrongState(
+                    f"axes {', '.join(sorted(self._missing))} did not get their turn within {MEETING_S:g} s, so no axis"
+                    " was started"
+                )
+            )
+        await asyncio.shield(self._started)
 
     @abstractmethod
     async def _start(self) -> None:

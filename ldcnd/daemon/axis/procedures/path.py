@@ -285,11 +285,6 @@ class PathMember(Procedure):
             guards.check_may_move(tracker)
             guards.check_referenced(tracker)
             walking(motion.driver).check_path()
-            plans = [
-                motion.plan_to(position, self._request.velocity, self._request.acceleration)
-                for position in (*self._request.via, self._request.position)
-            ]
-            self.plan = plans[-1]
             status = await walking(motion.driver).path_status()
             if status.points or status.running or not status.enabled:
                 raise WrongState(
@@ -299,7 +294,7 @@ class PathMember(Procedure):
                     remedy="restart the drive",
                 )
             self._here = status.commanded_counts
-            self._corners = (float(self._here), *(float(plan.motion.target_counts or 0) for plan in plans))
+            self._corners = self._planned_corners(status.commanded_counts)
             await path.join(motion.config.name, self)
         except LdcndError as error:
             path.fail(error)
@@ -308,6 +303,16 @@ class PathMember(Procedure):
         motion.tracker.started(motion.clock.now_s())
         self._wait(path.share_of(self).sent)
         return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
+
+    def _planned_corners(self, here_counts: int) -> tuple[float, ...]:
+        """Plan the move to each corner from the one before; return where the path turns, in counts of the drive."""
+        motion, request = self.motion, self._request
+        corners = [here_counts]
+        for position in (*request.via, request.position):
+            corner = motion.unwrapped(position, request.direction, from_counts=corners[-1])
+            self.plan = motion.plan_to(corner, request.velocity, request.acceleration)
+            corners.append(self.plan.motion.target_counts or 0)
+        return tuple(map(float, corners))
 
     def on_path(self) -> PathAxis:
         """Return the share of this axis."""
@@ -324,7 +329,7 @@ class PathMember(Procedure):
         motion = self.plan.motion
         here = Motion(self._here, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
         await self.permit.load(here)
-        await self.permit.start()
+        await self.permit.start(stays=True)
 
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""

@@ -4,10 +4,12 @@ Nothing in these drives bounds a duty: if this daemon dies, the motor runs on. T
 the axis must be configured for it.
 """
 
+from typing_extensions import override
+
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.guards import Permit
 from ldcnd.daemon.axis.motion import AxisMotion
-from ldcnd.daemon.axis.procedure import Procedure
+from ldcnd.daemon.axis.procedures.endless import LATENCY_S, EndlessMotion
 from ldcnd.daemon.axis.state import AxisTracker, Completion
 from ldcnd.drivers.driver import AxisReading, Motion, PwmOutput, StopMode
 from ldcnd.errors import NotSupported, ValueOutOfRange
@@ -18,13 +20,14 @@ FULL_DUTY = 255
 """Steps of the duty in one direction on these drives."""
 
 
-class PwmRun(Procedure):
+class PwmRun(EndlessMotion):
     """One duty, from the request to the stop that ends it."""
 
     def __init__(self, motion: AxisMotion, permit: Permit, request: SetPwm) -> None:
-        self.permit = permit
-        self._motion = motion
+        super().__init__(motion, permit)
         self._request = request
+        self._seen: tuple[float, float] | None = None  # the latest velocity, and when it was read
+        self._gains = 0.0  # acceleration, as the latest two readings show it
 
     async def begin(self) -> CommandReply:
         """See `Procedure`. A duty under way may be replaced by another."""
@@ -38,20 +41,33 @@ class PwmRun(Procedure):
         speed, rate = motion.config.velocity, motion.config.acceleration
         counts_per_unit = abs(motion.counts_per_unit)
         acceleration = motion.driver.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
+        self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
+        self.check_room(request.duty)
         duty = request.duty if motion.counts_per_unit > 0 else -request.duty
         await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
-        self.deadline_s = motion.clock.now_s() + request.duration_s
+        self._until_s = motion.clock.now_s() + request.duration_s
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
         return motion.reply(
             self.permit, duration_s=request.duration_s, duty=round(request.duty * FULL_DUTY) / FULL_DUTY
         )
 
-    def calls_for_step(self, reading: AxisReading) -> bool:  # noqa: ARG002 - what the drive says is no comfort
-        """See `Procedure`: an axis that lost its command while it was out of sight may still be running."""
-        return self._motion.tracker.command is None
+    @override
+    def fastest(self, velocity: float) -> tuple[float, float]:
+        """See `EndlessMotion`: what a duty leads to depends on motor and load, so its readings tell."""
+        now_s = self._motion.clock.now_s()
+        if self._seen and now_s > self._seen[1]:
+            self._gains = abs(velocity - self._seen[0]) / (now_s - self._seen[1])
+        self._seen = velocity, now_s
+        most = abs(velocity) + self._gains * LATENCY_S
+        return (most, 0.0) if self._request.duty > 0 else (0.0, most)
+
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        """See `Procedure`: a limit is near, or the command was lost while out of sight; it may still be running."""
+        return self.ends_before_limit(reading) or self._motion.tracker.command is None
 
     async def step(self) -> bool:
-        """See `Procedure`: the time is over. An axis that has meanwhile failed is switched off instead."""
+        """See `Procedure`: its time is over, or a limit near. An axis that has failed meanwhile is switched off."""
         ours = self._motion.tracker.command is not None
         await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)
         if ours:
