@@ -374,7 +374,9 @@ async def test_nothing_is_moved_until_the_last_of_several_other_daemons_has_gone
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.001, 0.003, 0.006, 0.01, 0.02, 0.05])
-@pytest.mark.parametrize("command", [Jog(velocity=5.0, hold_s=1.0), MoveVelocity(velocity=5.0), Home()], ids=lambda each: each.verb)
+@pytest.mark.parametrize(
+    "command", [Jog(velocity=5.0, hold_s=1.0), MoveVelocity(velocity=5.0), Home()], ids=lambda each: each.verb
+)
 async def test_no_motion_begins_once_the_daemon_ends(command, after_s, tmp_path):
     chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
     settings = simulated_config(baud=19_200).model_copy(update={"state_dir": tmp_path})
