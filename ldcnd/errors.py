@@ -48,6 +48,7 @@ class ErrorCode(StrEnum):
     STOP_LATCHED = "stop_latched"
     ABORTED = "aborted"
     AXIS_UNREACHABLE = "axis_unreachable"
+    NOT_IDENTIFIED = "not_identified"
     TOO_MANY_REQUESTS = "too_many_requests"
     DUPLICATE_DAEMON = "duplicate_daemon"
     SHUTTING_DOWN = "shutting_down"
@@ -398,6 +399,14 @@ class AxisUnreachable(RequestRefused):
     code = ErrorCode.AXIS_UNREACHABLE
     retryable = True
     way_out = "check power of the drive and the line"
+
+
+class NotIdentified(RequestRefused):
+    """What answers is not proven to be what is configured, on a line that is taken over; it may only be stopped."""
+
+    code = ErrorCode.NOT_IDENTIFIED
+    retryable = True
+    way_out = "correct the wiring or the configuration; the message says what was expected and what answers"
 
 
 class TooManyRequests(RequestRefused):

@@ -25,6 +25,19 @@ class ReplyVerdict(Enum):
     """An intact reply by which the node says it did not execute our damaged packet; resending is always safe."""
 
 
+class Effect(Enum):
+    """What a packet does to the one who takes it."""
+
+    READS = "reads"
+    """Nothing, or it only fills up what was received in part."""
+    RELIEVES = "relieves"
+    """It takes energy out: it stops the motor or switches it off, and does nothing else."""
+    ARRANGES = "arranges"
+    """It gives an address, a group or a rate, or resets who is to be given one."""
+    CHANGES = "changes"
+    """Anything else."""
+
+
 @dataclass(frozen=True, slots=True)
 class Exchange(Generic[ReplyT]):
     """A request and the properties of its reply that the bus needs.
@@ -39,9 +52,10 @@ class Exchange(Generic[ReplyT]):
             exchange without a reply, the quiet time that the line needs after it.
         repeatable: may the bus send the request again after its reply was lost? Never true for what could move a
             drive twice.
-        moves: can make a motor move or change how it does; see `only_while` of the bus.
         total_bytes: for replies whose length depends on their content: given the received bytes, the total length, or
             None when it is not known yet. When absent the length is `reply_bytes`.
+        effect: a codec that does not say what its packet does gets the strictest treatment: see `Proofs` and
+            `only_while` of the bus.
     """
 
     node: int
@@ -52,7 +66,7 @@ class Exchange(Generic[ReplyT]):
     response_s: float
     repeatable: bool
     total_bytes: Callable[[bytes], int | None] | None = None
-    moves: bool = False
+    effect: Effect = Effect.CHANGES
 
 
 @dataclass(frozen=True, slots=True)

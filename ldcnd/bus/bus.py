@@ -7,13 +7,14 @@ from typing_extensions import override
 
 from ldcnd.bus.line import Line, Phase, Users
 from ldcnd.bus.poller import Poller
+from ldcnd.bus.proof import Proofs
 from ldcnd.bus.queue import POLL, ExchangeQueue, Lane, PhaseOrder
 from ldcnd.bus.resync import Resync
 from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.transaction import Job, StopProbe, Transaction, condition_in_force
+from ldcnd.bus.transaction import Job, StopProbe, Transaction
 from ldcnd.bus.wire import BusStatistics
 from ldcnd.errors import BadReply, BusDown, BusError, LdcndError, NotSupported, PacketRejected, TransportLost
-from ldcnd.exchange import Exchange, Timing
+from ldcnd.exchange import Effect, Exchange, Timing
 from ldcnd.log import get_logger
 from ldcnd.transport.adapter import LineErrors
 from ldcnd.transport.transport import Opener, Transport
@@ -118,14 +119,22 @@ LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
 
+READS = Effect.READS  # looked up slowly in its class
+
+
 class Bus(Users):
-    """The owner of one line; every method runs on the event loop that `run` runs on."""
+    """The owner of one line; every method runs on the event loop that `run` runs on.
+
+    Attributes:
+        proofs: who is known to be at which address; what changes anything is sent to no other.
+    """
 
     def __init__(self, settings: BusSettings, opener: Opener) -> None:
         self.settings = settings
         self.statistics = BusStatistics()
         self.wire_log = WireLog(settings.recorded_s, settings.recorded_bytes)
         self.resync = Resync()
+        self.proofs = Proofs()
         self._opener = opener
         self._loop = asyncio.get_running_loop()
         self._order = PhaseOrder(settings.cycle) if settings.cycle else None
@@ -147,9 +156,9 @@ class Bus(Users):
         With `once` it is not sent again when the node reports that the packet was damaged: the damage may be in that
         report, and then the packet was executed.
 
-        An exchange that can cause motion is sent only if the condition of the caller's context (`only_while`) holds
-        when its turn comes. Cancelling the caller never leaves half a packet on the wire; a sent exchange completes
-        and its reply is dropped.
+        When its turn comes, an exchange that changes anything is sent only to who is proven to be who is meant
+        (`Proofs`), and only if the condition of the caller's context (`only_while`) holds. Cancelling the caller never
+        leaves half a packet on the wire; a sent exchange completes and its reply is dropped.
 
         Raises:
             BusDown: the line is not open, or was lost before the request was sent.
@@ -158,6 +167,7 @@ class Bus(Users):
             OutcomeUnknown: the reply was lost and the exchange must not be repeated.
             PacketRejected: the node refused our packet as damaged at every attempt; it was not executed.
             BadReply: the reply was intact but makes no sense.
+            AxisUnreachable, NotIdentified: not proven to be who is meant; nothing was sent.
             LdcndError: as the condition refused it; nothing was sent.
         """
         return await self._submit(exchange, lane, once=once)
@@ -332,7 +342,7 @@ class Bus(Users):
 
     def _job(self, exchange: Exchange[Any], lane: Lane, *, once: bool = False) -> Job:
         attempts = 1 if once else self.settings.attempts
-        condition = condition_in_force() if exchange.moves and lane is not Lane.STOP else None
+        condition = self.proofs.condition(exchange, lane)
         future: asyncio.Future[Any] = self._loop.create_future()
         return Job(exchange, lane, self._loop.time(), future, attempts=attempts, condition=condition)
 
@@ -404,8 +414,10 @@ class Bus(Users):
             poller = self._queue.polls.take(now_s)
             if poller is None:
                 return None
-            wanted_at_s = poller.due_at_s
-            return PollTransaction(poller, poller.next_exchange(now_s), wanted_at_s)
+            wanted_at_s, exchange = poller.due_at_s, poller.next_exchange(now_s)
+            if exchange.effect is not READS:
+                raise AssertionError(f"the poll {exchange.request.hex(' ')} does not say that it only reads")
+            return PollTransaction(poller, exchange, wanted_at_s)
         job.attempts_left -= 1
         if isinstance(job, StopProbe):
             self.statistics.stop_wait.add(now_s - job.wanted_at_s)
@@ -444,6 +456,7 @@ class Bus(Users):
             self._order.observe(exchange.node, timing)
         if not exchange.reply_bytes or exchange.node not in mute.misses:
             return
+        self.proofs.answered(exchange.node)
         if (also := mute.answered(exchange.node)) is not None:
             for poller in self._pollers:
                 if poller.node == also:
@@ -453,6 +466,7 @@ class Bus(Users):
     def missed(self, transaction: Transaction, now_s: float) -> None:
         node = transaction.exchange.node
         self._mute.missed(node)
+        self.proofs.missed(node, self._mute.misses[node])
         if isinstance(transaction, PollTransaction):
             pause_s = self._mute.pause_s(
                 node, self.longest_s(transaction.exchange) + self.settings.margin_s + self.quarantine_s
@@ -477,5 +491,6 @@ class Bus(Users):
         self._opened.clear()
         self._closed.set()
         self._pollers.clear()
+        self.proofs.lose_all(f"the line was lost ({reason})")
         for waiting in self._queue.drain():
             waiting.fail(BusDown(f"bus {self.settings.name} was lost ({reason}) before the exchange was complete"))

@@ -25,7 +25,7 @@ _condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
 
 
 class only_while:  # noqa: N801 - read as a statement
-    """Let what can move, when queued in this context, be sent only if the condition still holds when its turn comes.
+    """Let what changes anything, when queued in this context, be sent only if the condition holds when its turn comes.
 
     A queue may be long: the condition is checked between it and the wire. Stops are not subject to any condition.
     """

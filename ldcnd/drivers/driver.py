@@ -238,7 +238,8 @@ class ReadingListeners:
 class Drive(ABC):
     """One drive, as far as all are alike; what it can do it inherits from the contracts below.
 
-    An exchange that can make a motor move says so (`Exchange.moves`): the bus checks its permit when its turn has come.
+    An exchange says what it does (`Exchange.effect`): the bus checks the permit of one that changes anything when its
+    turn has come, and that the drive is known to be this one.
 
     Attributes:
         spec: what the configuration says.

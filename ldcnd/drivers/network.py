@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ldcnd.bus.poller import Poller
+from ldcnd.bus.proof import Proof
 from ldcnd.bus.resync import Resync
 from ldcnd.drivers.driver import Drive, Motion, StopMode
 from ldcnd.errors import NotSupported
@@ -200,11 +201,13 @@ class IoDriver(ABC):
 
     Attributes:
         name: as configured.
+        proof: that who answers is this module.
         observed: called with each reading.
         lost: called when a poll brought nothing.
     """
 
     name: str
+    proof: Proof
     observed: Callable[[IoReading, Timing], None]
     lost: Callable[[], None]
 
@@ -321,7 +324,7 @@ class Network(ABC):
 
     @abstractmethod
     async def bring_up(self) -> BringUpReport:
-        """Make the drives ready to be polled, moving nothing.
+        """Make the drives ready to be polled, moving nothing, and prove those that were identified (`Bus.proofs`).
 
         Raises:
             NetworkMismatch: what answers is not what the configuration expects; says precisely what differs.

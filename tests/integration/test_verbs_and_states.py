@@ -74,7 +74,7 @@ TABLE = {
     "error": row(motions=WRONG, power_on=WRONG),
     "error, moving": row(motions=WRONG, power_on=WRONG, reset=WRONG),
     "error, latched": row(motions=LATCHED, power_on=LATCHED),
-    "away": dict.fromkeys(COMMANDS, AWAY),
+    "away": dict.fromkeys(COMMANDS, AWAY) | {"halt": TAKEN, "power off": TAKEN},
 }
 
 

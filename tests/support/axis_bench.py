@@ -13,6 +13,7 @@ from typing import Any, cast
 from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
+from ldcnd.bus.proof import Proofs
 from ldcnd.config.axis import AxisConfig
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.guards import UNCONDITIONAL, Right
@@ -164,6 +165,7 @@ class IdleBus:
         distrusted: how often late replies were to be looked for.
         withdrawn: the nodes whose waiting exchanges were withdrawn, with the reasons.
         during: what happens while an exchange is under way, once.
+        proofs: as of a `Bus`.
     """
 
     def __init__(self) -> None:
@@ -171,6 +173,7 @@ class IdleBus:
         self.distrusted = 0
         self.withdrawn: list[tuple[int, LdcndError]] = []
         self.during: Happening | None = None
+        self.proofs = Proofs()
 
     async def execute(self, exchange: Exchange[Any], *_args: object, **_kwargs: object) -> object:
         """Answer an exchange."""
@@ -199,6 +202,8 @@ class AxisBench:
     def __init__(self, config: AxisConfig, publisher: Publisher) -> None:
         self.drive = FakeDrive()
         self.bus = IdleBus()
+        self.proof = self.bus.proofs.expect(self.drive.spec.address, f"axis {config.name}", config.name)
+        self.proof.prove()
         self.ended: list[tuple[str, CommandStatus, str | None]] = []
         self.notes: list[tuple[str, CommandStatus, str]] = []
         self._ids = iter(f"own-{number}" for number in range(1000))

@@ -5,6 +5,7 @@ from collections.abc import Awaitable, Callable
 from types import SimpleNamespace
 from typing import TypeVar
 
+from ldcnd.bus.proof import Proofs
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
 from ldcnd.exchange import Exchange
@@ -26,7 +27,7 @@ class DirectBus:
         sent: the commands, each with its lane.
         instead: what happens before the next packet of a command; if it raises, the packet is not sent.
         after: what happens after the next packet of a command, before its reply is taken.
-        settings, baud: as of a `Bus`.
+        settings, baud, proofs: as of a `Bus`.
     """
 
     def __init__(self, host: SimulatedHost) -> None:
@@ -37,6 +38,7 @@ class DirectBus:
         self.after: dict[Command, Interference] = {}
         self.settings = SimpleNamespace(name="direct", bits_per_byte=10)
         self.baud = 19_200
+        self.proofs = Proofs()
 
     async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
         """Carry an exchange out; `once` makes no difference where nothing is repeated."""

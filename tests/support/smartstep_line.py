@@ -139,6 +139,8 @@ async def smartstep_line(
     )
     network = SmartStepNetwork(bus, specs)
     bus.resync = network.resync
+    for spec in specs:  # as after a bring-up
+        bus.proofs.expect(spec.axis.address, spec.axis.name).prove()
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name="bus")
         try:

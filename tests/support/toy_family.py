@@ -11,7 +11,7 @@ from typing_extensions import override
 from ldcnd.bus.poller import Poller
 from ldcnd.bus.resync import Resync
 from ldcnd.errors import BadReply, BusError
-from ldcnd.exchange import Exchange, ReplyVerdict, Timing
+from ldcnd.exchange import Effect, Exchange, ReplyVerdict, Timing
 from tests.support.scripted_line import Say, Script
 
 REQUEST_BYTES = 6
@@ -77,6 +77,7 @@ def exchange(
         decode=decode if reply_bytes else lambda _data: number,
         response_s=response_s,
         repeatable=repeatable,
+        effect=Effect.READS,
     )
 
 
@@ -99,6 +100,7 @@ def probe(avoid: AbstractSet[int]) -> Exchange[int] | None:
         decode=_decode_probe,
         response_s=RESPONSE_S,
         repeatable=True,
+        effect=Effect.READS,
     )
 
 

@@ -31,7 +31,7 @@ from ldcnd.drivers.driver import (
 from ldcnd.drivers.network import BringUpReport, Network
 from ldcnd.drivers.transcript import Describe
 from ldcnd.errors import BadReply, NetworkMismatch, NotSupported, ReplyTimeout
-from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.exchange import Effect, Exchange, ReplyVerdict
 from ldcnd.families.family import Demand, Family, Line, OpenLine, bus_settings
 from ldcnd.model.catalogue import verbs_for
 from ldcnd.model.commands import Capability, Verb
@@ -70,6 +70,9 @@ class Op(IntEnum):
     STATUS, ENABLE, DISABLE, LOAD, START, STOP = range(6)
 
 
+EFFECTS = {Op.STATUS: Effect.READS, Op.DISABLE: Effect.RELIEVES, Op.STOP: Effect.RELIEVES}
+
+
 class Flag(IntFlag):
     ENABLED = 1
     AT_REST = 2
@@ -105,7 +108,14 @@ def decode(data: bytes) -> AxisReading:
 
 def exchange(node: int, op: Op, position: int = 0, velocity: int = 0) -> Exchange[AxisReading]:
     return Exchange(
-        node, frame(REQUEST, node, op, position, velocity), FRAME_BYTES, check, decode, RESPONSE_S, op is not Op.START
+        node,
+        frame(REQUEST, node, op, position, velocity),
+        FRAME_BYTES,
+        check,
+        decode,
+        RESPONSE_S,
+        op is not Op.START,
+        effect=EFFECTS.get(op, Effect.CHANGES),
     )
 
 
@@ -175,6 +185,7 @@ class ToyNetwork(Network):
             except ReplyTimeout as error:
                 raise NetworkMismatch(f"axis {name} does not answer") from error
             stage.identity = "Toy stage"
+            self._bus.proofs.expect(stage.spec.address, f"axis {name}", name).prove()
         return BringUpReport(BAUD, dict.fromkeys(self._stages, "Toy stage"), reset=False)
 
 

@@ -13,6 +13,7 @@ from ldcnd.errors import (
     NotSupported,
     WrongState,
 )
+from ldcnd.exchange import Effect
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.toy_family import ToyPoller
@@ -61,8 +62,9 @@ async def test_what_can_move_is_sent_only_if_its_condition_holds_when_its_turn_c
         if not held:
             raise WrongState("not any more")
 
-    moving = replace(toy.exchange(2), moves=True)
+    moving = replace(toy.exchange(2), effect=Effect.CHANGES)
     async with running(rig) as callers:
+        rig.bus.proofs.expect(1, "node 1").prove()
         callers.create_task(rig.bus.execute(toy.exchange(1)), name="first")
         await asyncio.sleep(0)
         with only_while(condition):

@@ -11,7 +11,7 @@ from typing_extensions import override
 from ldcnd.bus.queue import Lane
 from ldcnd.bus.transaction import only_while
 from ldcnd.errors import BusError
-from ldcnd.exchange import Exchange, Timing
+from ldcnd.exchange import Effect, Exchange, Timing
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.scripted_line import Say
@@ -57,7 +57,7 @@ def busy(rig: Rig, story: list[str]) -> list[NotedPoller]:
 
 
 def moving(number: int) -> Exchange[int]:
-    return replace(toy.exchange(number, node=9), moves=True)
+    return replace(toy.exchange(number, node=9), effect=Effect.CHANGES)
 
 
 async def test_readings_of_a_busy_line_come_several_at_a_time_in_order_and_in_time():
@@ -118,6 +118,7 @@ async def test_permission_to_move_is_asked_of_all_that_the_drives_have_said():
         asked.append((asyncio.get_running_loop().time(), [timing for poller in pollers for timing in poller.timings]))
 
     async with running(rig) as callers:
+        rig.bus.proofs.expect(9, "node 9").prove()
         pollers = busy(rig, [])
         await asyncio.sleep(0.1)
         for number in range(40):

@@ -13,7 +13,7 @@ from ldcnd.drivers.ldcn.profiles import PROFILES
 from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
-from ldcnd.exchange import ReplyVerdict
+from ldcnd.exchange import Effect, ReplyVerdict
 
 LS_182AP = PROFILES["ls-182ap"]
 V1, V2, V3, V4 = (PROFILES[f"pic-servo-v{version}"] for version in (1, 2, 3, 4))
@@ -90,24 +90,36 @@ def test_a_node_address_is_a_byte(address):
 
 
 @pytest.mark.parametrize("to", [NODE, Group(0x81, LS_182AP)])
-def test_what_can_move_a_motor_says_so(to):
+def test_a_packet_says_what_it_does(to):
     standing = Trajectory(velocity=0, acceleration=1, mode=ProfileMode.VELOCITY)
-    moving = (
-        commands.start_motion(to),
-        commands.load_trajectory(to, standing),
-        commands.stop_motor(to, StopControl.AMP_ENABLE | StopControl.SMOOTH),
-        commands.set_gain(to, GAINS),
-    )
-    quiet = (
-        commands.read_status(to, StatusItem.AUX),
-        commands.no_operation(to),
-        commands.clear_sticky_bits(to),
-        commands.hard_reset(to),
-        commands.unanswered(0xFF, b"", QUIET_S, repeatable=False),
-    )
+    amplifier = StopControl.AMP_ENABLE
+    told = {
+        Effect.READS: (commands.read_status(to, StatusItem.AUX), commands.no_operation(to)),
+        Effect.RELIEVES: (
+            commands.stop_motor(to, StopControl.MOTOR_OFF),
+            commands.stop_motor(to, amplifier | StopControl.SMOOTH),
+            commands.stop_motor(to, amplifier | StopControl.ABRUPT),
+        ),
+        Effect.ARRANGES: (commands.hard_reset(to), commands.set_address(to, 1, 0x81)),
+        Effect.CHANGES: (
+            commands.start_motion(to),
+            commands.load_trajectory(to, standing),
+            commands.set_gain(to, GAINS),
+            commands.close_loop(to),
+            commands.stop_motor(to, amplifier),
+            commands.stop_motor(to, amplifier | StopControl.HERE, 5),
+            commands.clear_sticky_bits(to),
+            commands.reset_position(to),
+            commands.define_status(to, StatusItem(0)),
+            commands.set_homing(to, HomingControl(0)),
+            commands.save_home(to),
+            commands.unanswered(0xFF, b"", QUIET_S, repeatable=False),
+        ),
+    }
 
-    assert all(exchange.moves for exchange in moving)
-    assert not any(exchange.moves for exchange in quiet)
+    assert {effect: {exchange.effect for exchange in exchanges} for effect, exchanges in told.items()} == {
+        effect: {effect} for effect in told
+    }
 
 
 def test_what_could_act_twice_is_never_repeated():

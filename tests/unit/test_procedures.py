@@ -353,7 +353,7 @@ async def test_a_search_by_position_error_resets_the_drive_and_closes_the_loop_a
             bench.drive.during[stopped] = bench.stop
         await bench.send(Home(method=HomeMethod.POSITION_ERROR, velocity=5.0), "home")
         await bench.pass_s(0.1, **SEARCHING)
-        await bench.pass_s(0.1, enabled=False, **CAPTURED)
+        await bench.pass_s(0.1, **CAPTURED | {"enabled": False, "velocity_counts_per_s": 0.0})
 
         assert bench.drive.calls[2:4] == ["reset", "stop" if stopped == "reset" else "captured_home"]
         assert ("power" in bench.drive.calls) is (stopped != "reset")

@@ -49,9 +49,11 @@ from ldcnd.model.commands import (
     BufferMode,
     Capability,
     CommandReply,
+    Halt,
     Jog,
     Move,
     MoveAbsolute,
+    Power,
     Preview,
     PreviewReply,
     QuickStop,
@@ -204,8 +206,9 @@ class AxisService:
         self.driver = driver
         self.stoppable = Verb.STOP in driver.capabilities
         tracker = AxisTracker if self.stoppable else ObservedTracker
+        self._proof = bus.proofs.expect(driver.spec.address, f"axis {config.name}", config.name)
         self._arrivals = Arrivals(config, self._shown_at, ended, note)
-        self.tracker = tracker(config.name, config.unit, self._arrivals.ended)
+        self.tracker = tracker(config.name, config.unit, self._arrivals.ended, self._proof)
         self.telemetry = AxisTelemetry(
             publisher,
             self.tracker,
@@ -327,6 +330,9 @@ class AxisService:
         tracker, gate = self.tracker, self._plausibility
         if self._pending is not None and tracker.stop_pending:
             self.stop_wanted.set()  # it replies again, whatever it says
+        if not self._proof.holds:
+            self.missed(BadReply(f"axis {self.config.name}: who answers was not identified", axis=self.config.name))
+            return False
         verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
         if verdict is Verdict.BELIEVED:
             if gate.confirmed:  # items that only the first of two readings has are valid as well
@@ -346,7 +352,10 @@ class AxisService:
         return verdict is Verdict.ASK_AGAIN
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        """Process an accepted reading."""
+        """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
+        if not self._proof.holds:
+            self.missed(BadReply(f"axis {self.config.name}: who answers was not identified", axis=self.config.name))
+            return
         tracker, arrivals = self.tracker, self._arrivals
         was_away = self._seen and tracker.link is LinkState.DOWN
         self._seen = True
@@ -468,6 +477,11 @@ class AxisService:
         permit = permit or self.permit(self._next_command_id(), command.verb)
         if isinstance(command, Stop | QuickStop) and self.stoppable:
             await self.stop(StopMode.SMOOTH if isinstance(command, Stop) else StopMode.ABRUPT)
+            return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
+        off = isinstance(command, Power) and not command.on
+        if (off or isinstance(command, Halt)) and self.tracker.link is LinkState.DOWN and self.stoppable:
+            # whatever is there, and whatever it does: it comes to rest as by a stop, as soon as it can be heard
+            await self.bring_to_rest(StopMode.OFF if off else StopMode.SMOOTH, command.verb)
             return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
         if command.verb not in self.driver.capabilities:
             raise NotSupported(
@@ -617,7 +631,10 @@ class AxisService:
                 asked_s = self._clock.now_s()
                 reading = await self._read()
                 now_s = self._clock.now_s()
-                self.observed(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
+                if self._proof.holds:
+                    self.observed(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
+                else:
+                    self.tracker.enabled = reading.enabled
         except LdcndError as error:  # a stop that comes now withdraws the reading, and is sent itself
             log.warning("stop not sent again", axis=self.config.name, reason=error.message)
             return

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+from ldcnd.bus.transaction import only_while
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.guards import Permit, cannot
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
@@ -263,15 +264,13 @@ class AxisCommands:
         if on:
             guards.check_may_power_on(tracker)
             guards.check_stands(tracker)
+            await self._motion.check_does_not_coast()
             if self._gains is None and isinstance(self._driver, TakesGains):
                 raise WrongState(
                     f"axis {tracker.name} has no gains: its loop cannot close",
                     axis=tracker.name,
                     remedy=Remedy("configure gains or {}", step("set_gains")),
                 )
-        else:
-            guards.check_reachable(tracker)
-        if on:
             await permit.power_on()
         else:
             await self._driver.stop(StopMode.OFF)
@@ -283,7 +282,6 @@ class AxisCommands:
 
     async def _halt(self, permit: Permit) -> CommandReply:
         tracker = self._tracker
-        guards.check_reachable(tracker)
         if tracker.state in MOTION_STATES or self._moves_by_force():
             await self._driver.stop(StopMode.SMOOTH)
             self.brought_to_rest(permit.command_id, permit.verb)
@@ -525,5 +523,6 @@ class AxisCommands:
         guards.check_reachable(self._tracker)
         if not isinstance(self._driver, HasOutputs):
             raise cannot(self._driver.spec, "set outputs")
-        await self._driver.set_outputs(request.limit1, request.limit2)
+        with only_while(permit.ask):
+            await self._driver.set_outputs(request.limit1, request.limit2)
         return self._motion.reply(permit)

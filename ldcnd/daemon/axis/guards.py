@@ -55,7 +55,9 @@ from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
 
 
 def check_reachable(axis: AxisTracker) -> None:
-    """Refuse when the drive does not answer."""
+    """Refuse when the drive does not answer, or is not known to be the one that is configured."""
+    if axis.proof:
+        axis.proof.check()
     if axis.link is LinkState.DOWN:
         raise AxisUnreachable(
             f"axis {axis.name}: the drive does not answer", axis=axis.name, remedy="check its power and the line"
@@ -123,6 +125,20 @@ def check_stands(axis: AxisTracker) -> None:
             axis=axis.name,
             value=axis.state,
             remedy=Remedy("{} and wait", step("halt")),
+        )
+
+
+def check_does_not_coast(axis: AxisTracker) -> None:
+    """Refuse to close the loop while the shaft turns: the drive would hold it where it is, at once.
+
+    A shaft turns when its drive shows a velocity, which is more than a count in a servo cycle: one that creeps, as a
+    load that sinks, can be caught.
+    """
+    if axis.coasts:
+        raise WrongState(
+            f"axis {axis.name} turns with its motor off: its drive would hold it at once, whatever its speed",
+            axis=axis.name,
+            remedy=Remedy("wait until it stands, then {}", step("power", 'send power {"on": true}', on=True)),
         )
 
 
@@ -449,10 +465,15 @@ class Permit:
 
     async def power_on(self) -> None:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
-        self._to_energise()()
-        was_on = self._gate.tracker.enabled
+        energise, tracker = self._to_energise(), self._gate.tracker
+
+        def condition() -> None:
+            energise()
+            check_does_not_coast(tracker)
+
+        condition()
+        was_on = tracker.enabled
         try:
-            condition = self._to_energise()
             self.begin()
             with only_while(condition):
                 await self._gate.driver.power(on=True)

@@ -15,6 +15,7 @@ from ldcnd.daemon.axis.guards import (
     Permit,
     QuietDrive,
     check_acceleration,
+    check_does_not_coast,
     check_position,
     check_velocity,
     no_speed,
@@ -39,6 +40,9 @@ from ldcnd.errors import (
 from ldcnd.messaging.codec import error_reply
 from ldcnd.model.commands import CommandReply, Direction, Preview, PreviewReply, Verb
 from ldcnd.model.samples import AxisState
+
+LOOK_AGAIN_S = 0.02
+"""From one look at a shaft that turns to the next one, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +134,24 @@ class AxisMotion:
         """Plan with other limits and speeds from now on."""
         self.config = config
         self._window_counts = window_counts(config)
+
+    async def check_does_not_coast(self, within_s: float = 0.0) -> None:
+        """Refuse to close the loop of a shaft that turns, by a reading of now: an older one may be of its motion.
+
+        Args:
+            within_s: how long to wait until it stands.
+
+        Raises:
+            WrongState: it turns.
+            BusError: the line failed.
+        """
+        until_s = self._loop.time() + within_s
+        while not self.tracker.enabled:
+            self.tracker.looked_at(await self.read())
+            if not self.tracker.coasts or self._loop.time() >= until_s:
+                break
+            await asyncio.sleep(LOOK_AGAIN_S)
+        check_does_not_coast(self.tracker)
 
     def latest(self) -> AxisReading:
         """Return the latest reading.

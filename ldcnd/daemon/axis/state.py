@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from ldcnd.bus.proof import Proof
 from ldcnd.config.axis import AxisConfig
 from ldcnd.drivers.driver import AxisReading, Fault
 from ldcnd.exchange import Timing
@@ -205,11 +206,13 @@ class RestJudge:
 
     Attributes:
         rests: whether it does; None while that is not known.
+        turns: the latest reading shows a velocity.
         commanded: the drive's profile is one of this daemon's.
     """
 
     def __init__(self) -> None:
         self.rests: bool | None = None
+        self.turns = False
         self.commanded = False
         self._since_s: float | None = None  # from when on positions have stayed together
         self._low = self._high = 0
@@ -217,7 +220,7 @@ class RestJudge:
 
     def forget(self, *, rests: bool | None = None, commanded: bool = False) -> None:
         """Discard the readings so far: the drive was out of reach, or something was commanded."""
-        self.rests, self.commanded = rests, commanded
+        self.rests, self.turns, self.commanded = rests, False, commanded
         self._since_s, self._quiet_s = None, REST_S
 
     def observed(self, reading: AxisReading, at_s: float) -> None:
@@ -225,13 +228,13 @@ class RestJudge:
         position = reading.position_counts
         runs = reading.enabled and not reading.profile_done
         if runs or abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s:
-            self.rests, self._since_s, self._quiet_s = False, None, REST_S
+            self.rests, self.turns, self._since_s, self._quiet_s = False, True, None, REST_S
             return
         if self.commanded and reading.enabled:
             self.rests = True
             return
         if self._since_s is None:
-            self._since_s, self._low, self._high = at_s, position, position
+            self.turns, self._since_s, self._low, self._high = False, at_s, position, position
             return
         self._low, self._high = min(self._low, position), max(self._high, position)
         held_s = at_s - self._since_s
@@ -250,17 +253,20 @@ class AxisTracker:
         refused: why the reference that an earlier daemon has kept was refused; empty when none was, and once there is
             another one.
         settle: judges the end of the motion under way; None where the end of its profile is its end.
+        proof: that who answers is its drive; None for an axis without a line.
     """
 
-    def __init__(self, name: str, unit: str, ended: Ended = _ignore_end) -> None:
+    def __init__(self, name: str, unit: str, ended: Ended = _ignore_end, proof: Proof | None = None) -> None:
         """Begin in ignorance.
 
         Args:
             name: of the axis.
             unit: of the axis.
             ended: called for every command that is over.
+            proof: that who answers is its drive.
         """
         self._ended = ended
+        self.proof = proof
         self.name = name
         self.unit = unit
         self.state = AxisState.DISABLED
@@ -321,6 +327,11 @@ class AxisTracker:
     def at_rest(self) -> bool:
         """Whether the readings prove that nothing moves."""
         return self._rest.rests is True
+
+    @property
+    def coasts(self) -> bool:
+        """Whether the shaft is seen to turn while the motor is off."""
+        return self._rest.turns and not self.enabled
 
     @property
     def energised(self) -> bool:
@@ -478,6 +489,10 @@ class AxisTracker:
         if reason:
             self.last_error = f"{command.verb}: {reason}"
         self._ended(command, status, reason, settled)
+
+    def looked_at(self, reading: AxisReading) -> None:
+        """Take from a reading out of turn whether the shaft turns."""
+        self._rest.turns = abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s
 
     # -- what was commanded ------------------------------------------------------------------------------------------
 

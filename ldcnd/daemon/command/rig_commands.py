@@ -140,8 +140,7 @@ class RigCommands:
                 return await module.set_io(command, lambda: self._admit_module(module, command))
             case SetIoTimer():
                 module = self._rig.modules[command.module]
-                self._admit_module(module, command)
-                return await module.set_timer(command)
+                return await module.set_timer(command, lambda: self._admit_module(module, command))
             case Rehearse():
                 for name in concerned(self._rig, command):
                     self._admit(name, command.lease)

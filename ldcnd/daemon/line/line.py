@@ -12,7 +12,7 @@ from ldcnd.daemon.axis.polling import AxisPoller
 from ldcnd.daemon.clock import Clock
 from ldcnd.drivers.driver import PollsItself, Readable, ReadingListeners, StopMode
 from ldcnd.drivers.network import BringUpReport, Network
-from ldcnd.errors import BusDown, BusError, LdcndError, WrongState
+from ldcnd.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
 from ldcnd.log import get_logger
 from ldcnd.model.commands import Verb
 from ldcnd.model.rig_commands import CapturedInputs, SnapshotReply
@@ -162,6 +162,7 @@ class BusService:
                 if error.message != self.problem:
                     log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
                 self.problem = error.message
+                self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
                 await self._pause(retry_s)
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue
@@ -217,6 +218,7 @@ class BusService:
         loop = asyncio.get_running_loop()
         while not await self._closed_within(pause_s):
             pause_s = FIRST_SCAN_PAUSE_S
+            self.bus.proofs.heard_again.clear()
             await self._send_pending_stops()
             if not self.network.incomplete():
                 continue
@@ -244,15 +246,16 @@ class BusService:
                 log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
 
     async def _closed_within(self, pause_s: float) -> bool:
-        """Tell whether the line is lost within a time, or before a stop must be sent again."""
+        """Tell whether the line is lost within a time, before a stop must be sent again or a node is heard again."""
         closed = asyncio.ensure_future(self.bus.wait_closed())
         wanted = asyncio.ensure_future(self._stop_wanted.wait())
+        heard = asyncio.ensure_future(self.bus.proofs.heard_again.wait())
         try:
-            await asyncio.wait((closed, wanted), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((closed, wanted, heard), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)
             return closed.done()
         finally:
-            closed.cancel()
-            wanted.cancel()
+            for each in (closed, wanted, heard):
+                each.cancel()
 
     def _restarted(self, name: str) -> None:
         """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""

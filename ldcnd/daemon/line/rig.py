@@ -126,24 +126,34 @@ class ModuleService:
         twice = sorted(set(command.high) & set(command.low))
         if twice:
             raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
-        condition()
+        self._check(condition)
         with only_while(condition):
             reading = await self._driver.set_outputs(levels, frozenset(command.inputs), (command.pwm1, command.pwm2))
         log.info("outputs set", module=self.name, high=command.high, low=command.low, inputs=command.inputs)
         return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
 
-    async def set_timer(self, command: SetIoTimer) -> IoReply:
-        """Choose what is counted.
+    async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
+        """Choose what is counted, if the sender still may when the packet is sent.
 
         Raises:
-            BusError: the line failed.
+            LdcndError: as `IoDriver.set_timer`, or as the condition.
         """
+        self._check(condition)
         enabled, edges = command.mode is not IoTimer.OFF, command.mode is IoTimer.COUNTER
-        await self._driver.set_timer(enabled=enabled, counts_edges=edges, prescale=command.prescale)
+        with only_while(condition):
+            await self._driver.set_timer(enabled=enabled, counts_edges=edges, prescale=command.prescale)
         reading = await self._driver.set_outputs({}, frozenset(), (None, None))
         return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
 
+    def _check(self, condition: Condition) -> None:
+        """Refuse before anything is noted of outputs: the line asks both again when the turn of a packet has come."""
+        self._driver.proof.check()
+        condition()
+
     def _observed(self, reading: IoReading, timing: Timing) -> None:
+        if not self._driver.proof.holds:
+            self._lost()
+            return
         self._misses = 0
         t, t_error_ns = self._clock.stamp(timing)
         self._topic.publish(

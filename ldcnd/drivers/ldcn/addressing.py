@@ -20,7 +20,7 @@ from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PI
 from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset
 from ldcnd.drivers.network import GroupSpec
 from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
-from ldcnd.exchange import Exchange
+from ldcnd.exchange import Effect, Exchange
 
 ReplyT = TypeVar("ReplyT")
 
@@ -183,7 +183,7 @@ NULLS_SETTLE_S = 0.001
 
 def nulls(quiet_s: float) -> Exchange[None]:
     """Return the exchange that fills up any half-received packet, and a pause."""
-    return unanswered(EVERYBODY, NULLS, quiet_s, repeatable=True)
+    return unanswered(EVERYBODY, NULLS, quiet_s, repeatable=True, effect=Effect.READS)
 
 
 class LineRate:
@@ -254,7 +254,8 @@ class LineRate:
             for address in self.groups
         ]
         quiet_s = commands.group_quiet_s(self.cycle_s)
-        await self._bus.change_baud(unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False), baud)
+        burst = unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False, effect=Effect.ARRANGES)
+        await self._bus.change_baud(burst, baud)
 
     def spaced(self, packets: list[bytes]) -> bytes:
         """Return group packets as one piece, a servo cycle apart at the present rate."""
@@ -335,8 +336,9 @@ class Addressing:
             return
         packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
         burst = self.rate.spaced(packets)
+        reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=Effect.ARRANGES)
         for _ in range(2):
-            await self._bus.execute(unanswered(EVERYBODY, burst, settle_s, repeatable=False))
+            await self._bus.execute(reset)
 
     async def address_all(self, expected: int) -> dict[int, Identity]:
         """Give the modules addresses 1, 2, ... in the order of the chain; return who is where.

@@ -48,7 +48,7 @@ from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, BaudCodes, baud_divisor, encode_gains
 from ldcnd.drivers.ldcn.trajectory import Trajectory, encode_trajectory
 from ldcnd.errors import NotSupported, ValueOutOfRange
-from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.exchange import Effect, Exchange, ReplyVerdict
 
 ReplyT = TypeVar("ReplyT")
 
@@ -68,7 +68,7 @@ class Destination(ABC, Generic[ReplyT]):
 
     @abstractmethod
     def exchange(
-        self, request: bytes, items: StatusItem | None, *, repeatable: bool, moves: bool = False
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
     ) -> Exchange[ReplyT]:
         """Pair a request with its reply: these status items, or those sent by default when None."""
 
@@ -95,7 +95,7 @@ class Node(Destination[Status]):
             )
 
     def exchange(
-        self, request: bytes, items: StatusItem | None, *, repeatable: bool, moves: bool = False
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
     ) -> Exchange[Status]:
         """See `Destination`.
 
@@ -117,7 +117,7 @@ class Node(Destination[Status]):
             response_s=CYCLE_CLOCKS / self.profile.clock_hz,
             repeatable=repeatable,
             total_bytes=total_bytes,
-            moves=moves,
+            effect=effect,
         )
 
 
@@ -145,10 +145,10 @@ class Group(Destination[None]):
         items: StatusItem | None,  # noqa: ARG002 - no module answers
         *,
         repeatable: bool,
-        moves: bool = False,
+        effect: Effect = Effect.CHANGES,
     ) -> Exchange[None]:
         """See `Destination`; the manuals require 0.51 ms of quiet."""
-        return unanswered(self.address, request, group_quiet_s(self.cycle_s), repeatable=repeatable, moves=moves)
+        return unanswered(self.address, request, group_quiet_s(self.cycle_s), repeatable=repeatable, effect=effect)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
@@ -157,7 +157,7 @@ def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
 
 
 def unanswered(
-    address: int, request: bytes, quiet_s: float, *, repeatable: bool, moves: bool = False
+    address: int, request: bytes, quiet_s: float, *, repeatable: bool, effect: Effect = Effect.CHANGES
 ) -> Exchange[None]:
     """Return an exchange that draws no reply and keeps the line quiet for a while."""
     return Exchange(
@@ -168,7 +168,7 @@ def unanswered(
         decode=_nothing,
         response_s=quiet_s,
         repeatable=repeatable,
-        moves=moves,
+        effect=effect,
     )
 
 
@@ -216,16 +216,25 @@ COMMON_COMMANDS = frozenset(
     }
 )
 """Commands of every module, servo or not."""
-MOVING_COMMANDS = frozenset(
+EFFECTS = {
+    Command.READ_STATUS: Effect.READS,
+    Command.NO_OPERATION: Effect.READS,
+    Command.SET_ADDRESS: Effect.ARRANGES,
+    Command.SET_BAUD_RATE: Effect.ARRANGES,
+    Command.HARD_RESET: Effect.ARRANGES,
+}
+"""All others change something; Stop Motor, which does not only stop, by its control byte."""
+RELIEVING = frozenset(
     {
-        Command.LOAD_TRAJECTORY,
-        Command.START_MOTION,
-        Command.STOP_MOTOR,
-        Command.SET_GAIN,
-        Command.ADD_PATH_POINTS,
+        StopControl(0),
+        StopControl.MOTOR_OFF,
+        StopControl.ABRUPT,
+        StopControl.SMOOTH,
+        StopControl.AMP_ENABLE | StopControl.ABRUPT,
+        StopControl.AMP_ENABLE | StopControl.SMOOTH,
     }
 )
-"""Commands that can move a motor or change its motion; Stop Motor also closes the loop and leads along set-points."""
+"""Control bytes of Stop Motor that stop a motor or switch it off, and do nothing else."""
 
 
 def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
@@ -319,6 +328,8 @@ def set_gain(to: Destination[ReplyT], gains: Gains) -> Exchange[ReplyT]:
 def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | None = None) -> Exchange[ReplyT]:
     """Stop in one stop mode, or only switch the amplifier; always safe to repeat.
 
+    With the loop open the modes that stop close it, for which there is `close_loop`.
+
     Args:
         to: who stops.
         control: amplifier enable and at most one stop mode.
@@ -332,7 +343,14 @@ def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | No
     if (position is not None) != bool(control & StopControl.HERE):
         raise ValueOutOfRange("Stop Motor takes a position exactly with the bit for stopping here", value=position)
     data = bytes((control,)) + (POSITION.encode(position) if position is not None else b"")
-    return _exchange(to, Command.STOP_MOTOR, data)
+    effect = Effect.RELIEVES if control in RELIEVING else Effect.CHANGES
+    return _exchange(to, Command.STOP_MOTOR, data, effect=effect)
+
+
+def close_loop(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Close the loop at the present position: the bytes of an abrupt stop, which take energy out of a closed loop."""
+    control = StopControl.AMP_ENABLE | StopControl.ABRUPT
+    return _exchange(to, Command.STOP_MOTOR, bytes((control,)), effect=Effect.CHANGES)
 
 
 def io_control(to: Destination[ReplyT], pins: LimitPins, *, fast_path: bool = False) -> Exchange[ReplyT]:
@@ -429,7 +447,7 @@ def no_operation(to: Destination[ReplyT]) -> Exchange[ReplyT]:
 def hard_reset(to: Node | Group) -> Exchange[None]:
     """Put modules back into the state after power-up: 19200 baud, address 0, motor off; not answered."""
     request = encode_packet(Packet(to.address, Command.HARD_RESET))
-    return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False)
+    return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False, effect=EFFECTS[Command.HARD_RESET])
 
 
 def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
@@ -455,11 +473,13 @@ def _exchange(
     *,
     items: StatusItem | None = None,
     repeatable: bool = True,
+    effect: Effect | None = None,
 ) -> Exchange[ReplyT]:
     if to.profile and to.profile.support is Support.IDENTIFY and command not in COMMON_COMMANDS:
         raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
     request = encode_packet(Packet(to.address, command, data))
-    return to.exchange(request, items, repeatable=repeatable, moves=command in MOVING_COMMANDS)
+    effect = effect or EFFECTS.get(command, Effect.CHANGES)
+    return to.exchange(request, items, repeatable=repeatable, effect=effect)
 
 
 def _dialect(to: Destination[ReplyT]) -> Profile:

@@ -29,6 +29,7 @@ from ldcnd.errors import (
     RequestRefused,
     WrongState,
 )
+from ldcnd.exchange import Effect
 from ldcnd.log import get_logger
 
 log = get_logger("ldcn")
@@ -80,7 +81,8 @@ class Groups:
             return
         control = STOP_CONTROLS[mode]
         packets = [commands.stop_motor(commands.Group(group.address), control).request for group in groups]
-        stop = unanswered(groups[0].address, self._rate.spaced(packets), self._quiet_s(groups), repeatable=True)
+        burst = self._rate.spaced(packets)
+        stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True, effect=Effect.RELIEVES)
         try:
             await self._bus.execute(stop, Lane.STOP)
         finally:

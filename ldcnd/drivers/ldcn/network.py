@@ -13,11 +13,13 @@ from typing_extensions import override
 
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.poller import Poller, next_on_grid
+from ldcnd.bus.proof import bringing_up
 from ldcnd.bus.resync import Resync
 from ldcnd.drivers.driver import AxisSpec, Drive, Motion, StopMode
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import (
     ANY_DIALECT,
+    EVERYBODY,
     FASTEST_BAUD,
     NULLS,
     NULLS_SETTLE_S,
@@ -91,7 +93,6 @@ class ModuleWatch(Poller[Status]):
 
 log = get_logger("ldcn")
 
-MISSES_UNTIL_MUTE = 3
 PLACE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY
 RATE_ATTEMPTS = 2
 """Attempts at Set Baud to the whole line: it is not answered, and one lost packet must not decide on the rate."""
@@ -117,6 +118,14 @@ class LdcnNetwork(Network):
         self._placed: set[int] = set()
         self._expected = _expected(specs, line)
         plan = GroupPlan(line.groups, self._names)
+        self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
+        self._proofs = {
+            each.address: bus.proofs.expect(each.address, each.what, self._names.get(each.address))
+            for each in self._expected
+        }
+        for group in plan.addresses:
+            members = (address for address in self._proofs if group in (EVERYBODY, plan.place(address).address))
+            bus.proofs.expect_group(group, members)
         self._rate = LineRate(
             bus,
             baud,
@@ -130,7 +139,6 @@ class LdcnNetwork(Network):
         self._rejoin = Rejoin(bus, self._rate, self._addressing, self._expected)
         drives = {drive.spec.name: drive for drive in self._drives.values()}
         self.axes: Mapping[str, Drive] = drives
-        self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
         self._groups = Groups(bus, plan, self._addressing, drives, tuple(self._io.values()), snapshots=line.snapshot)
         self.io: Mapping[str, IoDriver] = {module.name: module for module in self._io.values()}
         self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)
@@ -142,6 +150,10 @@ class LdcnNetwork(Network):
 
         A line that this daemon had up before is taken over if that is possible, whatever the policy.
         """
+        with bringing_up():
+            return await self._bring_up()
+
+    async def _bring_up(self) -> BringUpReport:
         self._identities.clear()
         self._watches.clear()
         self._rate.working = self._baud
@@ -207,6 +219,8 @@ class LdcnNetwork(Network):
         )
         for address, drive in self._drives.items():
             drive.identity = str(modules[address])
+        for proof in self._proofs.values():
+            proof.prove()
         self._was_up = True
         self._restarted.clear()
         log.info("network up", bus=self._bus.settings.name, modules=len(modules), baud=self._bus.baud, reset=reset)
@@ -385,12 +399,13 @@ class LdcnNetwork(Network):
 
     @override
     def incomplete(self) -> bool:
-        return any(self._bus.misses(each.address) >= MISSES_UNTIL_MUTE for each in self._expected)
+        return not self._bus.proofs.all_hold()
 
     async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:
-        """See `Network`: one scan of `Rejoin`."""
+        """See `Network`: one scan of `Rejoin`, and who answers again is identified again."""
 
         def addressing(address: int) -> None:
+            self._proofs[address].lose(f"address {address} has restarted")
             if address in self._drives:
                 self._drives[address].forget()
                 restarted(self._names[address])
@@ -398,8 +413,28 @@ class LdcnNetwork(Network):
                 self._io[address].forget()
 
         silent = tuple(each for each in self._expected if self._bus.misses(each.address))
-        heard = await self._rejoin.look(silent, addressing)
+        with bringing_up():
+            heard = await self._rejoin.look(silent, addressing)
+        heard |= await self._identify()
         return frozenset(self._names[address] for address in heard if address in self._names)
+
+    async def _identify(self) -> frozenset[int]:
+        """Prove again who answers and was lost; return the addresses of those that are what is configured."""
+        found = set()
+        for each in self._expected:
+            proof = self._proofs[each.address]
+            if proof.holds or each.address not in self._identities or self._bus.misses(each.address):
+                continue
+            identity = await self._rate.who_is(each.address, patient=True)
+            if identity is None:
+                continue
+            if different := each.differs(identity):
+                proof.lose(different, silent=False)
+                continue
+            self._identities[each.address] = identity
+            proof.prove()
+            found.add(each.address)
+        return frozenset(found)
 
     @override
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:

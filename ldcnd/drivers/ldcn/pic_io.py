@@ -19,7 +19,7 @@ from ldcnd.drivers.ldcn.packet import MOST_ADDRESS, Command, Packet, check_statu
 from ldcnd.drivers.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.errors import BadReply, ValueOutOfRange
-from ldcnd.exchange import Exchange
+from ldcnd.exchange import Effect, Exchange
 
 LINES = 12
 ALL_LINES = (1 << LINES) - 1
@@ -277,7 +277,7 @@ class IoNode(Destination[IoStatus]):
 
     @override
     def exchange(
-        self, request: bytes, items: int | None, *, repeatable: bool, moves: bool = False
+        self, request: bytes, items: int | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
     ) -> Exchange[IoStatus]:
         asked = self.items if items is None else IoItem(items)
         reply_bytes, rejected_bytes = io_status_bytes(asked), io_status_bytes(self.items)
@@ -290,7 +290,7 @@ class IoNode(Destination[IoStatus]):
             response_s=SERVO_CYCLE_S,
             repeatable=repeatable,
             total_bytes=None if asked == self.items else partial(_total_bytes, rejected_bytes, reply_bytes),
-            moves=moves,
+            effect=effect,
         )
 
 
@@ -301,8 +301,7 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
         ValueOutOfRange: see `encode_io_command`.
     """
     repeatable = not isinstance(command, SynchOutput | SynchInput)
-    moves = not isinstance(command, SetTimerMode | SynchInput)  # what an output switches is unknown here
-    return to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable, moves=moves)
+    return to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
 
 
 def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
@@ -315,7 +314,7 @@ def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
 def read_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
     """Request these items once instead of the default ones."""
     request = encode_packet(Packet(to.address, Command.READ_STATUS, bytes((items,))))
-    return to.exchange(request, items, repeatable=True)
+    return to.exchange(request, items, repeatable=True, effect=Effect.READS)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:

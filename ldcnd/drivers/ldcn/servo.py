@@ -59,6 +59,7 @@ from ldcnd.errors import (
     OutcomeUnknown,
     PacketRejected,
     Remedy,
+    RequestRefused,
     ValueOutOfRange,
     WrongState,
     step,
@@ -269,6 +270,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             decode=decode,
             response_s=exchange.response_s,
             repeatable=exchange.repeatable,
+            effect=exchange.effect,
         )
 
     # -- power -------------------------------------------------------------------------------------------------------
@@ -298,7 +300,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         if self.profile.pic_ae_diagnostics and not self._initialised:
             await self._initialise_registers()
         self._initialised = True
-        await self._stop_motor(StopControl.AMP_ENABLE | StopControl.ABRUPT)
+        await self._switch(commands.close_loop(self._node), Lane.COMMAND, pic_ae=True, closed=True)
         # pos_error is set while the loop is open, and sticky
         await self._clear_sticky_bits()
         status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
@@ -335,18 +337,22 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
                 remedy=Remedy(f"remove the cause, then {{}}{again}", step("reset")),
             )
 
-    async def _stop_motor(self, control: StopControl, lane: Lane = Lane.COMMAND) -> None:
-        """Send Stop Motor, and take note of what became of power driver and loop."""
+    async def _stop_motor(self, control: StopControl) -> None:
+        """Stop, before anything else that waits."""
         bits = int(control)
         exchange = self._stops.get(bits)
         if exchange is None:  # made once: a stop, and a command that stops first, wait for it
             exchange = self._stops[bits] = commands.stop_motor(self._node, control)
+        await self._switch(exchange, Lane.STOP, pic_ae=bool(bits & _AMP_ENABLE), closed=not bits & _MOTOR_OFF)
+
+    async def _switch(self, exchange: Exchange[Status], lane: Lane, *, pic_ae: bool, closed: bool) -> None:
+        """Send Stop Motor, and take note of what became of power driver and loop."""
         try:
             await self._bus.execute(exchange, lane)
         except BaseException:
             self.state.switched_unconfirmed()
             raise
-        self.state.switched(pic_ae=bool(bits & _AMP_ENABLE), closed=not bits & _MOTOR_OFF)
+        self.state.switched(pic_ae=pic_ae, closed=closed)
 
     async def _clear_sticky_bits(self) -> None:
         self.state.clearing()
@@ -383,12 +389,13 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         off = mode is StopMode.OFF
         self._switching_off += off
         try:
-            await self._stop_motor(STOP_CONTROLS[mode], Lane.STOP)
+            await self._stop_motor(STOP_CONTROLS[mode])
         finally:
             self._switching_off -= off
         if self.state.homing_armed:
-            await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
-            self.state.homing_armed = False
+            with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
+                await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
+                self.state.homing_armed = False
         self.state.guard, self.state.guard_hit = "", False
         return mode
 

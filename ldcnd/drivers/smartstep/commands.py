@@ -34,7 +34,7 @@ from ldcnd.drivers.smartstep.packet import (
 from ldcnd.drivers.smartstep.parameters import Parameter
 from ldcnd.drivers.smartstep.profiles import RESPONSE_S, SMARTSTEP, CountUnit, SmartStepProfile, StringChecksum
 from ldcnd.errors import BadReply, ValueOutOfRange
-from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.exchange import Effect, Exchange, ReplyVerdict
 
 
 class RefusalReason(StrEnum):
@@ -207,6 +207,7 @@ def probe(unit: int) -> Exchange[None]:
         RESPONSE_S,
         repeatable=True,
         total_bytes=_packet_total,
+        effect=Effect.READS,
     )
 
 
@@ -256,7 +257,16 @@ def _exchange(command: Command, value_of: Callable[[Reply], ValueT], *, repeatab
         RESPONSE_S,
         repeatable,
         total_bytes=_packet_total,
+        effect=_effect(command),
     )
+
+
+def _effect(command: Command) -> Effect:
+    if command.function is Function.REFERENCE:
+        return Effect.READS
+    if (command.address, command.data) == (Register.OPERATING_MODE, OperatingMode.NORMAL):
+        return Effect.RELIEVES  # it leaves a mode and does nothing else
+    return Effect.CHANGES
 
 
 def _checker(command: Command) -> Callable[[bytes], ReplyVerdict]:
@@ -364,6 +374,7 @@ def string_reference(
         profile.first_character_s,
         repeatable=True,
         total_bytes=lambda data: piece_bytes(data, longest),
+        effect=Effect.READS,
     )
 
 

@@ -166,6 +166,7 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
         known = driver_type(type_word)
         title = "R7D-APL or R7D-APH" if known is DriverType.R7D_AP else f"unlisted type {type_word:04X}H"
         self.identity = f"SmartStep {title} (version {version:04X}H)"
+        self.words.identified(type_word)
 
     @override
     def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any]:

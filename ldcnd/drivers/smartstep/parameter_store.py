@@ -47,6 +47,7 @@ from ldcnd.errors import (
     NotSupported,
     OutcomeUnknown,
     Remedy,
+    RequestRefused,
     ValueOutOfRange,
     WrongState,
     step,
@@ -233,10 +234,11 @@ class UnitParameters(ParameterAccess):
 
     async def _written_once(self, parameter: Parameter, old: int, value: int) -> bool:
         ledger = self._ledger()
+        await self._words.identify()  # what this loses was not a write
         await ledger.enter(self._axis, parameter.label, self._rules.budget)
         try:
             await self._words.ask(write_eeprom(self._words.unit, parameter, value))
-        except (DriveFault, BusDown, BusBusy):
+        except (DriveFault, RequestRefused, BusDown, BusBusy):
             await ledger.withdraw(self._axis, parameter.label)  # declined, or never sent
             raise
         except (OutcomeUnknown, BadReply):

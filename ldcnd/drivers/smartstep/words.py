@@ -8,7 +8,7 @@ from typing import TypeVar
 from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.smartstep import commands
-from ldcnd.drivers.smartstep.addresses import OperatingMode
+from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
 from ldcnd.drivers.smartstep.commands import Refusal, RefusalReason
 from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, ReplyReader
 from ldcnd.drivers.smartstep.profiles import SmartStepProfile
@@ -24,7 +24,7 @@ from ldcnd.errors import (
     ReplyTimeout,
     WrongState,
 )
-from ldcnd.exchange import Exchange
+from ldcnd.exchange import Effect, Exchange
 from ldcnd.wirelog.recorder import WireEvent
 
 
@@ -80,6 +80,8 @@ class Words:
         self.self_hearing = False
         self._bus = bus
         self._profile = profile
+        self._proof = bus.proofs.expect(unit, f"axis {axis}", axis)
+        self._type: int | None = None
 
     async def ask(self, exchange: Exchange[ValueT | Refusal], lane: Lane = Lane.COMMAND) -> ValueT:
         """Run one exchange, in the response time of the profile.
@@ -96,11 +98,32 @@ class Words:
                 value="self_hearing",
                 remedy="use four wires",
             )
+        if exchange.effect is Effect.CHANGES:
+            await self.identify()
         answer = await self._bus.execute(commands.with_response_time(exchange, self._profile), lane)
         if isinstance(answer, Refusal):
             mode = await self._mode_of(answer)
             raise drive_error(self.axis, answer, mode)
         return answer
+
+    async def identify(self) -> None:
+        """Read which drive answers, unless that is known.
+
+        Raises:
+            As `ask`.
+        """
+        if not self._proof.holds:
+            self.identified(await self.read(Register.DRIVER_TYPE))
+
+    def identified(self, type_word: int) -> None:
+        """Take the driver type that was read: another one than before is another drive."""
+        if self._type in (None, type_word):
+            self._type = type_word
+            self._proof.prove()
+        else:
+            self._proof.lose(
+                f"unit {self.unit} is a driver of type {type_word:04X}H, and was one of {self._type:04X}H", silent=False
+            )
 
     async def answers(self, unit: int) -> bool:
         """Return whether any drive of the line has this unit number; the exchange changes nothing."""

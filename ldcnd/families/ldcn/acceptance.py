@@ -15,11 +15,11 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import (
     ANY_DIALECT,
     EVERYBODY,
-    NULLS,
     NULLS_SETTLE_S,
     UNADDRESSED,
     Identity,
     LineRate,
+    nulls,
     once,
     read_identity,
 )
@@ -29,6 +29,7 @@ from ldcnd.drivers.ldcn.profiles import Profile, Support
 from ldcnd.drivers.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.errors import BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
+from ldcnd.exchange import Effect
 from ldcnd.families.family import TrialMove
 from ldcnd.families.ldcn.examination import Held
 from ldcnd.model.health import Finding, Verdict
@@ -274,8 +275,8 @@ class _Drive:
     async def nulls(self) -> Finding:
         """See `ASSUMPTIONS`."""
         half = commands.no_operation(self._node).request[:2]
-        await self._bus.execute(unanswered(EVERYBODY, half, NULLS_SETTLE_S, repeatable=False))
-        await self._bus.execute(unanswered(EVERYBODY, NULLS, NULLS_SETTLE_S, repeatable=False))
+        await self._bus.execute(unanswered(EVERYBODY, half, NULLS_SETTLE_S, repeatable=False, effect=Effect.READS))
+        await self._bus.execute(nulls(NULLS_SETTLE_S))
         await self._bus.execute(once(read_identity(self.address, self._known)))
         return self._finding(
             "nulls", "no reply to half a packet and 16 nulls; the next packet was answered", confirmed=True
@@ -303,6 +304,7 @@ async def _moved(
         text = f"address {move.address} is no drive that may move, or {move.counts} counts are not 1 to {MOST_COUNTS}"
         yield Finding(axis=str(move.address), what="move", verdict=Verdict.WRONG, text=text)
         return
+    bus.proofs.expect(move.address, f"address {move.address}").prove()
     axis = LdcnAxis(AxisSpec("trial", move.address, profile.name, move.gains), profile, bus)
     trial = _Trial(bus, axis, Node(move.address, profile), move, held)
     try:

@@ -26,6 +26,8 @@ log = get_logger("axis")
 
 DEFAULT_TIMEOUT_S = 60.0
 STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
+REBOUND_S = 1.0
+"""Longest time for which a shaft may still turn after it has run onto its stop, seconds."""
 BEYOND = 1.1
 """Length of a search without a distance, as a multiple of its time-out: the drive ends it if this host does not."""
 
@@ -250,6 +252,7 @@ class HomeSequence(Procedure):
         self.permit.still_wanted()
         closed = search.stop is not StopMode.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:
+            await motion.check_does_not_coast(REBOUND_S)
             await self.permit.power_on()
         tracker.switched(on=closed, now_s=motion.clock.now_s())
         motion.telemetry.origin_counts = captured - search.position * motion.counts_per_unit
