@@ -44,10 +44,10 @@ def faults(target: Target, axis: str) -> None:
 @click.option("--count", type=click.IntRange(min=1), help="End after this many samples.")
 @with_target
 def watch(target: Target, axis: str, item: str | None, count: int | None) -> None:
-    """Show the telemetry of AXIS (or of all) as it comes."""
+    """Show the telemetry of AXIS, an axis or an I/O module (or of all), as it comes."""
 
     async def work(client: RigClient) -> None:
-        if axis != "*":
+        if axis != "*" and axis not in {module.name for bus in await client.buses() for module in bus.modules}:
             await axis_of(client, axis)
         seen = 0
         async with client.samples(axis, item or "*") as samples:

@@ -215,15 +215,17 @@ class Rig:
             raise LeaseRequired(f"axis {name} is not controlled here", axis=name, remedy="use Rig.control")
         return control
 
+    def _leases(self) -> tuple[str, ...]:
+        """Return the leases that this program holds here, for what concerns several axes."""
+        return tuple({axis.control.lease.lease: None for axis in self._held.values() if axis.control})
+
     async def set_speed_override(self, percent: float) -> SpeedOverrideReply:
         """Scale every velocity of the rig, 0 to 100 %; at 0 what moves is halted and nothing begins.
 
         Raises:
             LeaseHeld, LeaseRequired: it would be raised, and another program controls one of the axes.
         """
-        controls = [control for name in self.axes if (control := self._axis(name).control)]
-        leases = tuple({control.lease.lease for control in controls})
-        return await self._client.ask(SetSpeedOverride(percent=percent, leases=leases))
+        return await self._client.ask(SetSpeedOverride(percent=percent, leases=self._leases()))
 
     async def preview_together(
         self,
@@ -290,7 +292,8 @@ class Rig:
             inputs: lines that are inputs from now on.
             pwm1: share of time for which PWM output 1 is on, 0 to 1.
             pwm2: likewise output 2.
-            lease: must cover the axes of the module's line, where a motion of them would need one.
+            lease: one besides those under which this program controls axes here; together they must cover the axes of
+                the module's line, where a motion of them would need one.
         """
         request = SetIo(
             module=module,
@@ -300,6 +303,7 @@ class Rig:
             pwm1=pwm1,
             pwm2=pwm2,
             lease=lease,
+            leases=self._leases(),
         )
         return await self._client.ask(request)
 
@@ -307,7 +311,9 @@ class Rig:
         self, module: str, mode: IoTimer | str, *, prescale: Literal[1, 2, 4, 8] = 1, lease: str | None = None
     ) -> IoReply:
         """Choose what the counter of an I/O module counts: `timer`, `counter` (edges of line 10), or `off`."""
-        return await self._client.ask(SetIoTimer(module=module, mode=IoTimer(mode), prescale=prescale, lease=lease))
+        return await self._client.ask(
+            SetIoTimer(module=module, mode=IoTimer(mode), prescale=prescale, lease=lease, leases=self._leases())
+        )
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Return what became of a command."""

@@ -92,3 +92,14 @@ def test_outputs_are_set_by_line_and_level(bench: VirtualRig):
     assert (forbidden.code, "not configured as an output" in forbidden.errors) == (1, True)
     assert misspelt.code == 2
     assert "LINE=high" in misspelt.errors
+
+
+def test_a_module_can_be_watched_as_an_axis_can(bench: VirtualRig):
+    watched = bench.run("axis watch cabinet --count 1")
+    other = bench.run("axis watch closet --count 1")
+
+    assert watched.code == 0, watched.errors
+    assert "cabinet" in last_line(watched)
+    assert "lines 1 to 12 0111" in last_line(watched)
+    assert other.code != 0
+    assert "closet" in other.errors

@@ -71,6 +71,8 @@ PAGE_BYTES = 12_000
 """Text in one reply: with its other fields it stays below what a payload may have."""
 LONGEST_DATA_BYTES = 2_000
 """Of a longer burst, such as noise on a broken line, only the beginning is shown."""
+BACK_WITHIN_S = 20.0
+"""Time for a line to come up again whose loss was rehearsed, seconds."""
 LINE_OVERHEAD_BYTES = 3
 """Quotation marks and comma in JSON."""
 
@@ -398,6 +400,7 @@ async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
 
     Raises:
         UnknownAxis: there is no such axis.
+        BusDown: its line is not up, or has not come up again.
     """
     axis = rig.axes[request.axis]
     log.warning("rehearsal", axis=request.axis, kind=request.kind.value)
@@ -406,9 +409,14 @@ async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
         policy = axis.config.loss.daemon
     else:
         bus = _bus_of(rig, request.axis)
+        bus.check_up()
         bus.bus.drop("rehearsed loss")
         await bus.wait_down()
-        await bus.wait_up()
+        try:
+            async with asyncio.timeout(BACK_WITHIN_S):
+                await bus.wait_up()
+        except TimeoutError:
+            bus.check_up()
         policy = axis.config.loss.bus
     return RehearsalReply(kind=request.kind, axis=request.axis, policy=policy.value)
 

@@ -108,8 +108,7 @@ class BusService:
             NotSupported, WrongState, BusError: as `Network.snapshot`; BusDown while the line is not up.
         """
         name = self.bus.settings.name
-        if self.report is None:
-            raise BusDown(f"bus {name} is not up: {self.problem}", value=name, remedy="see `ldcnd bus list`")
+        self.check_up()
         instant = await self.network.snapshot(self._check_registers)
         t, t_error_ns = clock.stamp_between(instant.from_s, instant.until_s)
         positions = tuple(axis.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
@@ -118,6 +117,16 @@ class BusService:
             for each in instant.io
         )
         return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions, io=io)
+
+    def check_up(self) -> None:
+        """Refuse what needs the line while it is not up.
+
+        Raises:
+            BusDown: it is not.
+        """
+        name = self.bus.settings.name
+        if self.report is None:
+            raise BusDown(f"bus {name} is not up: {self.problem}", value=name, remedy="see `ldcnd bus list`")
 
     def _check_registers(self) -> None:
         """Refuse to overwrite a register in which a command waits for a capture.
