@@ -20,7 +20,7 @@ from ldcnd.model.commands import (
     SetPwm,
     Why,
 )
-from ldcnd.model.samples import AxisState
+from ldcnd.model.samples import AxisState, Moving
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,
@@ -90,6 +90,7 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
         recovered = await rig.until(lambda state: state.state is AxisState.DISABLED)
         assert (await rig.until_fault(lambda faults: not faults.active)).first is None
         assert not recovered.enabled
+        await rig.until(lambda state: state.moving is Moving.NO)
         await rig.send(Power(on=True))
         if lost:
             return
@@ -193,6 +194,7 @@ async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_ax
             await rig.send(SetPosition(position=3.0))
         rig.condition(Condition.ENCODER_LOSS, present=False)
         await rig.send(Reset())
+        await rig.until(lambda state: state.moving is Moving.NO)
         await rig.send(Power(on=True))
         with pytest.raises(NotReferenced):
             await rig.send(FAR)

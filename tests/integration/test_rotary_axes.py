@@ -84,6 +84,7 @@ async def test_set_points_are_followed_through_the_turn():
         for at in (9.8, 9.6, 9.9, 0.1, 0.3):
             await rig.send(Track(position=at))
             await asyncio.sleep(0.05)
+        await asyncio.sleep(0.2)  # the shaft follows
 
         assert rig.position_mm == pytest.approx(0.3, abs=0.02)
 

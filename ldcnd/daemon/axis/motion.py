@@ -136,7 +136,7 @@ class AxisMotion:
         self._window_counts = window_counts(config)
 
     async def check_does_not_coast(self, within_s: float = 0.0) -> None:
-        """Refuse to close the loop of a shaft that turns, by a reading of now: an older one may be of its motion.
+        """Refuse to close the loop of a shaft that turns; where its rest is not proven, by a reading of now.
 
         Args:
             within_s: how long to wait until it stands.
@@ -146,7 +146,7 @@ class AxisMotion:
             BusError: the line failed.
         """
         until_s = self._loop.time() + within_s
-        while not self.tracker.enabled:
+        while not (self.tracker.enabled or self.tracker.at_rest):
             self.tracker.looked_at(await self.read())
             if not self.tracker.coasts or self._loop.time() >= until_s:
                 break

@@ -160,6 +160,7 @@ class SmartStepNetwork(Network):
         remarks: list[str] = []
         for unit in self._units.values():
             unit.wires_checked = False
+            unit.words.forget()
         for number, unit in self._units.items():
             try:
                 await self._bus.execute(commands.with_response_time(commands.probe(number), unit.profile))

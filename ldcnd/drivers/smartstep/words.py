@@ -106,6 +106,10 @@ class Words:
             raise drive_error(self.axis, answer, mode)
         return answer
 
+    def forget(self) -> None:
+        """The line comes up: any drive may be there."""
+        self._type = None
+
     async def identify(self) -> None:
         """Read which drive answers, unless that is known.
 
