@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ldcnd.bus.bus import Bus
+from ldcnd.bus.proof import bringing_up
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.addressing import (
     ANY_DIALECT,
@@ -179,8 +180,9 @@ class LineScan:
     async def _address(self) -> dict[int, Found]:
         """Reset the line and give addresses in the order of the chain."""
         addressing = Addressing(self._bus, self._rate, GroupPlan((), {}))
-        await addressing.reset_all()
-        identities = await addressing.address_all(0)
+        with bringing_up():
+            await addressing.reset_all()
+            identities = await addressing.address_all(0)
         self._waiting.clear()
         return {address: Found(self._rate.at_reset, identity) for address, identity in identities.items()}
 
