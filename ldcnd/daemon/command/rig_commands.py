@@ -411,9 +411,9 @@ async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
         bus = _bus_of(rig, request.axis)
         bus.check_up()
         bus.bus.drop("rehearsed loss")
-        await bus.wait_down()
         try:
-            async with asyncio.timeout(BACK_WITHIN_S):
+            async with asyncio.timeout(BACK_WITHIN_S):  # also where the daemon ends meanwhile: then it never does
+                await bus.wait_down()
                 await bus.wait_up()
         except TimeoutError:
             bus.check_up()
