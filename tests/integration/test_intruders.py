@@ -108,6 +108,28 @@ async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(a
     assert not sent & {Command.SET_GAIN, Command.LOAD_TRAJECTORY, Command.START_MOTION, Command.RESET_POSITION}
 
 
+@pytest.mark.parametrize(("axis", "position", "at"), [("x", 80.0, 30_000), ("z", 45.0, 40_000)])
+async def test_a_counter_that_another_program_sets_in_mid_motion_costs_the_reference_and_halts_the_axis(
+    axis, position, at
+):
+    chain = build_chain(four_drives())
+    async with rig_on(chain, simulated_config({"reference": "at_reset"})) as rig:
+        await standing_at(rig, axis, 0.0)
+        await rig.client.command(axis, MoveAbsolute(position=position))
+        while drive(chain, AXES[axis]).loop.position < at:
+            await asyncio.sleep(0.01)
+        drive(chain, AXES[axis]).execute(ResetPosition())
+        await asyncio.sleep(0.5)
+        state = await rig.client.state(axis)
+        await asyncio.sleep(1.0)
+        before = drive(chain, AXES[axis]).loop.position
+        await asyncio.sleep(0.5)
+
+        assert drive(chain, AXES[axis]).loop.position == pytest.approx(before, abs=3)
+    assert state is not None
+    assert (state.state, state.referenced, state.link) == (AxisState.ERROR_STOP, False, LinkState.UP)
+
+
 async def test_a_drive_that_was_reset_is_said_when_it_has_its_address_again():
     chain = build_chain(four_drives())
     async with rig_on(chain, simulated_config({"reference": "at_reset"})) as rig:

@@ -140,10 +140,11 @@ async def test_a_drive_without_gains_is_not_switched_on():
     assert bench.drive.told[1][1] == Gains(kp=100, kd=0, ki=0, il=0, ol=250, cl=0, el=2000, sr=1, deadband=0)
 
 
-async def test_a_halt_sends_something_only_to_a_motor_that_turns():
+async def test_a_halt_is_always_sent_also_to_a_motor_that_seems_to_stand():
     async with axis_bench() as bench:
         await bench.send(Halt())
-        assert bench.drive.calls == []
+        assert bench.drive.calls == ["stop"]
+        await bench.settled()
 
         await bench.send(MoveVelocity(velocity=10.0), "jog")
         await bench.pass_s(0.1, position_counts=2000, **RUNNING)

@@ -42,7 +42,7 @@ from ldcnd.model.commands import (
     Verb,
 )
 from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.model.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
 
 THERE = MoveAbsolute(position=10.0)
@@ -101,7 +101,7 @@ async def test_what_waits_when_the_daemon_ends_is_refused():
         bench.drive.during["load"] = asyncio.Event().wait
         first = asyncio.create_task(outcome(bench.send(THERE)), name="first")
         await asyncio.sleep(0)
-        waiting = [asyncio.create_task(outcome(bench.send(Halt())), name="waiting") for _ in range(3)]
+        waiting = [asyncio.create_task(outcome(bench.send(Reset())), name="waiting") for _ in range(3)]
         await asyncio.sleep(0)
     await asyncio.wait(waiting, timeout=1.0)
 
@@ -474,7 +474,7 @@ async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away(
         assert not bench.tracker.referenced
 
 
-async def test_a_jump_during_a_command_is_left_to_the_command():
+async def test_a_jump_during_a_command_ends_it_costs_the_reference_and_has_the_motor_stopped():
     async with axis_bench() as bench:
         await moving(bench)
         for counts in (0, 0, *[500_000] * ROUNDS):
@@ -482,8 +482,10 @@ async def test_a_jump_during_a_command_is_left_to_the_command():
             bench.axis.judged(slow, frozenset(), now())
             await asyncio.sleep(0.05)
 
-        assert bench.tracker.state is AxisState.DISCRETE_MOTION
-        assert bench.tracker.referenced
+        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert not bench.tracker.referenced
+        assert bench.tracker.quality is Quality.UNCERTAIN
+        assert bench.axis.stop_is_pending
 
 
 @pytest.mark.parametrize("gap", ["disconnected", "missed"])
@@ -504,7 +506,7 @@ async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(g
         assert "position_jump" not in [fault.code for fault in bench.tracker.active_faults]
 
 
-async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_counts_as_lost():
+async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_has_the_motor_stopped():
     async with axis_bench() as bench:
         verdicts = [
             bench.axis.judged(_reading(bench, position_counts=90_000 * step), frozenset(), now()) for step in range(5)
@@ -512,8 +514,15 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
 
         assert verdicts == [False, True, True, True, False]
         assert bench.bus.distrusted == 4
-        assert bench.tracker.link is LinkState.DEGRADED
-        assert bench.drive.shown.position_counts == 0
+        assert (bench.tracker.link, bench.tracker.quality) == (LinkState.UP, Quality.UNCERTAIN)
+        assert [fault.code for fault in bench.tracker.active_faults] == ["readings_contradict", "stop_unconfirmed"]
+        assert bench.tracker.moving is not Moving.NO
+        assert not bench.tracker.referenced
+        assert bench.axis.stop_is_pending
+        await bench.axis.send_pending_stop()
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        await bench.send(Power(on=False))
+        assert bench.drive.told[-1] == ("stop", StopMode.OFF)
 
 
 @pytest.mark.parametrize("command", [MoveRelative(distance=1.0), SetPosition(position=0.0)])
@@ -596,7 +605,7 @@ async def test_a_referenced_line_counts_from_the_drives_zero_again():
         assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (True, 0.0)
 
 
-async def test_an_axis_out_of_reach_takes_only_what_brings_it_to_rest():
+async def test_of_an_axis_out_of_reach_only_what_takes_energy_out_is_sent():
     async with axis_bench() as bench:
         bench.axis.disconnected()
         for command in (Reset(), Power(on=True), THERE):
@@ -604,9 +613,27 @@ async def test_an_axis_out_of_reach_takes_only_what_brings_it_to_rest():
                 await bench.send(command)
         assert bench.drive.calls == []
 
-        await bench.send(Halt())
-        await bench.send(Power(on=False))
-        assert bench.drive.calls == ["stop", "stop"]
+        for command in (Halt(), Power(on=False)):
+            await bench.send(command)
+
+    assert bench.drive.told == [("stop", StopMode.SMOOTH), ("stop", StopMode.OFF)]
+
+
+@pytest.mark.parametrize("command", [Halt(), Power(on=False)])
+async def test_what_a_silent_drive_has_not_confirmed_is_said_to_be_so_and_waits_to_be_sent_again(command):
+    async with axis_bench() as bench:
+
+        async def lose() -> None:
+            bench.drive.during["stop"] = lose
+            raise LOST
+
+        bench.drive.during["stop"] = lose
+        with pytest.raises(OutcomeUnknown, match="has not confirmed"):
+            await bench.send(command)
+
+        assert set(bench.drive.calls) == {"stop"}
+        assert bench.tracker.stop_pending
+        assert bench.axis.stop_is_pending
 
 
 async def test_a_fault_during_a_motion_ends_it_and_nothing_follows():

@@ -102,12 +102,12 @@ def test_a_reading_that_the_next_one_contradicts_is_forgotten_and_counted():
     assert (axis.gate.confirmed, axis.gate.withheld, axis.gate.jumped) == (None, 1, False)
 
 
-def test_readings_that_contradict_each_other_count_as_a_lost_reply():
+def test_readings_that_contradict_each_other_are_said_to_do_so():
     axis = Axis()
 
     verdicts = [axis.read(at(100_000 * (number + 1))) for number in range(ROUNDS)]
 
-    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.LOST]
+    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.CONTRADICTS]
 
 
 @given(

@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from ldcnd.bus.bus import Bus
-from ldcnd.config.axis import AxisConfig
+from ldcnd.config.axis import AxisConfig, LossPolicy
 from ldcnd.daemon.axis import guards
 from ldcnd.daemon.axis.commands import AxisCommands
 from ldcnd.daemon.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
@@ -40,7 +40,16 @@ from ldcnd.drivers.driver import AxisReading, Drive, Fault, Moves, Readable, Rec
 from ldcnd.drivers.network import BringUpReport
 from ldcnd.drivers.parameter_access import MonitorValue
 from ldcnd.drivers.tracer import Tracer
-from ldcnd.errors import BadReply, BusError, LdcndError, NotSupported, StopLatched, TooManyRequests, WrongState
+from ldcnd.errors import (
+    BadReply,
+    BusError,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    StopLatched,
+    TooManyRequests,
+    WrongState,
+)
 from ldcnd.exchange import Timing
 from ldcnd.log import get_logger
 from ldcnd.model import events
@@ -71,6 +80,23 @@ log = get_logger("axis")
 QUEUED_COMMANDS = 8
 STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
+
+
+UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
+"""How a motion is stopped that is not understood any more, by `loss.bus`; smoothly otherwise."""
+
+
+def takes_energy_out(command: AxisCommand[CommandReply]) -> StopMode | None:
+    """Return how a command brings its motor to rest; None for a command that does anything else."""
+    match command:
+        case Stop() | Halt():
+            return StopMode.SMOOTH
+        case QuickStop():
+            return StopMode.ABRUPT
+        case Power(on=False):
+            return StopMode.OFF
+        case _:
+            return None
 
 
 Obey = Callable[[Permit, AxisCommand[CommandReply]], Awaitable[CommandReply]]
@@ -339,17 +365,33 @@ class AxisService:
                 if gate.zeroed:
                     self._changed_by_another(DRIVE_RESET, "its position counter has restarted at 0")
                     tracker.referenced = False
-                elif gate.jumped and tracker.command is None:
+                    self._stop_what_is_not_understood()
+                elif gate.jumped:
                     log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
                     tracker.jumped()
+                    self._stop_what_is_not_understood()
                 first, first_timing = gate.confirmed
                 self.observed(first, first.asked - asked, first_timing)
             self.observed(reading, asked, timing)
-        elif verdict is Verdict.LOST:
-            self.missed(BadReply(f"axis {self.config.name}: its readings contradict each other", axis=self.config.name))
+        elif verdict is Verdict.CONTRADICTS:
+            now_ns = self._clock.now_ns()
+            if tracker.contradicted(now_ns):
+                log.error("readings contradict each other", axis=self.config.name, counts=reading.position_counts)
+                self._stop_what_is_not_understood()
+            self._changed.set()
+            self.telemetry.stale(now_ns)
         if gate.foreign:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
         return verdict is Verdict.ASK_AGAIN
+
+    def _stop_what_is_not_understood(self) -> None:
+        """Have a motor that may have voltage stopped at once; its line sends that again until the drive confirms it."""
+        if not self.tracker.energised or not self.stoppable:
+            return
+        self._overtake(None)
+        if self._pending is None:
+            self._pending = UNDERSTOOD_NO_MORE.get(self.config.loss.bus, StopMode.SMOOTH)
+        self._not_confirmed()
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
@@ -475,14 +517,8 @@ class AxisService:
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
         permit = permit or self.permit(self._next_command_id(), command.verb)
-        if isinstance(command, Stop | QuickStop) and self.stoppable:
-            await self.stop(StopMode.SMOOTH if isinstance(command, Stop) else StopMode.ABRUPT)
-            return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
-        off = isinstance(command, Power) and not command.on
-        if (off or isinstance(command, Halt)) and self.tracker.link is LinkState.DOWN and self.stoppable:
-            # whatever is there, and whatever it does: it comes to rest as by a stop, as soon as it can be heard
-            await self.bring_to_rest(StopMode.OFF if off else StopMode.SMOOTH, command.verb)
-            return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
+        if self.stoppable and (mode := takes_energy_out(command)):
+            return await self._take_energy_out(permit, command, mode)
         if command.verb not in self.driver.capabilities:
             raise NotSupported(
                 f"axis {self.config.name}: {self.config.model} cannot {command.verb}",
@@ -498,6 +534,28 @@ class AxisService:
         finally:
             if self._commands.procedure is not None:
                 self._queue.wake()  # for the steps of what has begun
+
+    async def _take_energy_out(
+        self, permit: Permit, command: AxisCommand[CommandReply], mode: StopMode
+    ) -> CommandReply:
+        """Send it, whatever the state, the link, a latch or what waits: nothing here may refuse it.
+
+        Raises:
+            OutcomeUnknown: the drive has not confirmed it; it is sent again until it does.
+        """
+        if isinstance(command, Stop | QuickStop):
+            confirmed = await self.stop(mode)
+        else:
+            confirmed = await self.bring_to_rest(mode, command.verb, command_id=permit.command_id)
+        if not confirmed:
+            name = self.config.name
+            raise OutcomeUnknown(
+                f"axis {name}: the drive has not confirmed {command.verb} yet; it is sent again until it does",
+                axis=name,
+                value=command.verb.value,
+                remedy="look whether the axis moves; check the power of the drive and its line",
+            )
+        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
 
     async def in_turn(self, move: Move, permit: Permit, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
@@ -586,13 +644,16 @@ class AxisService:
         log.info("stop", axis=self.config.name, mode=mode.value)
         return await self.bring_to_rest(mode, Verb.STOP)
 
-    async def bring_to_rest(self, mode: StopMode, verb: Verb = Verb.HALT, by: Permit | None = None) -> bool:
+    async def bring_to_rest(
+        self, mode: StopMode, verb: Verb = Verb.HALT, by: Permit | None = None, command_id: str | None = None
+    ) -> bool:
         """Stop at once, before anything that waits; return whether the drive confirmed it.
 
         Args:
             mode: how.
             verb: the command, for the events.
             by: permit of the command that goes on afterwards; all others are void.
+            command_id: of the command that asks for it; the next one of the daemon when missing.
         """
         if not self.stoppable:
             return False
@@ -603,7 +664,7 @@ class AxisService:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
             self._bus.withdraw(self.driver.spec.address, overtaken)
-            return await self._confirmed_stop(self._pending, verb, STOP_ROUNDS)
+            return await self._confirmed_stop(self._pending, verb, STOP_ROUNDS, command_id)
         finally:
             if self._pending is not None:
                 self._not_confirmed()
@@ -697,7 +758,7 @@ class AxisService:
         self._pending = None
         self.tracker.stop_confirmed()
 
-    async def _confirmed_stop(self, mode: StopMode, verb: Verb, rounds: int) -> bool:
+    async def _confirmed_stop(self, mode: StopMode, verb: Verb, rounds: int, command_id: str | None = None) -> bool:
         if not self.tracker.energised:
             mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
         for _ in range(rounds):
@@ -709,9 +770,10 @@ class AxisService:
                     continue
                 return False
             if mode is StopMode.OFF:
+                self._commands.switched_off()
                 self.tracker.powered(on=False, now_s=self._clock.now_s())
             else:
-                self._commands.brought_to_rest(self._next_command_id(), verb)
+                self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
             if self._pending is None or STRENGTH[mode] >= STRENGTH[self._pending]:
                 self._pending = None
                 self.tracker.stop_confirmed()

@@ -18,7 +18,7 @@ from ldcnd.daemon.axis.procedures.probe import ProbeMove
 from ldcnd.daemon.axis.procedures.pwm import PwmRun
 from ldcnd.daemon.axis.procedures.track import SetPoint
 from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE, VelocityChange, runs
-from ldcnd.daemon.axis.state import MOTION_STATES, Completion
+from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
 from ldcnd.errors import (
     DriveFault,
@@ -36,7 +36,6 @@ from ldcnd.model.commands import (
     AxisCommand,
     BufferMode,
     CommandReply,
-    Halt,
     Home,
     Jog,
     Move,
@@ -96,8 +95,8 @@ class AxisCommands:
         if procedure := self._procedure_for(permit, request):
             return await self._undertake(procedure)
         match request:
-            case Power():
-                return await self._power(permit, on=request.on)
+            case Power(on=True):
+                return await self._power_on(permit)
             case MoveAbsolute():
                 return await self._move_absolute(permit, request)
             case MoveRelative():
@@ -110,8 +109,6 @@ class AxisCommands:
                 return await self._set_gains(permit, request)
             case SetOutputs():
                 return await self._set_outputs(permit, request)
-            case Halt():
-                return await self._halt(permit)
             case Reset():
                 return await self._reset(permit, faults_only=request.faults_only)
             case _:
@@ -173,6 +170,11 @@ class AxisCommands:
         """The drive acknowledged a stop: watch the axis come to rest."""
         self._drop_procedure()
         self._motion.stopping(command_id, verb)
+
+    def switched_off(self) -> None:
+        """The drive acknowledged that its motor is off: nothing that was under way goes on."""
+        self._drop_procedure()
+        self._motion.target_counts = None
 
     # -- procedures --------------------------------------------------------------------------------------------------
 
@@ -259,32 +261,22 @@ class AxisCommands:
 
     # -- power -------------------------------------------------------------------------------------------------------
 
-    async def _power(self, permit: Permit, *, on: bool) -> CommandReply:
+    async def _power_on(self, permit: Permit) -> CommandReply:
         tracker = self._tracker
-        if on:
-            guards.check_may_power_on(tracker)
-            guards.check_stands(tracker)
-            await self._motion.check_does_not_coast()
-            if self._gains is None and isinstance(self._driver, TakesGains):
-                raise WrongState(
-                    f"axis {tracker.name} has no gains: its loop cannot close",
-                    axis=tracker.name,
-                    remedy=Remedy("configure gains or {}", step("set_gains")),
-                )
-            await permit.power_on()
-        else:
-            await self._driver.stop(StopMode.OFF)
+        guards.check_may_power_on(tracker)
+        guards.check_stands(tracker)
+        await self._motion.check_does_not_coast()
+        if self._gains is None and isinstance(self._driver, TakesGains):
+            raise WrongState(
+                f"axis {tracker.name} has no gains: its loop cannot close",
+                axis=tracker.name,
+                remedy=Remedy("configure gains or {}", step("set_gains")),
+            )
+        await permit.power_on()
         self._drop_procedure()
         self._motion.target_counts = None
-        self._tracker.powered(on=on, now_s=self._motion.clock.now_s())
+        self._tracker.powered(on=True, now_s=self._motion.clock.now_s())
         self._motion.publish_state()
-        return self._motion.reply(permit)
-
-    async def _halt(self, permit: Permit) -> CommandReply:
-        tracker = self._tracker
-        if tracker.state in MOTION_STATES or self._moves_by_force():
-            await self._driver.stop(StopMode.SMOOTH)
-            self.brought_to_rest(permit.command_id, permit.verb)
         return self._motion.reply(permit)
 
     async def _reset(self, permit: Permit, *, faults_only: bool) -> CommandReply:

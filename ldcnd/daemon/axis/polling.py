@@ -39,7 +39,7 @@ OPEN_LOOP_SPEEDS = 8.0
 APART_S = 0.1
 """Longest time between two consecutive readings, seconds, unless commands delay the line."""
 ROUNDS = 4
-"""Consecutive contradicting readings that count as one lost reply, and those that must agree on a jump."""
+"""Consecutive readings that contradict the record, and those that must agree on a jump."""
 
 _COUNTER, _HALF = 1 << 32, 1 << 31
 
@@ -165,8 +165,9 @@ class Verdict(Enum):
 
     BELIEVED = "believed"
     ASK_AGAIN = "ask_again"
-    LOST = "lost"
-    """It was requested several times, and each reading contradicts the others."""
+    CONTRADICTS = "contradicts"
+    """It was requested several times, and each reading contradicts the others: the drive replies, and it is not
+    understood what it does."""
 
 
 _Seen = tuple[AxisReading, Timing]
@@ -248,8 +249,9 @@ class PlausibilityGate:
         if self._rounds < ROUNDS:
             return Verdict.ASK_AGAIN
         self.withheld += self._rounds
-        self._unconfirmed, self._rounds = None, 0
-        return Verdict.LOST
+        # what follows is compared with the latest: what was believed before may never be true again
+        self._known, self._unconfirmed, self._rounds, self._sure = (reading, timing), None, 0, False
+        return Verdict.CONTRADICTS
 
     def _believe(self, reading: AxisReading, timing: Timing) -> Verdict:
         self._known = reading, timing

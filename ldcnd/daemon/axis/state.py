@@ -49,6 +49,12 @@ JUMPED = Fault(
     " then send reset and home",
     loses_position=True,
 )
+READINGS_CONTRADICT = Fault(
+    "readings_contradict",
+    "the drive replies, and its readings contradict each other and what was commanded; a stop was sent; switch the axis"
+    " off, check gains, servo rate divisor and encoder, then send reset and home",
+    loses_position=True,
+)
 REFERENCE_REFUSED = Fault(
     "reference_refused",
     "the reference that an earlier daemon has kept was refused",
@@ -72,6 +78,7 @@ OF_DAEMON = (
     LOOP_OPENED,
     JUMPED,
     NOT_SETTLED,
+    READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     STOP_UNCONFIRMED,
 )
@@ -296,7 +303,7 @@ class AxisTracker:
     def shown(self) -> "StateShown":
         """Return what a state sample says besides when; compared after every poll, so no model is built for it."""
         return (
-            QUALITIES[self.link],
+            self.quality,
             self.state,
             self.enabled,
             self.referenced,
@@ -320,7 +327,9 @@ class AxisTracker:
 
     @property
     def quality(self) -> Quality:
-        """Quality of a value read just now."""
+        """Quality of a value read just now; never good while it is not known where the axis is."""
+        if self.position_lost and self.link is LinkState.UP:
+            return Quality.UNCERTAIN
         return QUALITIES[self.link]
 
     @property
@@ -434,6 +443,20 @@ class AxisTracker:
         """The next reading shows a position that no motion has led to: a fault until reset."""
         if JUMPED not in self._own:
             self._own = (*self._own, JUMPED)
+
+    def contradicted(self, now_ns: int) -> bool:
+        """The drive replies, and what it shows is not understood; tell whether that is new since the last reset."""
+        self._misses = 0
+        self.link = LinkState.UP
+        self._rest.forget()
+        new = READINGS_CONTRADICT not in self._own
+        if new:
+            self._own = (*self._own, READINGS_CONTRADICT)
+            self._faults(self._own, now_ns)
+        self.position_lost, self.referenced = True, False
+        if self.state is not AxisState.DISABLED:
+            self._fail(READINGS_CONTRADICT.text)
+        return new
 
     def missed(self, now_ns: int) -> None:
         """Count a poll that brought nothing."""

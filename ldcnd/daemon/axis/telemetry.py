@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.state import NOT_SETTLED, QUALITIES, ActiveCommand, AxisTracker, StateShown
+from ldcnd.daemon.axis.state import NOT_SETTLED, ActiveCommand, AxisTracker, StateShown
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.parameter_access import MonitorValue
@@ -77,7 +77,7 @@ class AxisTelemetry:
 
     def reading(self, reading: AxisReading, asked: frozenset[TelemetryItem], t: int, t_error_ns: int) -> None:
         """Publish the requested items, and the state and the inputs if they changed."""
-        quality, counts_per_unit = QUALITIES[self._tracker.link], self._counts_per_unit
+        quality, counts_per_unit = self._tracker.quality, self._counts_per_unit
         if TelemetryItem.POSITION in asked:
             counts, lag, turns = reading.position_counts, reading.following_error_counts, None
             value = (counts - self.origin_counts) / counts_per_unit

@@ -145,7 +145,7 @@ class Requests:
     def on_command(self, query: Query) -> None:
         """Take a query on `@cmd/**`."""
         self._dispatcher.leases.expire()  # before anything that waited while this process or its client was frozen
-        if self._pending >= PENDING_REQUESTS:
+        if self._pending >= PENDING_REQUESTS and not self._brings_to_rest(query):
             self._refuse(
                 query,
                 TooManyRequests(
@@ -158,6 +158,13 @@ class Requests:
         self._pending += 1
         task = self._group.create_task(self._answer(query, self._command), name=f"command {query.key}")
         task.add_done_callback(self._done)
+
+    def _brings_to_rest(self, query: Query) -> bool:
+        """Tell whether a query is to bring an axis to rest, which no flood of others may keep from being sent."""
+        try:
+            return _command_class(self._keys.parse_command(query.key)).effect is Effect.REST
+        except LdcndError:
+            return False
 
     def on_stop(self, query: Query) -> None:
         """Take a query on `@stop` or `@stop/<axis>`."""
