@@ -117,6 +117,7 @@ class _Transmission:
         on_wire: False for bytes that an adapter holds back, echoes or repeats.
         yields: ends as soon as the host sends.
         gone: how many of the bytes were delivered, dropped or swallowed.
+        spoilt_from: the first byte that another reply has spoilt; a third one does not restore it.
     """
 
     data: bytes
@@ -125,6 +126,7 @@ class _Transmission:
     on_wire: bool
     yields: bool
     gone: int = 0
+    spoilt_from: int | None = None
 
     @property
     def ends_at_s(self) -> float:
@@ -348,8 +350,11 @@ class Chain:
             if not early.on_wire or early.ends_at_s <= late.starts_at_s:
                 continue
             intact = early.complete(late.starts_at_s)
-            spoilt = zip(early.data[intact:], late.data + bytes(len(early.data)), strict=False)
-            early.data = early.data[:intact] + bytes(ours ^ (theirs | 1) for ours, theirs in spoilt)
+            end = len(early.data) if early.spoilt_from is None else early.spoilt_from
+            if intact < end:
+                spoilt = zip(early.data[intact:end], late.data + bytes(end), strict=False)
+                damaged = bytes(ours ^ (theirs | 1) for ours, theirs in spoilt)
+                early.data, early.spoilt_from = early.data[:intact] + damaged + early.data[end:], intact
             swallowed = math.ceil((early.ends_at_s - late.starts_at_s) / late.byte_s - _ALMOST)
             late.drop(swallowed)
 
