@@ -120,7 +120,7 @@ def snapshot(target: Target, bus: str) -> None:
 def list_buses(target: Target) -> None:
     """Show every line: rate, counters, latencies."""
     for bus in target.run(lambda client: client.buses()):
-        health = "up" if bus.up else f"down: {bus.problem}"
+        health = f"up; {bus.problem}".rstrip("; ") if bus.up else f"down: {bus.problem}"
         losses = f"{bus.timeouts} timeouts, {bus.corrupt_replies} corrupt, {bus.resent} resent"
         target.show(
             bus,

@@ -257,19 +257,29 @@ class Network(ABC):
         """Tell whether something on the line has stopped answering that `rejoin` may bring back."""
         return False
 
-    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:  # noqa: ARG002 - no drive is lost here
-        """Bring back drives that lost power without disturbing the others; moves and resets nothing.
+    async def rejoin(
+        self,
+        restarted: Callable[[str], None],  # noqa: ARG002 - no drive is lost here
+        heard: Callable[[str], None] = lambda _: None,  # noqa: ARG002
+    ) -> frozenset[str]:
+        """Bring back drives that lost power without disturbing the others; moves nothing, resets nothing that moves.
 
         Args:
             restarted: called with the axis whose drive had lost power, before that drive can answer again.
+            heard: called with an axis whose drive answers again, as soon as it does.
 
         Returns:
-            The axes whose drives answer again, restarted or only cut off for a while.
+            These axes.
 
         Raises:
             BusError: the line failed meanwhile.
         """
         return frozenset()
+
+    @property
+    def problem(self) -> str:
+        """What keeps drives off the line that is up, and what a person has to do; empty without a problem."""
+        return ""
 
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:  # noqa: B027 - optional
         """Stop axes with as few packets as the family can, before anything else that waits; not confirmed.

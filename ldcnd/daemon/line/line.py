@@ -234,15 +234,47 @@ class BusService:
             began_s = loop.time()
             heard: frozenset[str] = frozenset()
             try:
-                heard = await self.network.rejoin(self._restarted)
+                heard = await self._search()
             except LdcndError as error:
                 log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
+            self.problem = self.network.problem
             now_s = loop.time()
-            for axis in self.axes:
-                if axis.config.name in heard:
-                    self._poll(axis, now_s)
             if not heard:
                 pause_s = min((now_s - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)
+
+    async def _search(self) -> frozenset[str]:
+        """Search once for lost drives; a stop that waits goes out meanwhile, first to each drive that answers again.
+
+        Returns the axes that answer again.
+
+        Raises:
+            LdcndError: as `Network.rejoin`.
+        """
+        back: set[str] = set()
+
+        def heard(name: str) -> None:
+            back.add(name)
+            self._poll(self._axis(name), asyncio.get_running_loop().time())
+            self._stop_wanted.set()
+
+        search = asyncio.create_task(self.network.rejoin(self._restarted, heard), name="search for lost drives")
+        try:
+            while not search.done():
+                wanted = asyncio.ensure_future(self._stop_wanted.wait())
+                try:
+                    await asyncio.wait((search, wanted), return_when=asyncio.FIRST_COMPLETED)
+                    stops = wanted.done()
+                finally:
+                    wanted.cancel()
+                if stops:
+                    await self._send_pending_stops()
+            await search
+        finally:
+            search.cancel()
+        return frozenset(back)
+
+    def _axis(self, name: str) -> AxisService:
+        return next(axis for axis in self.axes if axis.config.name == name)
 
     async def _probe_stop_lane(self, period_s: float) -> None:
         """Keep measuring how long a stop would wait."""
@@ -269,7 +301,7 @@ class BusService:
     def _restarted(self, name: str) -> None:
         """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
         log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
-        axis = next(axis for axis in self.axes if axis.config.name == name)
+        axis = self._axis(name)
         axis.restarted()
         axis.disconnected()
         axis.cannot_move()

@@ -8,6 +8,7 @@ Sources: LS-182AP manual, "Addressing" with the flow chart of the procedure, "De
 4.1 "Network initialization", 5.2.
 """
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -106,6 +107,17 @@ def once(exchange: Exchange[ReplyT]) -> Exchange[ReplyT]:
     return replace(exchange, repeatable=False)
 
 
+WAITING_ADDRESSES = tuple(range(127, 63, -1))
+"""Given to what waits at address 0 until its place is proven; nothing that could move is ever sent there."""
+
+
+def waiting_address(number: int) -> int:
+    """Return the waiting address of the module with this number in the chain, from 1 on."""
+    return WAITING_ADDRESSES[number - 1]
+
+
+WAITING_GROUP = 0xFE
+"""The group of modules at waiting addresses: no configured group reaches it."""
 FIRST_GROUP = 0x81
 """Configured groups are numbered from here; 0x80 is avoided, as its leader's byte would be 0."""
 
@@ -186,6 +198,10 @@ def nulls(quiet_s: float) -> Exchange[None]:
     return unanswered(EVERYBODY, NULLS, quiet_s, repeatable=True, effect=Effect.READS)
 
 
+RESET_S = 2.0
+"""Longest time that a module takes to restart, seconds. No manual has it; 2 s are recommended for one model."""
+
+
 class LineRate:
     """Who is at which rate.
 
@@ -194,6 +210,7 @@ class LineRate:
         groups: the group addresses in use.
         at_reset: the rate after power-up and Hard Reset.
         cycle_s: the servo cycle of the modules.
+        reset_s: the longest time that a module takes to restart, seconds.
     """
 
     def __init__(
@@ -205,8 +222,10 @@ class LineRate:
         *,
         fastest: bool,
         clock_hz: int = CLOCK_HZ,
+        reset_s: float = RESET_S,
     ) -> None:
         self.working = working
+        self.reset_s = reset_s
         self.at_reset = baud_at_reset(clock_hz)
         self.cycle_s = CYCLE_CLOCKS / clock_hz
         usual = clock_hz == CLOCK_HZ
@@ -248,14 +267,15 @@ class LineRate:
         """
         if self._bus.baud == baud:
             return
-        profile = PIC_SERVO_SC if baud == FASTEST_BAUD else None
-        packets = [
-            commands.set_baud(commands.Group(address, profile), baud, self._codes, self._clock_hz).request
-            for address in self.groups
-        ]
+        packets = [self.set_baud(address, baud).request for address in (*self.groups, WAITING_GROUP)]
         quiet_s = commands.group_quiet_s(self.cycle_s)
         burst = unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False, effect=Effect.ARRANGES)
         await self._bus.change_baud(burst, baud)
+
+    def set_baud(self, group: int, baud: int) -> Exchange[None]:
+        """Return the exchange that moves one group without a leader to a rate."""
+        profile = PIC_SERVO_SC if baud == FASTEST_BAUD else None
+        return commands.set_baud(commands.Group(group, profile, self.cycle_s), baud, self._codes, self._clock_hz)
 
     def spaced(self, packets: list[bytes]) -> bytes:
         """Return group packets as one piece, a servo cycle apart at the present rate."""
@@ -295,6 +315,8 @@ MOST_MODULES = 32
 ADDRESSING_ATTEMPTS = 3
 END_ATTEMPTS = 2
 """The chain is expected to end here: each attempt to find one more module costs a time-out."""
+RESTART_PAUSE_S = 0.05
+"""From one question to a module that may be restarting to the next, seconds."""
 DRAIN_S = 0.005
 """Silence after which no reply can come to a half-received packet that nulls have filled up."""
 
@@ -334,58 +356,83 @@ class Addressing:
     async def _reset_at(self, baud: int, settle_s: float) -> None:
         if not await self.rate.host_to(baud):
             return
-        packets = [commands.hard_reset(commands.Group(address)).request for address in self._plan.addresses]
+        packets = [
+            commands.hard_reset(commands.Group(address)).request for address in (*self._plan.addresses, WAITING_GROUP)
+        ]
         burst = self.rate.spaced(packets)
         reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=Effect.ARRANGES)
         for _ in range(2):
             await self._bus.execute(reset)
 
     async def address_all(self, expected: int) -> dict[int, Identity]:
-        """Give the modules addresses 1, 2, ... in the order of the chain; return who is where.
+        """Give the modules addresses 1, 2, ... in the order of the chain, after a reset; return who is where.
+
+        Each first gets a waiting address. Only when all of these answer after the last of them was given out, each is
+        held by one module, in the order of the chain: one that has restarted meanwhile left its waiting address.
 
         Args:
-            expected: number of configured modules; those behind them are searched for with less patience.
+            expected: number of configured modules; they are waited for as long as they may take to restart.
         """
+        self.had_address.clear()
+        count, until_s = 0, asyncio.get_running_loop().time() + self.rate.reset_s
+        while count < MOST_MODULES and await (
+            self._park_expected(count + 1, until_s) if count < expected else self._park_unexpected(count + 1)
+        ):
+            count += 1
         modules: dict[int, Identity] = {}
-        for address in range(1, MOST_MODULES + 1):
-            if not await (self.address_next(address) if address <= expected else self._address_unexpected(address)):
-                break
-            identity = await self.rate.who_is(address, patient=True)
+        for number in range(1, count + 1):
+            identity = await self.rate.who_is(waiting_address(number), patient=True)
             if identity is None:
-                break
-            modules[address] = identity
+                return modules
+            modules[number] = identity
+        for number in modules:
+            if not await self.move(waiting_address(number), number):
+                return {address: modules[address] for address in range(1, number)}
         return modules
 
-    async def let_all_hear(self, expected: int) -> None:
-        """Assign this many addresses, to any modules, so that the next reset reaches every module.
-
-        Behind a module that waits for its address one with an address is deaf, and those behind it receive: a reset
-        then leaves it as it is, and two modules of the chain at address 0.
-        """
-        for address in range(1, expected + 1):
-            await self._set_address(UNADDRESSED, address)
-
-    async def address_next(self, address: int) -> bool:
-        """Address the module that is at 0 now, as a member of its group; tell whether there was one.
+    async def _park_expected(self, number: int, until_s: float) -> bool:
+        """Give what waits at address 0 a waiting address; tell whether there was something until that instant.
 
         A lost reply leaves open whether the module took the address: then it answers there.
         """
-        for _ in range(ADDRESSING_ATTEMPTS):
-            if await self._set_address(UNADDRESSED, address):
+        address, attempts = waiting_address(number), 0
+        while attempts < ADDRESSING_ATTEMPTS or asyncio.get_running_loop().time() < until_s:
+            attempts += 1
+            if await self._set_address(UNADDRESSED, address, EVERYBODY):
                 return True
-            if await self.rate.who_is(address, patient=True):
-                self.had_address.add(address)
+            if await self.rate.who_is(address):
+                self.had_address.add(number)
                 return True
+            if attempts >= ADDRESSING_ATTEMPTS:
+                await asyncio.sleep(RESTART_PAUSE_S)
         return False
 
-    async def _address_unexpected(self, address: int) -> bool:
-        """Address an unsupported module; return whether there was one.
+    async def _park_unexpected(self, number: int) -> bool:
+        """Give an unsupported module a waiting address; tell whether there was one.
 
         Whether one waits for an address is read first: a lost reply to that leaves nothing open.
         """
         for _ in range(END_ATTEMPTS):
             if await self.rate.who_is(UNADDRESSED.address):
-                return await self.address_next(address)
+                return await self._park_expected(number, 0.0)
+        return False
+
+    async def let_all_hear(self, expected: int) -> None:
+        """Assign this many waiting addresses, to any modules, so that the next reset reaches every module.
+
+        Behind a module that waits for its address one with an address is deaf, and those behind it receive: a reset
+        then leaves it as it is, and two modules of the chain at address 0.
+        """
+        for address in WAITING_ADDRESSES[:expected]:
+            await self._set_address(UNADDRESSED, address, EVERYBODY)
+
+    async def move(self, waiting: int, address: int) -> bool:
+        """Move the one module at a waiting address to its own, into its group; tell whether it did."""
+        for _ in range(ADDRESSING_ATTEMPTS):
+            if await self._set_address(Node(waiting, ANY_DIALECT), address, self._plan.place(address).address):
+                return True
+            if await self.rate.who_is(address, patient=True):
+                return True
         return False
 
     async def regroup(self, address: int) -> bool:
@@ -395,24 +442,31 @@ class Addressing:
         """
         node = Node(address, ANY_DIALECT)
         for _ in range(ADDRESSING_ATTEMPTS):
-            if await self._set_address(node, address, leader=self._plan.leads(address)):
+            if await self._set_address(
+                node, address, self._plan.place(address).address, leader=self._plan.leads(address)
+            ):
                 return True
             if not await self.rate.who_is(address, patient=True):
                 return False
         return False
 
+    async def lead(self, address: int) -> None:
+        """Make one module lead, if it is the leader of its group."""
+        if self._plan.leads(address):
+            await self.regroup(address)
+
     async def without_leaders(self) -> None:
         """Make leaders members, so that their groups take Set Baud Rate; those that do not answer are left."""
         for address in self._plan.leaders:
-            await self._set_address(Node(address, ANY_DIALECT), address)
+            await self._set_address(Node(address, ANY_DIALECT), address, self._plan.place(address).address)
 
     async def with_leaders(self) -> None:
         """Make leaders lead, once all modules are at the rate where they stay."""
         for address in self._plan.leaders:
             await self.regroup(address)
 
-    async def _set_address(self, node: Node, address: int, *, leader: bool = False) -> bool:
-        packet = commands.set_address(node, address, self._plan.place(address).address, leader=leader)
+    async def _set_address(self, node: Node, address: int, group: int, *, leader: bool = False) -> bool:
+        packet = commands.set_address(node, address, group, leader=leader)
         try:
             await self._bus.execute(packet)
         except (OutcomeUnknown, BadReply, PacketRejected):

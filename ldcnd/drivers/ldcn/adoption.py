@@ -1,40 +1,22 @@
-"""Taking over a running LDCN/NMC line, and bringing back modules that lost power, without a reset of the healthy ones.
+"""Taking over a running LDCN/NMC line.
 
 Adoption finds the line at whatever rate, identifies the modules and touches nothing: it sends nothing but nulls, Read
 Status and No Operation. Positions and motions go on; gains cannot be read back and count as those of the configuration.
-
-A module that lost power comes back silent, at 19200 baud and address 0, and keeps those behind it in the chain from
-receiving the host until it has an address again; they go on with what they were doing. A scan for it is one exchange at
-19200 baud, on a line that stays at its working rate: modules at that rate receive noise. When it answers, all modules
-that receive are taken down to 19200 baud, which is allowed while motors move, the newcomers get addresses one after
-another, and all go back to the working rate. In between every exchange is an ordinary one: stops overtake, healthy
-drives are polled at the lower rate. Some may have missed a change of rate, or have taken part in one before they had an
-address: while a module is missing afterwards, it is searched for, too.
-
-A PIC-SERVO SC may have saved its addresses: then it comes back with them, and never answers at address 0. One that
-answers at 19200 baud with its own address, and cannot have missed a change of rate, has restarted. It is reset while it
-stands, before it gets its address, because saved settings may have energised its motor, or would with the address.
 """
 
 import asyncio
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ldcnd.bus.bus import Bus
 from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.addressing import Addressing, Expected, Identity, LineRate, differences
+from ldcnd.drivers.ldcn.addressing import Expected, Identity, LineRate, differences
 from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem
 from ldcnd.drivers.ldcn.profiles import Profile, Support
-from ldcnd.errors import BusDown, BusError, LdcndError, NetworkMismatch
-from ldcnd.log import get_logger
-
-log = get_logger("ldcn")
+from ldcnd.errors import BusDown, BusError, NetworkMismatch
 
 UNADDRESSED = 0
-STRAY_SCANS = 3
-"""Number of scans for each possible stray at its rate and address."""
 MOTION_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 WATCH_S = 0.5
 """How long positions are watched before drives count as standing: the velocity in a status has no fraction."""
@@ -115,7 +97,7 @@ class Adoption:
         """Return in words what keeps the line from a reset: what moves, and what is not known to stand.
 
         A silent module is not known to stand, also behind one that waits for its address: it may only be kept from
-        hearing, and go on with its motion. `Rejoin.gather` makes such modules audible. Where nothing answers but a
+        hearing, and go on with its motion. `Gathering` makes such modules audible. Where nothing answers but a
         module that waits for its address, the line has been powered on or reset as a whole.
 
         Raises:
@@ -133,7 +115,7 @@ class Adoption:
         await asyncio.sleep(WATCH_S)
         after = await self._motion_states(watched)
         for address, (found, _) in watched.items():
-            if _moves(before[address], after[address]):
+            if moves(before[address], after[address]):
                 obstacles.append(f"address {address}, {found.identity}, moves")
         silent = [each for each in self._expected if each.address not in self.found]
         if silent and (self.found or not await self._newcomer()):
@@ -203,7 +185,7 @@ def _is_servo(each: Expected) -> bool:
     return each.profile.support is Support.FULL
 
 
-def _moves(before: Status | None, after: Status | None) -> bool:
+def moves(before: Status | None, after: Status | None) -> bool:
     """Judge by velocity, by a profile that runs with the loop closed, and by two positions; not known counts as yes."""
     if before is None or after is None or before.position is None or after.position is None:
         return True
@@ -213,140 +195,3 @@ def _moves(before: Status | None, after: Status | None) -> bool:
         for status in (before, after)
     )
     return runs or abs(after.position - before.position) > STILL_COUNTS
-
-
-class Rejoin:
-    """One line's search for newcomers."""
-
-    def __init__(self, bus: Bus, rate: LineRate, addressing: Addressing, expected: tuple[Expected, ...]) -> None:
-        self._bus = bus
-        self._rate = rate
-        self._addressing = addressing
-        self._expected = expected
-        self._strays: deque[tuple[int, int]] = deque()  # rates and addresses at which a stray module may be
-        self._kept_addresses: set[int] = set()  # of those that have restarted with them
-        self._foreign: Identity | None = None  # complained about already
-
-    async def look(self, mute: tuple[Expected, ...], addressing: Callable[[int], None]) -> frozenset[int]:
-        """Scan for these modules once, and bring back those that are found; return those known to answer.
-
-        Args:
-            mute: modules that have stopped answering, in the order of the chain.
-            addressing: called with the address of a newcomer before it is given that address.
-
-        Raises:
-            BusError: the line failed meanwhile.
-        """
-        if self._bus.baud != self._rate.at_reset and not self._rate.changeable:
-            return frozenset()  # a newcomer could not receive at this port's rates
-        if not mute or not (await self._anybody_there(mute) or await self._anybody_with_saved_address(mute)):
-            return frozenset()
-        lost = [each for each in mute if await self._rate.who_is(each.address) is None]
-        if lost:
-            await self._at_reset_baud(lost, addressing)
-        heard = [each.address for each in self._expected if await self._rate.who_is(each.address, patient=True)]
-        # those behind a newcomer answer again, too
-        self._suspect(each.address for each in self._expected if each.address not in heard)
-        return frozenset(each.address for each in mute if each.address in heard)
-
-    async def gather(self, found: Mapping[int, Found], addressing: Callable[[int], None]) -> bool:
-        """Make a line audible that answers in part; tell whether there was something to do.
-
-        Newcomers get their addresses, which reconnects those behind them, and modules that a lost host has left
-        at different rates are brought to the working rate. Nothing is moved or reset.
-
-        Args:
-            found: who answered, at which rate; at least one.
-            addressing: called with the address of a newcomer before it is given that address.
-
-        Raises:
-            BusError: the line failed meanwhile.
-        """
-        if not self._rate.changeable and self._bus.baud != self._rate.at_reset:
-            return False
-        lost = [each for each in self._expected if each.address not in found]
-        rates = {each.baud for each in found.values()}
-        if len(rates) == 1 and not (lost and await self._rate.who_is_at(self._rate.at_reset, UNADDRESSED)):
-            return False
-        for baud in rates - {self._rate.at_reset}:
-            await self._rate.host_to(baud)
-            await self._addressing.without_leaders()
-            await self._rate.everybody_to(self._rate.at_reset)
-        await self._at_reset_baud(lost, addressing)
-        return True
-
-    async def _anybody_there(self, mute: tuple[Expected, ...]) -> bool:
-        """Probe for a newcomer at 19200 baud, and for one of those that may have strayed."""
-        found = await self._rate.who_is_at(self._rate.at_reset, UNADDRESSED)
-        if found and (found != self._foreign or mute[0].accepts(found)):
-            return True
-        if self._strays:
-            baud, address = self._strays.popleft()
-            awaited = address == UNADDRESSED or address in {each.address for each in mute}
-            return awaited and await self._rate.who_is_at(baud, address) is not None
-        return False
-
-    async def _anybody_with_saved_address(self, mute: tuple[Expected, ...]) -> bool:
-        """Return whether a mute module has come back at 19200 baud with an address that it has saved."""
-        at_reset = self._rate.at_reset
-        if self._bus.baud == at_reset:
-            return False
-        for each in mute:
-            astray = (at_reset, each.address) in self._strays
-            if each.profile.sc_extensions and not astray and await self._rate.who_is_at(at_reset, each.address):
-                self._kept_addresses.add(each.address)
-        return bool(self._kept_addresses)
-
-    async def _stands(self, each: Expected) -> bool:
-        exchange = commands.read_status(Node(each.address, each.profile), MOTION_ITEMS)
-        before = await self._bus.execute(exchange)
-        await asyncio.sleep(WATCH_S)
-        after = await self._bus.execute(exchange)
-        return not _moves(before, after)
-
-    def _suspect(self, missing: Iterable[int]) -> None:
-        strays = [(self._rate.at_reset, address) for address in missing]
-        self._strays = deque([(self._rate.working, UNADDRESSED), *strays] * STRAY_SCANS if strays else [])
-
-    async def _at_reset_baud(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
-        """Address newcomers at the rate of power-up; all modules that receive are at the working rate afterwards."""
-        self._suspect(each.address for each in self._expected)
-        await self._addressing.without_leaders()
-        await self._rate.everybody_to(self._rate.at_reset)
-        try:
-            await self._address_newcomers(lost, addressing)
-        except LdcndError:
-            if self._bus.is_open:
-                await self._back_to_work()
-            raise
-        await self._back_to_work()
-
-    async def _back_to_work(self) -> None:
-        await self._rate.everybody_to(self._rate.working)
-        await self._addressing.with_leaders()
-
-    async def _address_newcomers(self, lost: list[Expected], addressing: Callable[[int], None]) -> None:
-        """Give the module at address 0 the first address that is missing, as long as there is one."""
-        for each in lost:
-            if each.address in self._kept_addresses:
-                self._kept_addresses.discard(each.address)
-                if not await self._stands(each):
-                    continue
-                await self._bus.execute(commands.hard_reset(Node(each.address, each.profile)))
-            elif await self._rate.who_is(each.address):
-                continue  # it has its address, and had only missed a change of rate
-            found = await self._rate.who_is(UNADDRESSED)
-            if found is None:
-                break  # the next one has no power, or keeps those behind it from receiving
-            if not each.accepts(found):
-                if found != self._foreign:
-                    log.error("foreign newcomer", bus=self._bus.settings.name, place=each.what, found=str(found))
-                self._foreign = found
-                break
-            log.info("newcomer", bus=self._bus.settings.name, address=each.address, identity=str(found))
-            if each.profile.sc_extensions:
-                # saved settings may energise its motor as it gets an address, but not after a reset by command
-                await self._bus.execute(commands.hard_reset(Node(UNADDRESSED, each.profile)))
-            addressing(each.address)
-            if not await self._addressing.address_next(each.address):
-                break

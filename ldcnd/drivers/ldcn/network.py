@@ -31,12 +31,13 @@ from ldcnd.drivers.ldcn.addressing import (
     differences,
     read_identity,
 )
-from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found, Rejoin
+from ldcnd.drivers.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found
 from ldcnd.drivers.ldcn.commands import Node
+from ldcnd.drivers.ldcn.gathering import Gathering
 from ldcnd.drivers.ldcn.groups import Groups
 from ldcnd.drivers.ldcn.io_module import IoModule
 from ldcnd.drivers.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
-from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Support, at_clock
+from ldcnd.drivers.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
 from ldcnd.drivers.ldcn.registers import BaudCodes
 from ldcnd.drivers.ldcn.servo import LdcnAxis
 from ldcnd.drivers.network import (
@@ -136,7 +137,7 @@ class LdcnNetwork(Network):
         )
         self._addressing = Addressing(bus, self._rate, plan)
         self._adoption = Adoption(bus, self._rate, self._expected)
-        self._rejoin = Rejoin(bus, self._rate, self._addressing, self._expected)
+        self._gathering = Gathering(bus, self._rate, self._addressing, self._expected)
         drives = {drive.spec.name: drive for drive in self._drives.values()}
         self.axes: Mapping[str, Drive] = drives
         self._groups = Groups(bus, plan, self._addressing, drives, tuple(self._io.values()), snapshots=line.snapshot)
@@ -195,9 +196,23 @@ class LdcnNetwork(Network):
         except NetworkMismatch:
             reads_only = not self._was_up and self._line.adopt_fallback is AdoptFallback.REFUSE
             found = self._adoption.found
-            if reads_only or not found or not await self._rejoin.gather(found, addressing):
+            if reads_only or not found or not self._gathering.possible:
                 raise
+            await self._to_one_rate(found)
+            await self._gathering.search(addressing, lambda _: None, left=len(self._expected) - len(found))
+            await self._addressing.with_leaders()
         return await self._adoption.attempt()
+
+    async def _to_one_rate(self, found: Mapping[int, Found]) -> None:
+        """Bring modules that a lost host has left at different rates to one; allowed while motors move."""
+        rates = {each.baud for each in found.values()}
+        if len(rates) == 1:
+            (self._rate.working,) = rates
+        for baud in rates - {self._rate.working}:
+            await self._rate.host_to(baud)
+            await self._addressing.without_leaders()
+            await self._rate.everybody_to(self._rate.working)
+        await self._rate.host_to(self._rate.working)
 
     def _open_loops(self, adopted: Adopted) -> frozenset[str]:
         return frozenset(
@@ -208,6 +223,11 @@ class LdcnNetwork(Network):
 
     def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
         self._identities = dict(modules)
+        self._gathering.places = self._expected + tuple(
+            Expected(address, "module", found.profile or PIC_STEP, found)
+            for address, found in sorted(modules.items())
+            if address > len(self._expected)
+        )
         self._watches = {
             address: self._io.get(address) or ModuleWatch(address) for address in modules if address not in self._drives
         }
@@ -357,9 +377,9 @@ class LdcnNetwork(Network):
         different = differences(self._expected, modules)
         if different:
             raise NetworkMismatch(
-                f"bus {self._bus.settings.name}: {len(modules)} module(s) found, {len(self._expected)} configured; "
-                + "; ".join(different),
-                remedy="correct the wiring or the configuration",
+                f"bus {self._bus.settings.name}: {len(modules)} module(s) found within"
+                f" {self._rate.reset_s:g} s of the reset, {len(self._expected)} configured; " + "; ".join(different),
+                remedy="switch on what has no power, and correct the wiring or the configuration",
             )
         known = {each.address for each in self._expected}
         return tuple(
@@ -401,8 +421,10 @@ class LdcnNetwork(Network):
     def incomplete(self) -> bool:
         return not self._bus.proofs.all_hold()
 
-    async def rejoin(self, restarted: Callable[[str], None]) -> frozenset[str]:
-        """See `Network`: one scan of `Rejoin`, and who answers again is identified again."""
+    async def rejoin(
+        self, restarted: Callable[[str], None], heard: Callable[[str], None] = lambda _: None
+    ) -> frozenset[str]:
+        """See `Network`: one search of `Gathering`, and what answers again is identified again."""
 
         def addressing(address: int) -> None:
             self._proofs[address].lose(f"address {address} has restarted")
@@ -412,11 +434,28 @@ class LdcnNetwork(Network):
             elif address in self._io:
                 self._io[address].forget()
 
-        silent = tuple(each for each in self._expected if self._bus.misses(each.address))
+        missing = {
+            address: name
+            for address, name in self._names.items()
+            if self._bus.misses(address) or not self._proofs[address].holds
+        }
+        back: set[str] = set()
+
+        def reached(address: int) -> None:
+            if address in missing and missing[address] not in back:
+                back.add(missing[address])
+                heard(missing[address])
+
         with bringing_up():
-            heard = await self._rejoin.look(silent, addressing)
-        heard |= await self._identify()
-        return frozenset(self._names[address] for address in heard if address in self._names)
+            await self._gathering.search(addressing, reached)
+        for address in await self._identify():
+            reached(address)
+        return frozenset(back)
+
+    @property
+    @override
+    def problem(self) -> str:
+        return self._gathering.problem
 
     async def _identify(self) -> frozenset[int]:
         """Prove again who answers and was lost; return the addresses of those that are what is configured."""
