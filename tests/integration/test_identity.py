@@ -9,7 +9,7 @@ import pytest
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import AxisUnreachable, LeaseHeld, NotIdentified, WrongState
+from ldcnd.errors import AxisUnreachable, LeaseHeld, NotIdentified, OutcomeUnknown, WrongState
 from ldcnd.model.commands import Halt, MoveVelocity, Power, Reset, SetGains, SetOutputs, Stop, Why
 from ldcnd.model.leases import Acquire
 from ldcnd.model.rig_commands import SetIo, SetIoTimer
@@ -82,7 +82,8 @@ async def test_outputs_are_not_set_in_a_servo_that_holds_the_address_of_the_modu
 
 async def test_a_line_that_is_down_takes_no_motion_after_a_stop_and_a_reset():
     async with two_servos() as (rig, chain):
-        await rig.client.command("x", Stop())
+        with pytest.raises(OutcomeUnknown, match="sent again"):
+            await rig.client.command("x", Stop())
         await rig.until("x", lambda state: not state.stop_pending)
         for command in (Reset(), Power(on=True), SetGains(kp=10, el=100), SetOutputs(limit1="high")):
             with pytest.raises(NotIdentified, match="axis x is not identified"):
@@ -103,7 +104,8 @@ async def test_a_stop_a_halt_and_power_off_reach_a_line_that_is_not_taken_over()
     async with two_servos() as (rig, _):
         for command in (Stop(), Halt(), Power(on=False)):
             before = len(rig.sent)
-            await rig.client.command("x", command)
+            with pytest.raises(OutcomeUnknown, match="sent again"):
+                await rig.client.command("x", command)
             await asyncio.sleep(1.0)
             assert Command.STOP_MOTOR in {packet.command for packet in rig.sent[before:]}, command.verb
 
