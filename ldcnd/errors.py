@@ -44,6 +44,7 @@ class ErrorCode(StrEnum):
     VELOCITY_LIMIT = "velocity_limit"
     ACCELERATION_LIMIT = "acceleration_limit"
     WRONG_STATE = "wrong_state"
+    REGISTER_UNKNOWN = "register_unknown"
     NOT_REFERENCED = "not_referenced"
     STOP_LATCHED = "stop_latched"
     ABORTED = "aborted"
@@ -370,6 +371,13 @@ class WrongState(RequestRefused):
 
     code = ErrorCode.WRONG_STATE
     way_out = "the reply says which command leads out of the state"
+
+
+class RegisterUnknown(WrongState):
+    """What a register of the drive holds is not known, and the command depends on it; nothing was sent."""
+
+    code = ErrorCode.REGISTER_UNKNOWN
+    way_out = "send what writes the register; the message names it"
 
 
 class NotReferenced(RequestRefused):

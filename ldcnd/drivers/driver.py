@@ -4,6 +4,7 @@ The line that it is on is a `Network`, in network.py. Values are encoder counts 
 seconds; units, limits, states and authority are the daemon's.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
@@ -73,6 +74,8 @@ class AxisReading:
         cut_short: why the drive ended the motion before its end, by itself; empty when it did not.
         begun_anew: its own counter reads about 0, as after a reset.
         altered: what this host has not done to it and yet shows; empty when nothing does.
+        velocity_uncertain: the servo rate, on which the scale of the velocity depends, is not confirmed: the velocity
+            is the highest that it can be.
     """
 
     position_counts: int
@@ -93,6 +96,7 @@ class AxisReading:
     cut_short: str = ""
     begun_anew: bool = False
     altered: str = ""
+    velocity_uncertain: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +112,22 @@ class Motion:
     target_counts: int | None
     velocity_counts_per_s: float
     acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ceiling:
+    """Limits that hold after rounding to registers, too; infinite for none.
+
+    Attributes:
+        velocity_counts_per_s: highest speed.
+        acceleration_counts_per_s2: highest acceleration.
+    """
+
+    velocity_counts_per_s: float = math.inf
+    acceleration_counts_per_s2: float = math.inf
+
+
+NO_CEILING = Ceiling()
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +179,19 @@ class HomeCapture:
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """The host's copy of a register that cannot be read back; `value` is None when it is unknown."""
+    """What is published of a register that cannot be read back.
+
+    Attributes:
+        name: of the register.
+        value: what it holds; None when that is unknown.
+        provenance: how that is known.
+        why: the evidence, or the reason why there is none.
+    """
 
     name: str
     value: int | None
     provenance: Provenance
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,11 +312,11 @@ class Moves(Readable):
     retargets: bool = False
 
     @abstractmethod
-    def quantise(self, motion: Motion) -> Motion:
-        """Return the motion as the drive's registers will hold it.
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+        """Return the motion as the drive's registers will hold it: the nearest values that are not above these.
 
         Raises:
-            ValueOutOfRange: a value does not fit its register; says which one would.
+            ValueOutOfRange: a value does not fit its register, or the smallest one is above; says which one would do.
         """
 
     @abstractmethod
@@ -392,11 +420,22 @@ class WalksPaths(ABC):
 
 
 class TakesGains(ABC):
-    """The registers of its position loop can be loaded."""
+    """The registers of its position loop can be loaded.
+
+    Attributes:
+        gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
+            acknowledged last, before that the configuration's; None without either.
+    """
+
+    gains: Gains | None
 
     @abstractmethod
     async def set_gains(self, gains: Gains) -> None:
-        """Load the registers; they act at once."""
+        """Load the registers; they act at once.
+
+        Raises:
+            WrongState: the servo rate would change while the axis moves.
+        """
 
 
 class Records(ABC):
@@ -464,6 +503,7 @@ class HasOutputs(ABC):
 
         Raises:
             NotSupported: the model cannot.
+            RegisterUnknown: what a pin that is not named is used as is not known.
         """
 
 

@@ -134,8 +134,12 @@ class Provenance(StrEnum):
 
     WRITTEN_AND_ACKNOWLEDGED = "written_and_acknowledged"
     """This daemon wrote it and the drive acknowledged."""
+    RESET = "reset"
+    """The drive was reset, and its manual says what is in it then."""
+    READ_BACK = "read_back"
+    """The drive has shown it."""
     ASSUMED = "assumed"
-    """From the configuration or from what the manual says about a reset; not confirmed."""
+    """From the configuration, for a drive that was taken over as it is; not confirmed."""
     UNKNOWN = "unknown"
     """Anything may be in it."""
 
@@ -149,6 +153,8 @@ class RegisterInfo(Frozen):
     """Raw value; null when it is unknown."""
     provenance: Provenance
     """How the value is known."""
+    why: str = ""
+    """The evidence for the value, or the reason why it is not known."""
 
 
 class AxisLimits(Frozen):

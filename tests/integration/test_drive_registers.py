@@ -95,8 +95,8 @@ async def test_registers_say_where_their_values_come_from():
     fresh = {register.name: register for register in before.registers}
     after = {register.name: register for register in moved.registers}
     last = {register.name: register for register in stopped.registers}
-    assert (fresh["kp"].value, fresh["sr"].value, fresh["kp"].provenance) == (0, 1, Provenance.ASSUMED)
+    assert (fresh["kp"].value, fresh["sr"].value, fresh["kp"].provenance) == (0, 1, Provenance.RESET)
     assert (after["kp"].value, after["kp"].provenance) == (GAINS["kp"], Provenance.WRITTEN_AND_ACKNOWLEDGED)
     assert (after["position"].value, after["position"].provenance) == (1000, Provenance.WRITTEN_AND_ACKNOWLEDGED)
-    assert after["io_control"].value == 0x0C
+    assert (after["limit1_pin"].value, after["limit2_pin"].value) == (0x04, 0x08)
     assert (last["velocity"].value, last["velocity"].provenance) == (None, Provenance.UNKNOWN)

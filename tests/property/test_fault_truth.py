@@ -14,6 +14,7 @@ from ldcnd.daemon.axis.state import AxisTracker
 from ldcnd.drivers.ldcn.controls import StopControl
 from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
 from ldcnd.drivers.ldcn.record import DriveState
+from ldcnd.drivers.ldcn.registers import ServoRegisters
 from ldcnd.exchange import Timing
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, Trip
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis
@@ -49,7 +50,7 @@ class History:
         self.known.restarted()
 
     def _new_daemon(self) -> None:
-        self.known = DriveState("x", self.axis.profile)
+        self.known = DriveState("x", self.axis.profile, ServoRegisters(self.axis.profile, None, lambda: 0.0))
         self.tracker = AxisTracker("x", "mm")
 
     @property

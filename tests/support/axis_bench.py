@@ -22,9 +22,11 @@ from ldcnd.daemon.axis.telemetry import Arrival
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
 from ldcnd.drivers.driver import (
+    NO_CEILING,
     AnalogMotion,
     AxisReading,
     AxisSpec,
+    Ceiling,
     Gains,
     HasOutputs,
     HomeCapture,
@@ -78,6 +80,7 @@ class FakeDrive(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs):
 
     def __init__(self) -> None:
         self.spec = AxisSpec("x", 1, "pic-servo-v4", GAINS)
+        self.gains = GAINS
         self.identity = None
         self.capabilities = frozenset(Verb)
         self.adc_full_scale = 1023
@@ -102,7 +105,7 @@ class FakeDrive(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs):
         return Exchange(1, b"", 0, lambda _data: ReplyVerdict.INTACT, lambda _data: self.shown, 0.0, repeatable=True)
 
     @override
-    def quantise(self, motion: Motion) -> Motion:
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
         return motion
 
     @override
@@ -147,6 +150,7 @@ class FakeDrive(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs):
     @override
     async def set_gains(self, gains: Gains) -> None:
         await self._take("set_gains", gains)
+        self.gains = gains
 
     @override
     async def track(self, position_counts: int) -> None:

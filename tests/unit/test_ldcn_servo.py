@@ -344,7 +344,7 @@ async def test_a_set_point_and_a_start_are_never_repeated_by_the_line():
 
 
 @pytest.mark.parametrize("absolute", [True, False, None])
-def test_the_sensor_is_read_unless_the_drive_is_known_not_to_position_by_it(absolute) -> None:
+async def test_the_sensor_is_read_unless_the_drive_is_known_not_to_position_by_it(absolute) -> None:
     drive = Drive()
     drive.axis.state.known = replace(drive.axis.state.known, absolute=absolute)
 
@@ -362,7 +362,7 @@ async def test_outputs_are_set_in_the_drive() -> None:
     assert drive.bus.packets[-1].data == bytes([LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT])
 
 
-def test_readings_ask_for_no_more_than_is_wanted() -> None:
+async def test_readings_ask_for_no_more_than_is_wanted() -> None:
     drive = Drive(model="picservo-v4", profile=PIC_SERVO_V4)
     mask: Mapping[frozenset[str], bytes] = {
         items: drive.axis.reading(frozenset(items)).request for items in (frozenset(), frozenset({"adc"}))

@@ -4,17 +4,27 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.driver import AnalogMotion, HomeCapture, Motion, PwmOutput, StopMode
-from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, blocks_homing, with_modes
+from ldcnd.drivers.driver import AnalogMotion, Ceiling, Gains, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, pin_bits
 from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
-from ldcnd.drivers.ldcn.profiles import LS_173AP, LS_182AP, PIC_SERVO_SC, PIC_SERVO_V1, PIC_SERVO_V2, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.record import DriveState, RegisterBook
+from ldcnd.drivers.ldcn.profiles import (
+    LS_173AP,
+    LS_182AP,
+    PIC_SERVO_SC,
+    PIC_SERVO_V1,
+    PIC_SERVO_V2,
+    PIC_SERVO_V4,
+    PROFILES,
+)
+from ldcnd.drivers.ldcn.record import DriveState
+from ldcnd.drivers.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown
 from ldcnd.drivers.ldcn.servo import home_methods, homing_control, opens_loop
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
-from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
+from ldcnd.errors import BadReply, NotSupported, ReplyTimeout, ValueOutOfRange
 from ldcnd.model.commands import HomeMethod, PinMode
 from ldcnd.model.meta import Provenance
 
+GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
 CLOSED = AuxFlag.SERVO_ON | AuxFlag.INDEX
 
 
@@ -25,59 +35,94 @@ def status(flags=StatusFlag.POWER_ON | StatusFlag.MOVE_DONE, aux=CLOSED, velocit
 # -- registers ---------------------------------------------------------------------------------------------------------
 
 
+def book_of(profile, gains=GAINS):
+    return ServoRegisters(profile, gains, lambda: 7.0)
+
+
+def state_of(profile):
+    registers = book_of(profile)
+    registers.reset()
+    return DriveState("x", profile, registers)
+
+
 @pytest.mark.parametrize(
     ("profile", "lacking"),
     [
-        (LS_182AP, {"cl", "io_control"}),
-        (PIC_SERVO_V1, {"deadband", "io_control"}),
-        (PIC_SERVO_V4, set()),
-        (PIC_SERVO_SC, {"io_control"}),
+        (LS_182AP, {"cl", "limit1_pin", "limit2_pin", "step_multiplier", "fast_path"}),
+        (PIC_SERVO_V1, {"deadband", "limit1_pin", "limit2_pin", "step_multiplier", "fast_path"}),
+        (PIC_SERVO_V4, {"step_multiplier", "fast_path"}),
+        (PIC_SERVO_SC, {"limit1_pin", "limit2_pin"}),
     ],
 )
 def test_a_book_has_the_registers_of_its_device(profile, lacking):
-    full = {register.name for register in RegisterBook(PIC_SERVO_V4).all()}
+    full = {register.name for each in PROFILES.values() for register in book_of(each).published()}
 
-    assert {register.name for register in RegisterBook(profile).all()} == full - lacking
+    assert {register.name for register in book_of(profile).published()} == full - lacking
 
 
 def test_before_a_reset_nothing_is_known_and_after_it_what_the_manual_says():
-    book = RegisterBook(PIC_SERVO_V4)
-    assert {register.provenance for register in book.all()} == {Provenance.UNKNOWN}
+    book = book_of(PIC_SERVO_V4)
+    assert {register.provenance for register in book.published()} == {Provenance.UNKNOWN}
 
     book.reset()
 
-    assert {register.provenance for register in book.all()} == {Provenance.ASSUMED}
-    assert (book.value("kp"), book.value("sr"), book.value("io_control")) == (0, 1, INPUTS)
+    assert {register.provenance for register in book.published()} == {Provenance.RESET}
+    assert (book.known("kp"), book.known("sr"), book.known("limit2_pin")) == (0, 1, LimitPins.LIMIT2_INPUT)
 
 
-def test_a_register_is_unknown_while_it_is_being_written():
-    book = RegisterBook(LS_182AP)
+def test_a_register_is_unknown_while_it_is_being_written_unless_it_holds_the_value_already():
+    book = book_of(LS_182AP)
     book.reset()
 
-    book.invalidate(["kp"])
-    assert (book.value("kp"), book.written("kp")) == (None, False)
+    with book.writing({"kp": 350, "kd": 0}):
+        assert (book["kp"], book.known("kd")) == (Unknown(REPLY_LOST, (0, 350)), 0)
 
-    book.wrote({"kp": 350})
-    assert (book.value("kp"), book.written("kp")) == (350, True)
+    assert book["kp"] == Known(350, 7.0, Provenance.WRITTEN_AND_ACKNOWLEDGED)
 
 
-def test_a_register_that_the_device_lacks_is_on_no_record():
-    book = RegisterBook(LS_182AP)
+def test_a_register_whose_write_was_not_acknowledged_holds_one_of_its_values():
+    book = book_of(LS_182AP)
+    book.reset()
+    for value in (350, 400):
+        with pytest.raises(ReplyTimeout), book.writing({"kp": value}):
+            raise ReplyTimeout("no reply")
 
-    book.wrote({"cl": 5})
-    book.invalidate(["cl"])
+    assert book["kp"] == Unknown(REPLY_LOST, (0, 350, 400))
 
-    assert "cl" not in {register.name for register in book.all()}
-    assert (book.value("cl"), book.written("cl")) == (None, False)
+
+def test_a_register_that_the_device_lacks_is_in_no_book():
+    book = book_of(LS_182AP)
+
+    with book.writing({"cl": 5}):
+        pass
+
+    assert "cl" not in {register.name for register in book.published()}
+    assert book.known("cl") is None
 
 
 def test_what_a_drive_was_taken_over_with_is_assumed_and_the_rest_is_unknown():
-    book = RegisterBook(LS_182AP)
-    book.wrote({"kp": 350, "position": 7})
+    book = book_of(LS_182AP)
+    book.reset()
 
-    book.assume({"kp": 100})
+    book.taken_over()
 
-    assert (book.value("kp"), book.written("kp"), book.value("position")) == (100, False, None)
+    assert isinstance(book["kp"], Assumed)
+    assert (book["kp"].value, book.known("kp"), book.loaded, book.known("position")) == (350, None, False, None)
+
+
+def test_velocity_is_shown_in_the_shortest_tick_that_is_possible():
+    book = book_of(LS_182AP)
+    book.reset()
+    with book.writing({"sr": 10}):
+        pass
+    assert book.shown_tick == (pytest.approx(0.00512), False)
+
+    with pytest.raises(ReplyTimeout), book.writing({"sr": 4}):
+        raise ReplyTimeout("no reply")
+    assert book.shown_tick == (pytest.approx(0.002048), True)
+
+    book.forget("it is another drive")
+    assert book.shown_tick == (pytest.approx(0.000512), True)
 
 
 # -- homing ------------------------------------------------------------------------------------------------------------
@@ -176,32 +221,48 @@ def test_quantising_keeps_the_sign_and_rounds_to_the_register():
     assert motion.acceleration_counts_per_s2 == pytest.approx(344 / 0.017179869184)
 
 
+def test_a_value_at_its_limit_is_rounded_down_where_the_nearest_register_is_above_it():
+    step = 1 / 0.017179869184
+    free = quantised(Motion(0, 1000.0, 3.6 * step), 1, LS_182AP)
+    held = quantised(Motion(0, 1000.0, 3.6 * step), 1, LS_182AP, Ceiling(1000.0, 3.6 * step))
+
+    assert free.acceleration_counts_per_s2 == pytest.approx(4 * step)
+    assert free.velocity_counts_per_s == pytest.approx(1000.0, abs=0.02)
+    assert held.acceleration_counts_per_s2 == pytest.approx(3 * step)
+    assert 999.97 < held.velocity_counts_per_s <= 1000.0
+
+
+def test_a_limit_that_is_a_register_value_is_reached():
+    held = quantised(Motion(0, 1000.0, 344 / 0.017179869184), 1, LS_182AP)
+
+    again = quantised(held, 1, LS_182AP, Ceiling(held.velocity_counts_per_s, held.acceleration_counts_per_s2))
+
+    assert again == held
+
+
+def test_a_limit_below_one_step_of_the_register_is_refused_and_the_step_is_named():
+    with pytest.raises(ValueOutOfRange, match="the limit is 30") as refusal:
+        quantised(Motion(0, 1000.0, 30.0), 1, LS_182AP, Ceiling(1000.0, 30.0))
+
+    assert refusal.value.limit == pytest.approx(58.2, abs=0.01)
+    assert refusal.value.nearest is None
+    assert quantised(Motion(0, 1000.0, 30.0), 2, LS_182AP, Ceiling(1000.0, 30.0)).acceleration_counts_per_s2 < 30.0
+
+
 # -- pins --------------------------------------------------------------------------------------------------------------
 
 
-def test_pins_change_one_by_one():
-    pins = with_modes(INPUTS, PinMode.HIGH, None)
-    assert pins == LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT
+def test_the_bits_of_a_pin_say_what_it_is_used_as():
+    bits = (LimitPins.LIMIT1_INPUT, LimitPins.LIMIT1_HIGH)
 
-    pins = with_modes(pins, None, PinMode.LOW)
-    assert pins == LimitPins.LIMIT1_HIGH
-
-    assert with_modes(pins, PinMode.INPUT, PinMode.INPUT) == INPUTS
-
-
-def test_a_pin_that_is_an_output_blocks_homing_on_it_only():
-    pins = with_modes(INPUTS, PinMode.LOW, None)
-
-    assert blocks_homing(pins, HomeMethod.REVERSE_LIMIT)
-    assert not blocks_homing(pins, HomeMethod.FORWARD_LIMIT)
-    assert not blocks_homing(pins, HomeMethod.INDEX)
+    assert [int(pin_bits(mode, *bits)) for mode in (PinMode.INPUT, PinMode.HIGH, PinMode.LOW)] == [4, 1, 0]
 
 
 # -- drive state -------------------------------------------------------------------------------------------------------
 
 
 def test_a_closed_loop_proves_that_the_power_driver_is_on():
-    state = DriveState("x", LS_182AP)
+    state = state_of(LS_182AP)
 
     reading = state.reading(status(flags=StatusFlag.POWER_ON | StatusFlag.LIMIT1))
 
@@ -210,7 +271,7 @@ def test_a_closed_loop_proves_that_the_power_driver_is_on():
 
 
 def test_limit_switches_are_out_of_sight_while_the_power_driver_is_off():
-    state = DriveState("x", LS_182AP)
+    state = state_of(LS_182AP)
 
     reading = state.reading(
         status(flags=StatusFlag.POWER_ON | StatusFlag.LIMIT1 | StatusFlag.LIMIT2, aux=AuxFlag.INDEX)
@@ -220,7 +281,7 @@ def test_limit_switches_are_out_of_sight_while_the_power_driver_is_off():
 
 
 def test_an_open_loop_on_purpose_is_no_position_error():
-    state = DriveState("x", PIC_SERVO_V4)
+    state = state_of(PIC_SERVO_V4)
     state.switched(pic_ae=True, closed=True)
     tripped = status(flags=StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag.INDEX)
     searching = status(
@@ -237,7 +298,7 @@ def test_an_open_loop_on_purpose_is_no_position_error():
 
 
 def test_a_loop_that_was_closed_again_is_not_open_on_purpose():
-    state = DriveState("x", PIC_SERVO_V4)
+    state = state_of(PIC_SERVO_V4)
     state.loaded(absolute=False, opens_loop=True)
     state.switched(pic_ae=True, closed=True)
     tripped = status(flags=StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag.INDEX)
@@ -246,15 +307,17 @@ def test_a_loop_that_was_closed_again_is_not_open_on_purpose():
 
 
 def test_velocity_counts_in_the_ticks_of_the_servo_rate_divisor_but_not_on_sc():
-    v4, sc = DriveState("x", PIC_SERVO_V4), DriveState("x", PIC_SERVO_SC)
-    v4.servo_divisor = sc.servo_divisor = 4
+    v4, sc = state_of(PIC_SERVO_V4), state_of(PIC_SERVO_SC)
+    for state in (v4, sc):
+        with state._registers.writing({"sr": 4}):
+            pass
 
     assert v4.reading(status(velocity=8)).velocity_counts_per_s == pytest.approx(8 / 0.002048)
     assert sc.reading(status(velocity=8)).velocity_counts_per_s == pytest.approx(8 / 0.000512)
 
 
 def test_a_search_is_armed_until_the_drive_says_that_it_is_over():
-    state = DriveState("x", LS_182AP)
+    state = state_of(LS_182AP)
     state.homing_armed, state.guard = True, "forward limit"
 
     state.reading(status(flags=StatusFlag.POWER_ON | StatusFlag.HOME_IN_PROGRESS))
@@ -265,7 +328,7 @@ def test_a_search_is_armed_until_the_drive_says_that_it_is_over():
 
 
 def test_a_servo_overrun_is_a_warning():
-    state = DriveState("x", LS_182AP)
+    state = state_of(LS_182AP)
 
     (fault,) = state.reading(status(aux=CLOSED | AuxFlag.SERVO_OVERRUN)).faults
 
@@ -274,7 +337,7 @@ def test_a_servo_overrun_is_a_warning():
 
 def test_the_motion_lock_is_seen_where_there_is_one():
     locked = status(aux=CLOSED | AuxFlag.MOTION_LOCKED)
-    logosol, pic_servo = DriveState("x", LS_182AP), DriveState("x", PIC_SERVO_V4)
+    logosol, pic_servo = state_of(LS_182AP), state_of(PIC_SERVO_V4)
 
     logosol.reading(locked)
     pic_servo.reading(locked)
@@ -284,4 +347,4 @@ def test_the_motion_lock_is_seen_where_there_is_one():
 
 def test_a_status_without_position_is_no_reading():
     with pytest.raises(BadReply):
-        DriveState("x", LS_182AP).reading(Status(StatusFlag(0)))
+        state_of(LS_182AP).reading(Status(StatusFlag(0)))

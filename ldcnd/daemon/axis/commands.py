@@ -78,7 +78,6 @@ class AxisCommands:
         self._config = motion.config
         self._driver = motion.driver
         self._tracker = motion.tracker
-        self._gains = motion.driver.spec.gains
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
         self._moved: tuple[Permit, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
@@ -266,7 +265,7 @@ class AxisCommands:
         guards.check_may_power_on(tracker)
         guards.check_stands(tracker)
         await self._motion.check_does_not_coast()
-        if self._gains is None and isinstance(self._driver, TakesGains):
+        if isinstance(self._driver, TakesGains) and self._driver.gains is None:
             raise WrongState(
                 f"axis {tracker.name} has no gains: its loop cannot close",
                 axis=tracker.name,
@@ -437,7 +436,7 @@ class AxisCommands:
         permit, motion, before = self._moved
         if command.command_id != permit.command_id or command.completion is not Completion.PROFILE or share == before:
             return False
-        changed = self._driver.quantise(
+        changed = self._motion.quantise(
             replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
         )
         await permit.load(changed)
@@ -476,19 +475,19 @@ class AxisCommands:
         tracker = self._tracker
         guards.check_reachable(tracker)
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
-        if self._gains is None and not {"kp", "el"} <= asked.keys():
+        held = self._driver.gains if isinstance(self._driver, TakesGains) else None
+        if held is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
                 f"axis {self._config.name} has no gains yet",
                 axis=self._config.name,
                 remedy=Remedy("{}", step("set_gains", "send at least kp and el")),
             )
-        gains = self._gains or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
+        gains = held or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
         changed = replace(gains, **asked)
         if changed.sr != gains.sr:
             guards.check_stands(tracker)
         self._check_tracking_step(changed)
         await permit.set_gains(changed)
-        self._gains = changed
         return self._motion.reply(permit)
 
     def _check_tracking_step(self, gains: Gains) -> None:

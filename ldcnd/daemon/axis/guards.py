@@ -17,9 +17,11 @@ from typing_extensions import override
 from ldcnd.bus.transaction import Condition, only_while
 from ldcnd.daemon.axis.state import MOTION_STATES, AxisTracker
 from ldcnd.drivers.driver import (
+    NO_CEILING,
     AnalogMotion,
     AxisReading,
     AxisSpec,
+    Ceiling,
     Drive,
     Gains,
     HomeCapture,
@@ -267,7 +269,7 @@ class QuietDrive(Protocol):
     adc_full_scale: int | None
     retargets: bool
 
-    def quantise(self, motion: Motion) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
+    def quantise(self, motion: Motion, most: Ceiling = ...) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
     def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
     async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
@@ -314,7 +316,7 @@ class Unmoved(Moves):
         self._refuse(f"read {', '.join(sorted(items))} at once")
 
     @override
-    def quantise(self, motion: Motion) -> Motion:
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
         self._refuse("move")
 
     @override

@@ -25,7 +25,7 @@ from ldcnd.daemon.axis.state import ActiveCommand, AxisTracker, Completion, Sett
 from ldcnd.daemon.axis.straight import LineAxis
 from ldcnd.daemon.axis.telemetry import AxisTelemetry
 from ldcnd.daemon.clock import Clock
-from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Homes, Motion, StopMode
+from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Ceiling, Homes, Motion, StopMode
 from ldcnd.errors import (
     BusError,
     MalformedRequest,
@@ -226,6 +226,16 @@ class AxisMotion:
             ValueOutOfRange: a register cannot hold it.
             WrongState: the position has not been read yet.
         """
+        if velocity is not None and velocity <= 0:
+            raise ValueOutOfRange(
+                f"axis {self.tracker.name}: velocity {velocity:g} {self.tracker.unit}/s is not above 0;"
+                " the target gives the direction",
+                axis=self.tracker.name,
+                value=velocity,
+                limit=0.0,
+                nearest=-velocity if velocity < 0 else None,
+                remedy="send a velocity above 0",
+            )
         tracker, origin_counts, from_counts = self.tracker, self.telemetry.origin_counts, self.latest().position_counts
         speed, rate = self._checked(velocity, acceleration)
         if tracker.referenced:
@@ -243,7 +253,7 @@ class AxisMotion:
                 remedy="move there in parts",
             )
         counts_per_unit = abs(self.counts_per_unit)
-        motion = self.driver.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
+        motion = self.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
         duration_s = profile_duration_s(
             abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
         )
@@ -271,13 +281,29 @@ class AxisMotion:
             )
         speed, rate = self._checked(velocity, acceleration)
         counts_per_unit = self.counts_per_unit
-        motion = self.driver.quantise(Motion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
+        motion = self.quantise(Motion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
         return MotionPlan(
             motion,
             None,
             motion.velocity_counts_per_s / counts_per_unit,
             motion.acceleration_counts_per_s2 / abs(counts_per_unit),
             None,
+        )
+
+    def quantise(self, motion: Motion) -> Motion:
+        """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
+
+        Raises:
+            ValueOutOfRange: a register cannot hold it within the limits; names the nearest value.
+            RegisterUnknown: the scale of the registers is not known.
+        """
+        limits, counts = self.config.limits, abs(self.counts_per_unit)
+        return self.driver.quantise(
+            motion,
+            Ceiling(
+                math.inf if limits.velocity is None else limits.velocity * counts,
+                math.inf if limits.acceleration is None else limits.acceleration * counts,
+            ),
         )
 
     def limit_ahead(self, velocity: float) -> float | None:
@@ -330,7 +356,7 @@ class AxisMotion:
             counts_per_unit=abs(self.counts_per_unit),
             most_velocity=motion.velocity_counts_per_s,
             most_acceleration=motion.acceleration_counts_per_s2,
-            quantise=self.driver.quantise,
+            quantise=self.quantise,
             cycle_s=self.driver.capture_s if isinstance(self.driver, Homes) else 0.0,
         )
 

@@ -98,12 +98,13 @@ class AxisTelemetry:
             )
         if TelemetryItem.VELOCITY in asked:
             velocity = reading.velocity_counts_per_s
+            scaled = Quality.UNCERTAIN if reading.velocity_uncertain and quality is Quality.GOOD else quality
             self._velocity.publish(
                 {
                     "t": t,
                     "t_error_ns": t_error_ns,
                     "seq": 0,
-                    "quality": quality,
+                    "quality": scaled,
                     "value": velocity / counts_per_unit,
                     "unit": self._velocity_unit,
                     "counts_per_s": velocity,

@@ -226,7 +226,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         trace_channels=axis.traces.channels,
         priority=config.priority,
         registers=tuple(
-            RegisterInfo(name=register.name, value=register.value, provenance=register.provenance)
+            RegisterInfo(name=register.name, value=register.value, provenance=register.provenance, why=register.why)
             for register in registers_of(driver)
         ),
         past_faults=axis.reference.faults,

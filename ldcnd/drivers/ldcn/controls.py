@@ -152,34 +152,11 @@ def check_homing(control: HomingControl, profile: Profile | None) -> None:
         raise NotSupported(f"{profile.title} does not stop on home by itself")
 
 
-INPUTS = LimitPins.LIMIT1_INPUT | LimitPins.LIMIT2_INPUT
-"""After power-up."""
+def pin_bits(mode: PinMode, is_input: LimitPins, is_high: LimitPins) -> LimitPins:
+    """Return the bits of I/O Control that use a pin so, given those of an input and of an output that is high."""
+    return {PinMode.INPUT: is_input, PinMode.HIGH: is_high, PinMode.LOW: LimitPins(0)}[mode]
 
 
-def with_modes(pins: LimitPins, limit1: PinMode | None, limit2: PinMode | None) -> LimitPins:
-    """Return the control byte with other modes; None leaves a pin as it is."""
-    pins = _with_mode(pins, limit1, LimitPins.LIMIT1_INPUT, LimitPins.LIMIT1_HIGH)
-    return _with_mode(pins, limit2, LimitPins.LIMIT2_INPUT, LimitPins.LIMIT2_HIGH)
-
-
-def blocks_homing(pins: LimitPins, method: HomeMethod) -> bool:
-    """Tell whether the pin that a capture relies on is an output."""
-    match method:
-        case HomeMethod.REVERSE_LIMIT:
-            return not pins & LimitPins.LIMIT1_INPUT
-        case HomeMethod.FORWARD_LIMIT:
-            return not pins & LimitPins.LIMIT2_INPUT
-        case _:
-            return False
-
-
-def _with_mode(pins: LimitPins, mode: PinMode | None, is_input: LimitPins, is_high: LimitPins) -> LimitPins:
-    match mode:
-        case None:
-            return pins
-        case PinMode.INPUT:
-            return pins & ~is_high | is_input
-        case PinMode.HIGH:
-            return pins & ~is_input | is_high
-        case PinMode.LOW:
-            return pins & ~(is_input | is_high)
+def blocking_pin(method: HomeMethod) -> str:
+    """Return the register of the pin that must be an input for a capture; empty where none need be."""
+    return {HomeMethod.REVERSE_LIMIT: "limit1_pin", HomeMethod.FORWARD_LIMIT: "limit2_pin"}.get(method, "")

@@ -1,4 +1,8 @@
-"""One PIC-I/O of a line: polls its inputs, sets its outputs, and records them, as they cannot be read back.
+"""One PIC-I/O of a line: polls its inputs, sets its outputs, and records in a book what cannot be read back.
+
+Set Direction and Set Output write all lines at once. So that a line keeps its state when another one is written, that
+state must be known: of an output whose level is not, the level of its pin is read ("should match", data sheet, 2.2);
+what is an output cannot be read, and neither can PWM values.
 
 Nothing is written at start-up, after a reset or when the module comes back after a loss of power: its lines are inputs
 then and stay so until a request changes them. Source: PIC-I/O data sheet, 2.2, 3.1.
@@ -26,12 +30,21 @@ from ldcnd.drivers.ldcn.pic_io import (
     SynchOutput,
     read_io_status,
     send_io_command,
+    timer_control,
 )
+from ldcnd.drivers.ldcn.registers import TAKEN_OVER, RegisterBook
 from ldcnd.drivers.network import IoDriver, IoReading, ModuleEntry
-from ldcnd.errors import BusError, ValueOutOfRange, WrongState
+from ldcnd.errors import BusError, RegisterUnknown, ValueOutOfRange
 from ldcnd.exchange import Exchange, Timing
+from ldcnd.model.meta import Provenance
 
 CAPTURED = IoItem.CAPTURED_LEVELS | IoItem.CAPTURED_COUNTER
+DIRECTIONS = {line: f"direction {line}" for line in range(1, LINES + 1)}
+"""By line: whether it is an output."""
+LEVELS = {line: f"output {line}" for line in range(1, LINES + 1)}
+"""By line: the level that it has, or would have, as an output."""
+PWM = ("pwm 1", "pwm 2")
+TIMER = "timer"
 ITEMS = IoItem.LEVELS | IoItem.ADC1 | IoItem.ADC2 | IoItem.ADC3 | IoItem.COUNTER
 
 
@@ -61,17 +74,24 @@ class IoModule(Poller[IoStatus], IoDriver):
         self._period_s = 1.0 / entry.rate_hz
         self._allowed = _mask(entry.outputs)
         self._exchange = poll_io(entry.address)
-        self._outputs: int | None = 0
-        self._latch = 0
-        self._pwm: tuple[int, int] | None = (0, 0)
+        names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
+        self._book = RegisterBook(names, lambda: asyncio.get_running_loop().time())
+        self.forget()
 
     def forget(self) -> None:
-        """The module was reset or lost power: all lines are inputs, PWM is 0."""
-        self._outputs, self._latch, self._pwm = 0, 0, (0, 0)
+        """The module was reset or lost power: all lines are inputs, PWM is 0, the timer is off (data sheet, 2.2)."""
+        names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
+        self._book.note(dict.fromkeys(names, 0), Provenance.RESET)
 
     def adopted(self) -> None:
-        """The module was taken over as it is: what is an output cannot be read."""
-        self._outputs, self._latch, self._pwm = None, 0, None
+        """The module was taken over as it is: what is an output cannot be read.
+
+        Lines that are not configured as outputs count as inputs: the configuration says that something else drives
+        them.
+        """
+        self._book.forget(TAKEN_OVER)
+        inputs = [DIRECTIONS[line] for line in DIRECTIONS if not self._allowed & 1 << line - 1]
+        self._book.assume(dict.fromkeys(inputs, 0), "the configuration does not list the line as an output")
 
     # -- polling -----------------------------------------------------------------------------------------------------
 
@@ -93,13 +113,15 @@ class IoModule(Poller[IoStatus], IoDriver):
 
     def _reading(self, status: IoStatus) -> IoReading:
         levels = status.levels or 0
-        pwm = self._pwm
+        directions = [self._book.known(DIRECTIONS[line]) for line in _lines(self._allowed)]
+        outputs = tuple(line for line, out in zip(_lines(self._allowed), directions, strict=True) if out)
+        pwm1, pwm2 = (self._book.known(name) for name in PWM)
         return IoReading(
             levels=tuple(bool(levels & 1 << bit) for bit in range(LINES)),
-            outputs=None if self._outputs is None else _lines(self._outputs),
+            outputs=None if None in directions else outputs,
             adc=(status.adc1 or 0, status.adc2 or 0, status.adc3 or 0),
             counter=status.counter or 0,
-            pwm=None if pwm is None else (pwm[0] / MOST_PWM, pwm[1] / MOST_PWM),
+            pwm=None if pwm1 is None or pwm2 is None else (pwm1 / MOST_PWM, pwm2 / MOST_PWM),
         )
 
     # -- commands ----------------------------------------------------------------------------------------------------
@@ -109,50 +131,86 @@ class IoModule(Poller[IoStatus], IoDriver):
         self, levels: Mapping[int, bool], inputs: frozenset[int], pwm: tuple[float | None, float | None]
     ) -> IoReading:
         self._check(levels, inputs)
-        before = self._outputs
-        told = _mask(levels) | _mask(inputs)
-        if before is None and (told & self._allowed != self._allowed or None in pwm):
-            raise WrongState(
-                f"module {self.name} was taken over as it is: what its outputs are is not known",
-                value=self.name,
-                remedy=f"name its lines {', '.join(map(str, _lines(self._allowed)))} and both PWM outputs at once",
-            )
         pwm_after = self._pwm_after(pwm)
         if levels or inputs:
-            outputs = ((before or 0) | _mask(levels)) & ~_mask(inputs)
-            high = _mask(line for line, level in levels.items() if level)
-            latch = (self._latch & ~_mask(levels) | high) & outputs
-            if outputs != before:
-                self._outputs = None  # not known until the module has acknowledged it
-                await self._bus.execute(send_io_command(self._node, SetDirection(~outputs & ALL_LINES)))
-                self._outputs = outputs
+            directions = dict.fromkeys(levels, 1) | dict.fromkeys(inputs, 0)
+            asked = {DIRECTIONS[line]: out for line, out in directions.items()}
+            turned = None if self._book.holds(asked) else SetDirection(~self._mask_after(asked) & ALL_LINES)
+            latch = await self._levels_after(levels, directions)
+            if turned:
+                with self._book.writing(asked):
+                    await self._bus.execute(send_io_command(self._node, turned))
+            written = {LEVELS[line]: int(level) for line, level in levels.items()}
             if pwm_after:
-                await self._switch_together(latch, *pwm_after)
+                await self._switch_together(latch, pwm_after, written)
             else:
-                await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
-            self._latch = latch
+                with self._book.writing(written):
+                    await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
         elif pwm_after:
-            self._pwm = None
-            await self._bus.execute(send_io_command(self._node, SetPwm(*pwm_after)))
-        self._pwm = pwm_after or self._pwm
+            with self._book.writing(dict(zip(PWM, pwm_after, strict=True))):
+                await self._bus.execute(send_io_command(self._node, SetPwm(*pwm_after)))
         return self._reading(await self._bus.execute(self._exchange))
 
+    def _mask_after(self, asked: Mapping[str, int]) -> int:
+        """Return which lines are outputs once these directions are written.
+
+        Raises:
+            RegisterUnknown: what another line that may be an output is used as is not known.
+        """
+        outputs = 0
+        for line, name in DIRECTIONS.items():
+            out = asked.get(name, self._book.known(name))
+            if out is None and self._allowed & 1 << line - 1:
+                raise self._unknown(f"whether line {line} is an output", f"name line {line}, too")
+            outputs |= bool(out) << line - 1
+        return outputs
+
+    async def _levels_after(self, levels: Mapping[int, bool], directions: Mapping[int, int]) -> int:
+        """Return the word of Set Output in which every line that is not named keeps the level that its pin has."""
+        kept = [line for line in _lines(self._allowed) if line not in directions]
+        if any(self._book.known(LEVELS[line]) is None for line in kept):
+            shown = (await self._bus.execute(self._exchange)).levels or 0
+            read = {LEVELS[line]: shown >> line - 1 & 1 for line in kept if self._book.known(DIRECTIONS[line])}
+            self._book.note(
+                {name: level for name, level in read.items() if self._book.known(name) is None}, Provenance.READ_BACK
+            )
+        else:
+            shown = 0
+        high = {line for line, level in levels.items() if level}
+        for line in kept:
+            level = self._book.known(LEVELS[line])
+            # an input ignores its bit; if it is an output after all, it keeps what its pin shows
+            if shown >> line - 1 & 1 if level is None else level:
+                high.add(line)
+        return _mask(high)
+
+    def _unknown(self, what: str, remedy: str) -> RegisterUnknown:
+        return RegisterUnknown(f"module {self.name}: {what} is not known", value=self.name, remedy=remedy)
+
     def _pwm_after(self, pwm: tuple[float | None, float | None]) -> tuple[int, int] | None:
-        """Return the new values of both PWM outputs; None when the request leaves them alone."""
+        """Return the new values of both PWM outputs; None when the request leaves them alone.
+
+        Raises:
+            RegisterUnknown: the one that the request does not name is not known.
+        """
         if pwm == (None, None):
             return None
-        known = self._pwm or (0, 0)
-        pwm1, pwm2 = (old if new is None else round(new * MOST_PWM) for new, old in zip(pwm, known, strict=True))
-        return pwm1, pwm2
+        values = []
+        for name, new in zip(PWM, pwm, strict=True):
+            value = self._book.known(name) if new is None else round(new * MOST_PWM)
+            if value is None:
+                raise self._unknown(f"what {name} is set to", "name both PWM outputs at once")
+            values.append(value)
+        return values[0], values[1]
 
-    async def _switch_together(self, latch: int, pwm1: int, pwm2: int) -> None:
+    async def _switch_together(self, latch: int, pwm: tuple[int, int], written: Mapping[str, int]) -> None:
         """Let lines and PWM outputs change in the same cycle of the module.
 
         Only this module is addressed: in a group with servos Synch Output is Start Motion.
         """
-        self._pwm = None
-        await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, pwm1, pwm2)))
-        await self._bus.execute(send_io_command(self._node, SynchOutput()))
+        with self._book.writing({**written, **dict(zip(PWM, pwm, strict=True))}):
+            await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, *pwm)))
+            await self._bus.execute(send_io_command(self._node, SynchOutput()))
 
     async def captured(self) -> IoStatus:
         """Return the levels and the count that the latest Synch Input has captured."""
@@ -160,7 +218,9 @@ class IoModule(Poller[IoStatus], IoDriver):
 
     @override
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:
-        await self._bus.execute(send_io_command(self._node, SetTimerMode(enabled, counts_edges, prescale)))
+        mode = SetTimerMode(enabled, counts_edges, prescale)
+        with self._book.writing({TIMER: timer_control(mode)}):
+            await self._bus.execute(send_io_command(self._node, mode))
 
     def _check(self, levels: Mapping[int, bool], inputs: frozenset[int]) -> None:
         for line in (*levels, *inputs):

@@ -184,7 +184,7 @@ def encode_io_command(address: int, command: IoCommand) -> bytes:
         case SetSynchOutput(levels, pwm1, pwm2):
             packet = Packet(address, Command.STOP_MOTOR, _lines(levels) + _pwm(pwm1, pwm2))
         case SetTimerMode():
-            packet = Packet(address, Command.IO_CONTROL, bytes((_timer_control(command),)))
+            packet = Packet(address, Command.IO_CONTROL, bytes((timer_control(command),)))
         case SynchInput():
             packet = Packet(address, Command.SAVE_CURRENT_POSITION_AS_HOME)
     return encode_packet(packet)
@@ -338,7 +338,12 @@ def _pwm(*values: int) -> bytes:
     return bytes(values)
 
 
-def _timer_control(mode: SetTimerMode) -> int:
+def timer_control(mode: SetTimerMode) -> int:
+    """Return the byte of Set Timer Mode.
+
+    Raises:
+        ValueOutOfRange: the prescale does not exist.
+    """
     if mode.prescale not in PRESCALES:
         raise ValueOutOfRange(f"prescale {mode.prescale} is not one of 1, 2, 4, 8", value=mode.prescale, limit=8)
     return mode.enabled | mode.counter << 1 | PRESCALES.index(mode.prescale) << 4

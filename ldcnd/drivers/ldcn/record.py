@@ -1,27 +1,20 @@
-"""The host's record of one drive: what was sent to it, what it has shown, and what its registers hold.
+"""The host's record of one drive: what was sent to it, and what it has shown; its registers are in registers.py.
 
-A drive cannot be asked whether its power driver is enabled, what has switched it off, or which gains are in force: the
-host remembers what it has sent and what was acknowledged.
+A drive cannot be asked whether its power driver is enabled or what has switched it off: the host remembers what it has
+sent and what was acknowledged.
 Sources: LS-182AP manual, "Power-up and Reset Conditions", "Set Gain", "Load Trajectory"; PIC-SERVO manual, 4.3 to 4.5.
 """
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from ldcnd.drivers import driver
-from ldcnd.drivers.driver import AxisReading, Register
-from ldcnd.drivers.ldcn.controls import INPUTS
+from ldcnd.drivers.driver import AxisReading
 from ldcnd.drivers.ldcn.faults import AFTER_RESET, Fault, FaultCode, Knowledge, diagnose, servo_on
 from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
 from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import BYTES_WITH_DEADBAND
-from ldcnd.drivers.ldcn.trajectory import TRAJECTORY_NAMES
+from ldcnd.drivers.ldcn.registers import ServoRegisters
 from ldcnd.errors import BadReply
-from ldcnd.model.meta import Provenance
 from ldcnd.model.samples import TelemetryItem
-
-GAIN_NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
-LIMIT_PINS = "io_control"
 
 BEGUN_COUNTS = 16
 """A counter that was reset reads 0, and a shaft that its loop has let go settles near it."""
@@ -64,7 +57,6 @@ class DriveState:
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
         motion_locked: the drive refuses motion since it homed on a limit switch.
-        servo_divisor: servo rate divisor in force.
         guard: the limit switch at which the drive stops the present motion by itself; empty without one.
         guard_hit: it has.
         offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
@@ -73,10 +65,10 @@ class DriveState:
         counts: the latest position, in counts since the reset of the drive.
     """
 
-    def __init__(self, name: str, profile: Profile) -> None:
+    def __init__(self, name: str, profile: Profile, registers: ServoRegisters) -> None:
         self._name = name
         self._profile = profile
-        self._cycle_s = profile.servo_cycle_s
+        self._registers = registers
         self._question: object = ()  # what flags and faults were worked out from last
         self._shown: _Shown = NOTHING_SHOWN
         self.restarted()
@@ -89,7 +81,6 @@ class DriveState:
         self.homing_armed = False
         self.loop_may_open = False
         self.motion_locked = False
-        self.servo_divisor = 1
         self.guard = ""
         self.guard_hit = False
         self.offset_counts = self.setting_back = self.counts = 0
@@ -153,7 +144,7 @@ class DriveState:
             self.homing_armed = False
             self.guard_hit = bool(self.guard)
         self.motion_locked = locked
-        tick_s = self._cycle_s * (self.servo_divisor if self._profile.divisor_slows_profile else 1)
+        tick_s, uncertain = self._registers.shown_tick
         return AxisReading(
             position_counts=counts,
             following_error_counts=status.position_error,
@@ -173,6 +164,7 @@ class DriveState:
             cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
             begun_anew=-BEGUN_COUNTS <= counter <= BEGUN_COUNTS,
             altered=FOREIGN_CAPTURE if homing and not self.homing_armed else "",
+            velocity_uncertain=uncertain,
         )
 
     def faults(self, status: Status) -> tuple[driver.Fault, ...]:
@@ -230,59 +222,3 @@ class DriveState:
             self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)
         elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
             self.known = replace(self.known, nothing_latched=True)
-
-
-class RegisterBook:
-    """The registers of one drive, each with where its value comes from.
-
-    A register that is being written is unknown until the drive has acknowledged it.
-    """
-
-    def __init__(self, profile: Profile) -> None:
-        names = list(GAIN_NAMES)
-        if not profile.current_limit:
-            names.remove("cl")
-        if profile.gain_bytes < BYTES_WITH_DEADBAND:
-            names.remove("deadband")
-        names += TRAJECTORY_NAMES
-        if profile.limit_outputs:
-            names.append(LIMIT_PINS)
-        self._registers = {name: Register(name, None, Provenance.UNKNOWN) for name in names}
-
-    def all(self) -> tuple[Register, ...]:
-        """Return every register the drive has, in the order of the manual."""
-        return tuple(self._registers.values())
-
-    def value(self, name: str) -> int | None:
-        """Return what a register holds, or None when that is unknown or there is none of that name."""
-        register = self._registers.get(name)
-        return register.value if register else None
-
-    def written(self, name: str) -> bool:
-        """Tell whether this daemon wrote a register since the drive was reset or taken over."""
-        register = self._registers.get(name)
-        return register is not None and register.provenance is Provenance.WRITTEN_AND_ACKNOWLEDGED
-
-    def reset(self) -> None:
-        """The drive was reset: everything is 0 but the servo rate divisor and the pins, says the manual."""
-        self._set(dict.fromkeys(self._registers, 0) | {"sr": 1, LIMIT_PINS: INPUTS}, Provenance.ASSUMED)
-
-    def assume(self, values: Mapping[str, int]) -> None:
-        """The drive was taken over as it is: these values are assumed to be written, nothing else is known."""
-        self.invalidate(self._registers)
-        self._set(values, Provenance.ASSUMED)
-
-    def invalidate(self, names: Iterable[str]) -> None:
-        """Something is about to change these registers, or may have."""
-        for name in names:
-            if name in self._registers:
-                self._registers[name] = Register(name, None, Provenance.UNKNOWN)
-
-    def wrote(self, values: Mapping[str, int]) -> None:
-        """The drive has acknowledged these values."""
-        self._set(values, Provenance.WRITTEN_AND_ACKNOWLEDGED)
-
-    def _set(self, values: Mapping[str, int], provenance: Provenance) -> None:
-        for name, value in values.items():
-            if name in self._registers:
-                self._registers[name] = Register(name, int(value), provenance)

@@ -1,16 +1,26 @@
-"""LDCN/NMC registers: codes of baud rates, and the data of Set Gain.
+"""LDCN/NMC registers: codes of baud rates, the data of Set Gain, and what the registers of one module hold.
+
+Hardly any register can be read back. What one holds is `Known` by evidence, `Assumed`, or `Unknown`; it stands in the
+book of its module and nowhere else, and whatever depends on it takes it from there.
 
 Sources: LS-182AP manual, "Servo Control", "Set Gain", "Power-up and Reset Conditions", "Set Baud Rate" and the
 calculation at its end; PIC-SERVO manual, 4.3 to 4.5, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
 from enum import Enum
 from types import MappingProxyType
 
-from ldcnd.drivers.driver import Gains
+from typing_extensions import override
+
+from ldcnd.drivers.driver import Gains, Register
+from ldcnd.drivers.ldcn.controls import LimitPins
 from ldcnd.drivers.ldcn.packet import Field
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile
 from ldcnd.errors import NotSupported, ValueOutOfRange
+from ldcnd.model.meta import Provenance
 
 SERVO_CYCLE_S = CYCLE_CLOCKS / CLOCK_HZ
 """The servo period of a device with the usual clock at divisor 1: 0.512 ms."""
@@ -146,3 +156,217 @@ def gain_fields(profile: Profile) -> tuple[Field, ...]:
     if profile.gain_bytes >= _BYTES_WITH_STEP_MULTIPLIER:
         fields += (_STEP_MULTIPLIER,)
     return fields
+
+
+# -- what registers hold -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A value that something proves.
+
+    Attributes:
+        value: what the register holds.
+        since: when the proof came, in loop time.
+        evidence: the proof.
+    """
+
+    value: int
+    since: float
+    evidence: Provenance
+
+
+@dataclass(frozen=True, slots=True)
+class Assumed:
+    """A value that nothing proves, and why it is believed."""
+
+    value: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """No value.
+
+    Attributes:
+        why: what made it unknown.
+        among: the only values that it can be; empty for any.
+    """
+
+    why: str
+    among: tuple[int, ...] = ()
+
+
+Holding = Known | Assumed | Unknown
+REPLY_LOST = "the reply to the command that writes it was lost"
+TAKEN_OVER = "the module was taken over as it was"
+_EVIDENCE = MappingProxyType(
+    {
+        Provenance.WRITTEN_AND_ACKNOWLEDGED: "the module has acknowledged it",
+        Provenance.RESET: "the module was reset",
+        Provenance.READ_BACK: "the module has shown it",
+    }
+)
+
+
+class RegisterBook:
+    """The registers of one module."""
+
+    def __init__(self, names: Iterable[str], now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._holdings: dict[str, Holding] = dict.fromkeys(names, Unknown("nothing has written it yet"))
+
+    def __getitem__(self, name: str) -> Holding:
+        """Return what a register holds; of one that the module lacks nothing is known."""
+        return self._holdings.get(name, Unknown("the module lacks it"))
+
+    def known(self, name: str) -> int | None:
+        """Return the value of a register that is known, or None."""
+        holding = self[name]
+        return holding.value if isinstance(holding, Known) else None
+
+    def holds(self, values: Mapping[str, int]) -> bool:
+        """Tell whether all of these registers, as far as the module has them, are known to hold these values."""
+        return all(self.known(name) == value for name, value in values.items() if name in self._holdings)
+
+    def note(self, values: Mapping[str, int], evidence: Provenance) -> None:
+        """Enter values that something proves."""
+        since = self._now_s()
+        self._enter({name: Known(int(value), since, evidence) for name, value in values.items()})
+
+    def assume(self, values: Mapping[str, int], why: str) -> None:
+        """Enter values that nothing proves."""
+        self._enter({name: Assumed(value, why) for name, value in values.items()})
+
+    def forget(self, why: str, names: Iterable[str] | None = None) -> None:
+        """Note that these registers, or all, may hold anything."""
+        self._enter(dict.fromkeys(self._holdings if names is None else names, Unknown(why)))
+
+    @contextmanager
+    def writing(self, values: Mapping[str, int]) -> Iterator[None]:
+        """Enclose the packet that writes these values.
+
+        Until it is acknowledged, and for good if it is not, a register holds the one value or the other: it stays known
+        only where both are the same.
+        """
+        self._enter({name: self._either(self[name], int(value)) for name, value in values.items()})
+        yield
+        self.note(values, Provenance.WRITTEN_AND_ACKNOWLEDGED)
+
+    @staticmethod
+    def _either(before: Holding, value: int) -> Holding:
+        match before:
+            case Known(old) if old == value:
+                return before
+            case Known(old):
+                return Unknown(REPLY_LOST, (old, value))
+            case Unknown(_, among) if among:
+                return Unknown(REPLY_LOST, tuple(dict.fromkeys((*among, value))))
+        return Unknown(REPLY_LOST)
+
+    def published(self) -> tuple[Register, ...]:
+        """Return every register that the module has, in the order of the manual."""
+        return tuple(_published(name, holding) for name, holding in self._holdings.items())
+
+    def _enter(self, holdings: Mapping[str, Holding]) -> None:
+        self._holdings |= {name: holding for name, holding in holdings.items() if name in self._holdings}
+
+
+def _published(name: str, holding: Holding) -> Register:
+    match holding:
+        case Known(value, _, evidence):
+            return Register(name, value, evidence, _EVIDENCE[evidence])
+        case Assumed(value, why):
+            return Register(name, value, Provenance.ASSUMED, why)
+        case Unknown(why, among):
+            either = f": it is {' or '.join(map(str, among))}" if among else ""
+            return Register(name, None, Provenance.UNKNOWN, why + either)
+
+
+TRAJECTORY_NAMES = ("position", "velocity", "acceleration", "pwm_or_target")
+TRAJECTORY_CONTROL = "trajectory_control"
+LIMIT_PINS = MappingProxyType(
+    {
+        "limit1_pin": (LimitPins.LIMIT1_INPUT, LimitPins.LIMIT1_HIGH),
+        "limit2_pin": (LimitPins.LIMIT2_INPUT, LimitPins.LIMIT2_HIGH),
+    }
+)
+"""The two bits of I/O Control of each pin: input, and output high; without either it is an output that is low."""
+FAST_PATH = "fast_path"
+
+
+class ServoRegisters(RegisterBook):
+    """The registers of one servo drive.
+
+    None of Set Gain, Load Trajectory and I/O Control is among the status items of any dialect, so that nothing of them
+    can be read back (LS-182AP manual, "Define Status"; PIC-SERVO manual, 5.2).
+
+    Attributes:
+        gains: see `TakesGains`.
+        shown_tick: the servo tick in which the drive counts velocity, seconds, the shortest one that is possible, and
+            whether that is uncertain.
+    """
+
+    shown_tick: tuple[float, bool]
+
+    def __init__(self, profile: Profile, gains: Gains | None, now_s: Callable[[], float]) -> None:
+        self.gains = gains
+        self._profile = profile
+        self._cycle_s = profile.servo_cycle_s
+        lacking = {
+            "cl": not profile.current_limit,
+            "deadband": profile.gain_bytes < BYTES_WITH_DEADBAND,
+            "step_multiplier": profile.gain_bytes < _BYTES_WITH_STEP_MULTIPLIER,
+        }
+        names = [each.name for each in fields(Gains) if not lacking.get(each.name, False)]
+        names += [*TRAJECTORY_NAMES, TRAJECTORY_CONTROL]
+        names += LIMIT_PINS if profile.limit_outputs else ()
+        names += [FAST_PATH] if profile.path_points else []
+        super().__init__(names, now_s)
+        self.shown_tick = self._shown_tick()
+
+    def reset(self) -> None:
+        """Enter the state after power-up: everything is 0 but the divisors and the pins (manuals, "Power-up").
+
+        What a PIC-SERVO SC has saved in its EEPROM is restored by power-up only, and is overwritten at power-on.
+        """
+        pins = {name: int(is_input) for name, (is_input, _) in LIMIT_PINS.items()}
+        self.note(dict.fromkeys(self._holdings, 0) | {"sr": 1, "step_multiplier": 1} | pins, Provenance.RESET)
+
+    def taken_over(self) -> None:
+        """Another host has left the drive as it is: its gains may be those of the configuration."""
+        self.forget(TAKEN_OVER)
+        if self.gains:
+            self.assume(asdict(self.gains), f"{TAKEN_OVER}; this is what the configuration says")
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the drive is known to hold the gains that it should."""
+        return self.gains is not None and self.holds(asdict(self.gains))
+
+    @property
+    def divisor(self) -> int | None:
+        """The servo rate divisor on which velocity and acceleration depend; None while it is not known."""
+        return self.known("sr") if self._profile.divisor_slows_profile else 1
+
+    @property
+    def next_divisor(self) -> int | None:
+        """The one in force when the next motion is loaded: until then the gains are; None while it is not known."""
+        return self.gains.sr if self.gains and self._profile.divisor_slows_profile else self.divisor
+
+    def _shown_tick(self) -> tuple[float, bool]:
+        if not self._profile.divisor_slows_profile:
+            return self._cycle_s, False
+        match self["sr"]:
+            case Known(value):
+                return self._cycle_s * value, False
+            case Assumed(value):
+                return self._cycle_s * value, True
+            case Unknown(_, among):
+                return self._cycle_s * min(among, default=1), True
+
+    @override
+    def _enter(self, holdings: Mapping[str, Holding]) -> None:
+        super()._enter(holdings)
+        if "sr" in holdings:
+            self.shown_tick = self._shown_tick()

@@ -9,6 +9,7 @@ Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute p
 4.5, 5.2.
 """
 
+import asyncio
 import contextlib
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -21,9 +22,11 @@ from ldcnd.bus.bus import Bus
 from ldcnd.bus.queue import Lane
 from ldcnd.drivers.driver import (
     LARGEST_COUNT,
+    NO_CEILING,
     AnalogMotion,
     AxisReading,
     AxisSpec,
+    Ceiling,
     Evidence,
     Gains,
     HasOutputs,
@@ -44,20 +47,28 @@ from ldcnd.drivers.driver import (
 )
 from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.controls import INPUTS, HomingControl, LimitPins, StopControl, blocks_homing, with_modes
+from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, StopControl, blocking_pin, pin_bits
 from ldcnd.drivers.ldcn.faults import FaultCode, sensor_lost
 from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
 from ldcnd.drivers.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
 from ldcnd.drivers.ldcn.profiles import HomingSource, Profile
-from ldcnd.drivers.ldcn.record import LIMIT_PINS, DriveState, RegisterBook
-from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of, trajectory_values
+from ldcnd.drivers.ldcn.record import DriveState
+from ldcnd.drivers.ldcn.registers import FAST_PATH, FRACTION, LIMIT_PINS, TRAJECTORY_CONTROL, ServoRegisters, Unknown
+from ldcnd.drivers.ldcn.trajectory import (
+    ProfileMode,
+    Trajectory,
+    TrajectoryControl,
+    quantised,
+    trajectory_of,
+    trajectory_values,
+)
 from ldcnd.errors import (
     BadReply,
     DriveFault,
     NotSupported,
     OutcomeUnknown,
     PacketRejected,
+    RegisterUnknown,
     Remedy,
     RequestRefused,
     ValueOutOfRange,
@@ -193,14 +204,11 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         self.adc_full_scale = (1 << profile.adc_bits) - 1
         self.home_methods = home_methods(profile)
         self.retargets = profile.sc_extensions
-        self.state = DriveState(spec.name, profile)
+        self._book = ServoRegisters(profile, spec.gains, lambda: asyncio.get_running_loop().time())
+        self.state = DriveState(spec.name, profile, self._book)
         self._bus = bus
         self._node = Node(spec.address, profile)
-        self._loaded: Trajectory | None = None
-        self._book = RegisterBook(profile)
-        self._gains = spec.gains
         self._initialised = False
-        self._path_option_known = False  # a fast path, left by another host, would run at twice the speed
         self.path_period_s = PATH_CYCLES * profile.servo_cycle_s
         self.path_packet = MOST_POINTS_PER_PACKET
         self.path_most_counts = PATH_MOST_COUNTS
@@ -213,10 +221,9 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         self.state.restarted()
         self._book.reset()
         self._initialised = False
-        self._path_option_known = True
 
     def adopted(self, status: Status, *, known: bool) -> None:
-        """The drive was taken over as it is, with this status; gains count as configured.
+        """The drive was taken over as it is, with this status; its gains are assumed to be the configured ones.
 
         Args:
             status: flags and auxiliary byte.
@@ -227,20 +234,22 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             self.state.unseen()
         else:
             self.state.taken_over(status)
-            self._path_option_known = False
-        self._book.assume(asdict(self._gains) if self._gains else {})
-        if self._gains:
-            self.state.servo_divisor = self._gains.sr
+            self._book.taken_over()
         self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
 
     @property
     def capture_s(self) -> float:  # type: ignore[override]
         """One servo cycle (LS-182AP manual, "Encoder Input")."""
-        return self.profile.servo_cycle_s * (self.state.servo_divisor if self.profile.divisor_slows_profile else 1)
+        return self.profile.servo_cycle_s * (self._book.next_divisor or 1)
+
+    @property
+    def gains(self) -> Gains | None:  # type: ignore[override]
+        """See `TakesGains`."""
+        return self._book.gains
 
     @override
     def registers(self) -> tuple[Register, ...]:
-        return self._book.all()
+        return self._book.published()
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -281,7 +290,9 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         offset = self.state.offset_counts
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
-        trajectory = trajectory_of(_shifted(motion, offset), self.state.servo_divisor, self.profile)
+        if self.state.known.closed and self._book.gains and not self._book.loaded:
+            first = (commands.set_gain(self._node, self._book.gains), *first)
+        trajectory = trajectory_of(_shifted(motion, offset), self._next_divisor(), self.profile)
         return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
@@ -293,8 +304,8 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         if not on:
             await self.stop(StopMode.OFF)
             return
-        if self._gains and not (self.state.known.closed and self._book.written("kp")):  # it may have been reset unseen
-            await self.set_gains(self._gains)
+        if self._book.gains and not (self.state.known.closed and self._book.loaded):  # it may have been reset unseen
+            await self.set_gains(self._book.gains)
         if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
             await self._check_without_power_driver()
         if self.profile.pic_ae_diagnostics and not self._initialised:
@@ -385,7 +396,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
         if self.switched_off:
             mode = StopMode.OFF
-        self._book.invalidate(("velocity",))
+        self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
         self._switching_off += off
         try:
@@ -416,8 +427,55 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
     # -- motion ------------------------------------------------------------------------------------------------------
 
     @override
-    def quantise(self, motion: Motion) -> Motion:
-        return quantised(motion, self.state.servo_divisor, self.profile)
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+        return quantised(motion, self._next_divisor(), self.profile, most)
+
+    def _next_divisor(self) -> int:
+        """Return the servo rate divisor in which the next motion will be loaded.
+
+        Raises:
+            RegisterUnknown: it is not known, and no gains are there to be loaded.
+        """
+        divisor = self._book.next_divisor
+        if divisor is None:
+            raise self._unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
+        return divisor
+
+    def _unknown(self, register: str, remedy: str) -> RegisterUnknown:
+        holding = self._book[register]
+        why = f": {holding.why}" if isinstance(holding, Unknown) else ""
+        return RegisterUnknown(
+            f"axis {self.spec.name}: what register {register} of the drive holds is not known{why}",
+            axis=self.spec.name,
+            value=register,
+            remedy=remedy,
+        )
+
+    async def _load_gains(self) -> int:
+        """Have the drive hold the gains that it should before a motion; return the servo rate divisor in force.
+
+        "If the servo rate divisor is modified, the time dependent velocity and acceleration parameters will also have
+        to be modified" (LS-182AP manual, "Servo Control"). Set Gain is idempotent and moves nothing at standstill. What
+        is loaded are the gains that were acknowledged last, or the configured ones: a change that was reported as
+        failed does not take effect later by itself.
+
+        Raises:
+            RegisterUnknown: the divisor is not known, and the axis moves or has no gains to be loaded.
+        """
+        book = self._book
+        if book.gains is not None and not book.loaded:
+            if await self._stands():
+                await self.set_gains(book.gains)
+            elif book.divisor is None:
+                raise self._unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
+        return self._next_divisor() if book.divisor is None else book.divisor
+
+    async def _stands(self) -> bool:
+        """Read the drive: no profile of a closed loop runs, and it shows no more velocity than a loop that hunts."""
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        if status.aux is not None and not status.aux & AuxFlag.SERVO_ON:
+            return True
+        return bool(status.flags & StatusFlag.MOVE_DONE) and abs(status.velocity or 0) <= 1
 
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
@@ -427,7 +485,9 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             WrongState: the limit switch pin that would be homed on is an output; or the target is beyond the counter,
                 and the axis does not stand.
             DriveFault: the analog sensor is out of its range.
+            RegisterUnknown: see `_load_gains`.
         """
+        divisor = await self._load_gains()
         if isinstance(motion, Motion):
             target = motion.target_counts
             if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
@@ -435,7 +495,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             in_counter: Motion | AnalogMotion | PwmOutput = _shifted(motion, self.state.offset_counts)
         else:
             in_counter = motion
-        trajectory = trajectory_of(in_counter, self.state.servo_divisor, self.profile)
+        trajectory = trajectory_of(in_counter, divisor, self.profile)
         if isinstance(motion, AnalogMotion):
             await self._check_sensor()
         if isinstance(motion, PwmOutput) and not self.state.loop_may_open:
@@ -485,7 +545,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             )
         await self.about_to_renumber()
         self.state.setting_back = before
-        self._book.invalidate(("position",))  # the target that was loaded last means another place
+        self._book.forget("the position counter was set back", ("position",))
         with contextlib.suppress(OutcomeUnknown):
             await self._bus.execute(commands.reset_position(self._node))
         self.state.reading(await self._bus.execute(commands.read_status(self._node, STATE_ITEMS)))
@@ -561,12 +621,9 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         return self.spec.limit_stop is not None and level is self.spec.limit_stop
 
     async def _load(self, trajectory: Trajectory) -> None:
-        self._loaded = trajectory
         exchange = commands.load_trajectory(self._node, trajectory)
-        values = trajectory_values(trajectory)
-        self._book.invalidate(values)
-        await self._bus.execute(exchange)
-        self._book.wrote(values)
+        with self._book.writing(trajectory_values(trajectory)):
+            await self._bus.execute(exchange)
 
     async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
         """Start a profile from standstill to standstill before a raw duty.
@@ -590,8 +647,14 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             )
 
     def _check_pin(self, method: HomeMethod) -> None:
-        pins = self._book.value(LIMIT_PINS)
-        if pins is not None and self.profile.limit_outputs and blocks_homing(LimitPins(pins), method):
+        pin = blocking_pin(method)
+        if pin not in LIMIT_PINS:
+            return
+        is_input, holding = LIMIT_PINS[pin][0], self._book[pin]
+        if isinstance(holding, Unknown) and set(holding.among) - {is_input}:
+            remedy = step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
+            raise self._unknown(pin, Remedy("{}", remedy))
+        if self._book.known(pin) not in (None, is_input):
             raise WrongState(
                 f"axis {self.spec.name}: the {method} pin is an output",
                 axis=self.spec.name,
@@ -627,12 +690,13 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
     async def _has_started(self) -> bool:
         """Look for a witness: a profile that runs, the target reached, or a velocity."""
         status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
-        loaded = self._loaded
-        if loaded is None or not loaded.servo or not status.flags & StatusFlag.MOVE_DONE:
+        control, velocity = self._book.known(TRAJECTORY_CONTROL), self._book.known("velocity")
+        if control is None or not control & TrajectoryControl.SERVO or not status.flags & StatusFlag.MOVE_DONE:
             return True
-        if loaded.mode is ProfileMode.TRAPEZOIDAL and loaded.position is not None and status.position is not None:
-            return abs(status.position - loaded.position) <= REACHED_COUNTS
-        slow = loaded.velocity is not None and loaded.velocity < FRACTION  # shows in no status
+        target = None if control & TrajectoryControl.VELOCITY_MODE else self._book.known("position")
+        if target is not None and status.position is not None:
+            return abs(status.position - target) <= REACHED_COUNTS
+        slow = velocity is not None and velocity < FRACTION  # shows in no status
         return slow or bool(status.velocity)
 
     async def track(self, position_counts: int) -> None:
@@ -643,6 +707,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             ValueOutOfRange: beyond the drive's 32-bit counter.
             OutcomeUnknown: the reply was lost.
         """
+        await self._load_gains()
         control = StopControl.AMP_ENABLE | StopControl.HERE
         counter = position_counts - self.state.offset_counts
         if abs(counter) > LARGEST_COUNT:
@@ -666,12 +731,8 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
             raise NotSupported(
                 f"axis {self.spec.name}: {self.profile.title} has no path mode", axis=self.spec.name, value="path"
             )
-        if not self._path_option_known:
-            raise WrongState(
-                f"axis {self.spec.name}: an earlier host may have set the fast path, and no status shows it",
-                axis=self.spec.name,
-                remedy='restart the daemon with start = "reset"',
-            )
+        if self._book.known(FAST_PATH) != 0:  # a fast path, left by another host, would run at twice the speed
+            raise self._unknown(FAST_PATH, 'restart the daemon with start = "reset"')
 
     @override
     def path_exchanges(self) -> tuple[Exchange[Any], ...]:
@@ -736,21 +797,32 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
     @override
     async def set_gains(self, gains: Gains) -> None:
         exchange = commands.set_gain(self._node, gains)
-        values = asdict(gains)
-        self._book.invalidate(values)
-        await self._bus.execute(exchange)
-        self._book.wrote(values)
-        self._gains = gains
-        self.state.servo_divisor = gains.sr
+        if self.profile.divisor_slows_profile and self._book.divisor != gains.sr and not await self._stands():
+            raise WrongState(
+                f"axis {self.spec.name} moves: another servo rate divisor would change its velocity",
+                axis=self.spec.name,
+                value=gains.sr,
+                remedy=Remedy("{} and wait", step("halt")),
+            )
+        with self._book.writing(asdict(gains)):
+            await self._bus.execute(exchange)
+        self._book.gains = gains
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """See `HasOutputs`; PIC-SERVO version 4 only."""
-        known = self._book.value(LIMIT_PINS)
-        pins = with_modes(INPUTS if known is None else LimitPins(known), limit1, limit2)
-        exchange = commands.io_control(self._node, pins)
-        self._book.invalidate((LIMIT_PINS,))
-        await self._bus.execute(exchange)
-        self._book.wrote({LIMIT_PINS: pins})
+        if not self.profile.limit_outputs:
+            raise NotSupported(f"{self.profile.title} has no limit pins that can be outputs", axis=self.spec.name)
+        values = {FAST_PATH: 0}  # of PIC-SERVO CMC, in the same byte
+        for (name, bits), mode in zip(LIMIT_PINS.items(), (limit1, limit2), strict=True):
+            value = self._book.known(name) if mode is None else pin_bits(mode, *bits)
+            if value is None:
+                raise self._unknown(
+                    name, Remedy("{}", step("set_outputs", "send set_outputs with both limit1 and limit2"))
+                )
+            values[name] = int(value)
+        exchange = commands.io_control(self._node, LimitPins(sum(values.values())))
+        with self._book.writing(values):
+            await self._bus.execute(exchange)
 
 
 def _capabilities(profile: Profile) -> frozenset[Verb]:

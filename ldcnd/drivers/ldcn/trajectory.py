@@ -11,16 +11,17 @@ import math
 from dataclasses import dataclass, replace
 from enum import IntFlag, StrEnum
 
-from ldcnd.drivers.driver import AnalogMotion, Motion, PwmOutput
+from ldcnd.drivers.driver import NO_CEILING, AnalogMotion, Ceiling, Motion, PwmOutput
 from ldcnd.drivers.ldcn.faults import SENSOR_BITS, SENSOR_LEAST, SENSOR_MOST
 from ldcnd.drivers.ldcn.packet import POSITION, Field
 from ldcnd.drivers.ldcn.profiles import CYCLE_CLOCKS, Profile
-from ldcnd.drivers.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE
+from ldcnd.drivers.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE, TRAJECTORY_CONTROL, TRAJECTORY_NAMES
 from ldcnd.errors import NotSupported, ValueOutOfRange
 
 ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
 MOST_PWM = 0xFF
-TRAJECTORY_NAMES = ("position", "velocity", "acceleration", "pwm_or_target")
+ROUNDING = 1e-9
+"""Relative error of a conversion to floating point and back: it is no excess over a limit."""
 
 
 class ProfileMode(StrEnum):
@@ -164,20 +165,26 @@ def _pwm_or_target(profile: Profile, control: TrajectoryControl) -> Field:
 
 
 def trajectory_values(trajectory: Trajectory) -> dict[str, int]:
-    """Return what Load Trajectory writes: the fields that are present."""
+    """Return what Load Trajectory writes: the control byte, and the fields that are present."""
     values = {name: getattr(trajectory, name) for name in TRAJECTORY_NAMES}
-    return {name: value for name, value in values.items() if value is not None}
+    return {name: value for name, value in values.items() if value is not None} | {
+        TRAJECTORY_CONTROL: int(trajectory.control)
+    }
 
 
-def quantised(motion: Motion, servo_divisor: int, profile: Profile) -> Motion:
-    """Return the motion as the registers will hold it.
+def quantised(motion: Motion, servo_divisor: int, profile: Profile, most: Ceiling = NO_CEILING) -> Motion:
+    """Return the motion as the registers will hold it, rounded to the nearest that is not above the ceiling.
 
     Raises:
-        ValueOutOfRange: a value does not fit its register.
+        ValueOutOfRange: a value does not fit its register, or the smallest register value is above the ceiling.
     """
     _check_encoder_rate(motion.velocity_counts_per_s, profile)
-    velocity = programmed_velocity(abs(motion.velocity_counts_per_s), servo_divisor, profile)
-    acceleration = programmed_acceleration(motion.acceleration_counts_per_s2, servo_divisor, profile)
+    velocity = programmed_velocity(
+        abs(motion.velocity_counts_per_s), servo_divisor, profile, most.velocity_counts_per_s
+    )
+    acceleration = programmed_acceleration(
+        motion.acceleration_counts_per_s2, servo_divisor, profile, most.acceleration_counts_per_s2
+    )
     speed = velocity_counts_per_s(velocity, servo_divisor, profile)
     return replace(
         motion,
@@ -257,14 +264,16 @@ def _check_analog_target(target: int, profile: Profile) -> None:
         )
 
 
-def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profile) -> int:
+def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profile, ceiling: float = math.inf) -> int:
     """Return the velocity register for a speed of at least 0, rounded to the nearest; 33.554432 per count/s at SR 1.
+
+    Where the nearest is above the ceiling it is rounded down.
 
     Raises:
         ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
     """
     return _programmed(
-        "velocity", "counts/s", counts_per_s, _velocity_factor(servo_divisor, profile), profile.most_velocity
+        "velocity", "counts/s", counts_per_s, ceiling, _velocity_factor(servo_divisor, profile), profile.most_velocity
     )
 
 
@@ -277,14 +286,18 @@ def velocity_counts_per_s(programmed: int, servo_divisor: int, profile: Profile)
     return programmed / _velocity_factor(servo_divisor, profile)
 
 
-def programmed_acceleration(counts_per_s2: float, servo_divisor: int, profile: Profile) -> int:
+def programmed_acceleration(
+    counts_per_s2: float, servo_divisor: int, profile: Profile, ceiling: float = math.inf
+) -> int:
     """Return the acceleration register, rounded to the nearest; 0.017179869184 per count/s^2 at SR 1.
+
+    Where the nearest is above the ceiling it is rounded down.
 
     Raises:
         ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
     """
     return _programmed(
-        "acceleration", "counts/s^2", counts_per_s2, _acceleration_factor(servo_divisor, profile), MOST_RATE
+        "acceleration", "counts/s^2", counts_per_s2, ceiling, _acceleration_factor(servo_divisor, profile), MOST_RATE
     )
 
 
@@ -316,7 +329,7 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
     return CYCLE_CLOCKS / profile.clock_hz * (servo_divisor if profile.divisor_slows_profile else 1)
 
 
-def _programmed(what: str, unit: str, value: float, factor: float, most_register: int) -> int:
+def _programmed(what: str, unit: str, value: float, ceiling: float, factor: float, most_register: int) -> int:
     most = most_register / factor
     if not 0 <= value <= most:
         nearest = most if value > most else 0.0
@@ -327,12 +340,17 @@ def _programmed(what: str, unit: str, value: float, factor: float, most_register
             nearest=nearest,
         )
     register = math.floor(value * factor + 0.5)
+    if register > ceiling * factor * (1 + ROUNDING):
+        register -= 1
     if register == 0 and value > 0:
         least = 1 / factor
+        held = least > ceiling * (1 + ROUNDING)
         raise ValueOutOfRange(
-            f"{what} {value:g} {unit} is too small for the drive, the least is {least:g}",
+            f"{what} {value:g} {unit} is too small for the drive, the least is {least:g}"
+            + (f", and the limit is {ceiling:g}" if held else ""),
             value=value,
             limit=least,
-            nearest=least,
+            nearest=None if held else least,
+            remedy="raise the limit to the least, or load a larger servo rate divisor" if held else None,
         )
     return min(register, most_register)

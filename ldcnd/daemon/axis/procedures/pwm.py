@@ -40,7 +40,7 @@ class PwmRun(EndlessMotion):
         self._check_bounds()
         speed, rate = motion.config.velocity, motion.config.acceleration
         counts_per_unit = abs(motion.counts_per_unit)
-        acceleration = motion.driver.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
+        acceleration = motion.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
         self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
         self.check_room(request.duty)
         duty = request.duty if motion.counts_per_unit > 0 else -request.duty
