@@ -5,17 +5,21 @@ import asyncio
 import pytest
 
 from ldcnd.drivers.ldcn.controls import LimitPins
-from ldcnd.errors import (
-    ValueOutOfRange,
-    WrongState,
-)
-from ldcnd.model.commands import MoveAbsolute, SetGains, SetOutputs
+from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.errors import LdcndError, RegisterUnknown, ReplyTimeout, ValueOutOfRange, WrongState
+from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, SetGains, SetOutputs
 from ldcnd.model.meta import Provenance
+from ldcnd.model.samples import LinkState, Quality, TelemetryItem
+from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from tests.support.dialect_rig import (
     AXIS,
     GAINS,
     LS_182AP,
+    SC,
     V4,
+    Dialect,
+    DialectRig,
+    adopting_rig,
     dialect_rig,
 )
 
@@ -100,3 +104,194 @@ async def test_registers_say_where_their_values_come_from():
     assert (after["position"].value, after["position"].provenance) == (1000, Provenance.WRITTEN_AND_ACKNOWLEDGED)
     assert (after["limit1_pin"].value, after["limit2_pin"].value) == (0x04, 0x08)
     assert (last["velocity"].value, last["velocity"].provenance) == (None, Provenance.UNKNOWN)
+
+
+# -- replies that are lost ---------------------------------------------------------------------------------------------
+
+SR_10 = {"gains": GAINS | {"sr": 10, "kp": 40, "kd": 200, "ki": 0}, "limits": {"velocity": 20, "acceleration": 200}}
+
+
+class Swallowed(FaultInjector):
+    """Loses the replies to one command, which the module executes, or the requests."""
+
+    def __init__(self, command: Command, *, executed: bool) -> None:
+        super().__init__(FaultPlan())
+        self._command, self._executed, self._on = command, executed, False
+
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        packet = data[data.rfind(b"\xaa") :]
+        self._on = len(packet) > 2 and packet[2] & 15 == self._command
+        return FaultyRequest((None,) * len(data) if self._on and not self._executed else tuple(data))
+
+    def reply(self, data: bytes, at_s: float) -> FaultyReply:
+        return FaultyReply(b"" if self._on else data)
+
+
+async def send_unanswered(rig: DialectRig, command, written: Command, *, executed: bool = True) -> None:
+    """Send a command that writes a register, with no reply to that packet."""
+    rig.chain._injector = Swallowed(written, executed=executed)
+    try:
+        with pytest.raises(ReplyTimeout):
+            await rig.send(command)
+    finally:
+        rig.chain._injector = FaultInjector(FaultPlan())
+    await rig.until(lambda state: state.link is LinkState.UP)
+    await asyncio.sleep(0.2)  # polls go on
+
+
+async def fastest_mm_per_s(rig: DialectRig, seconds: float) -> float:
+    """Watch the shaft for a while; return its highest speed."""
+    fastest, before, loop = 0.0, rig.position_mm, asyncio.get_running_loop()
+    ends_s = loop.time() + seconds
+    while loop.time() < ends_s:
+        await asyncio.sleep(0.02)
+        rig.drive.catch_up(loop.time())
+        fastest, before = max(fastest, abs(rig.position_mm - before) / 0.02), rig.position_mm
+    return fastest
+
+
+@pytest.mark.parametrize("executed", [True, False])
+async def test_a_move_after_a_lost_set_gain_keeps_its_limit(executed):
+    async with dialect_rig(LS_182AP, **SR_10) as rig:
+        await rig.power_on()
+        await send_unanswered(rig, SetGains(sr=1, kp=350, kd=3000), Command.SET_GAIN, executed=executed)
+        velocity = await rig.rig.client.last("x", TelemetryItem.VELOCITY)
+        (unknown,) = await rig.rig.client.axes()
+
+        reply = await rig.send(MoveRelative(distance=10.0, velocity=20.0))
+
+        assert await fastest_mm_per_s(rig, 0.8) == pytest.approx(20.0, rel=0.1)
+        assert (rig.drive.loop.gains.sr, rig.drive.loop.gains.kp) == (10, 40)
+        assert reply.velocity == pytest.approx(20.0, rel=1e-4)
+        assert velocity.quality is Quality.UNCERTAIN
+        (sr,) = [register for register in unknown.registers if register.name == "sr"]
+        assert (sr.value, sr.provenance, "10 or 1" in sr.why) == (None, Provenance.UNKNOWN, True)
+        await rig.until(lambda state: state.command is None)
+        await asyncio.sleep(0.2)
+        assert (await rig.rig.client.last("x", TelemetryItem.VELOCITY)).quality is Quality.GOOD
+
+
+async def test_gains_that_may_have_changed_in_a_motion_are_loaded_again_at_rest():
+    async with dialect_rig(V4) as rig:
+        await rig.power_on()
+        await rig.send(MoveRelative(distance=5.0, velocity=2.0))
+        await send_unanswered(rig, SetGains(kp=300), Command.SET_GAIN)
+        assert rig.drive.loop.gains.kp == 300
+        await rig.send(Halt())
+        await rig.until(lambda state: state.command is None)
+
+        await rig.done(MoveRelative(distance=1.0))
+
+        assert rig.drive.loop.gains.kp == GAINS["kp"]
+
+
+async def test_a_drive_that_was_taken_over_is_given_the_configured_gains_before_it_moves():
+    config = {"gains": GAINS | {"sr": 2}, "limits": {"velocity": 20, "acceleration": 200}}
+    async with dialect_rig(LS_182AP, **config) as before:
+        await before.power_on()
+        await before.send(SetGains(sr=1))
+    before.drive.catch_up(asyncio.get_running_loop().time())
+    async with adopting_rig(LS_182AP, before, **config) as rig:
+        await rig.until(lambda state: state.enabled)
+        await asyncio.sleep(0.5)
+        assumed = await rig.rig.client.last("x", TelemetryItem.VELOCITY)
+        assert rig.drive.loop.gains.sr == 1  # adoption itself sends nothing
+
+        await rig.send(MoveRelative(distance=10.0, velocity=20.0))
+
+        assert await fastest_mm_per_s(rig, 0.8) == pytest.approx(20.0, rel=0.1)
+        assert rig.drive.loop.gains.sr == 2
+        assert assumed.quality is Quality.UNCERTAIN
+
+
+async def test_a_set_gain_that_stays_unanswered_keeps_the_axis_from_moving():
+    async with dialect_rig(LS_182AP, **SR_10) as rig:
+        await rig.power_on()
+        await send_unanswered(rig, SetGains(sr=1), Command.SET_GAIN)
+        at = rig.position_mm
+
+        await send_unanswered(rig, MoveRelative(distance=5.0), Command.SET_GAIN)
+
+        assert await fastest_mm_per_s(rig, 1.0) < 0.1
+        assert rig.position_mm == pytest.approx(at, abs=0.02)
+
+
+@pytest.mark.parametrize("executed", [True, False])
+async def test_a_pin_that_is_not_named_stays_what_it_is(executed):
+    async with dialect_rig(V4) as rig:
+        await rig.until(lambda state: state.link == "up")
+        await rig.send(SetOutputs(limit1="high"))
+
+        await send_unanswered(rig, SetOutputs(limit2="high"), Command.IO_CONTROL, executed=executed)
+        await rig.send(SetOutputs(limit2="high"))
+        assert rig.drive._pins == LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_HIGH
+
+        await send_unanswered(rig, SetOutputs(limit2="low"), Command.IO_CONTROL, executed=executed)
+        held = rig.drive._pins
+        with pytest.raises(RegisterUnknown, match="limit2_pin") as refusal:
+            await rig.send(SetOutputs(limit1="low"))
+        assert "both limit1 and limit2" in str(refusal.value.remedy)
+        assert rig.drive._pins == held
+
+        await rig.send(SetOutputs(limit1="low", limit2="low"))
+        assert rig.drive._pins == LimitPins(0)
+
+
+async def test_pins_of_a_drive_that_was_taken_over_are_named_together():
+    async with dialect_rig(V4) as before:
+        await before.until(lambda state: state.link == "up")
+        await before.send(SetOutputs(limit1="high", limit2="high"))
+    async with adopting_rig(V4, before) as rig:
+        await rig.until(lambda state: state.link == "up")
+        with pytest.raises(RegisterUnknown):
+            await rig.send(SetOutputs(limit2="low"))
+
+        assert rig.drive._pins == LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_HIGH
+
+
+# -- previews and limits -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_the_preview_of_a_disabled_axis_is_what_the_move_will_be(dialect: Dialect):
+    async with dialect_rig(dialect, **SR_10) as rig:
+        await rig.until(lambda state: state.link == "up")
+        disabled = await rig.rig.client.ask(Preview(distance=3.0, velocity=7.0), "x")
+        await rig.power_on()
+        enabled = await rig.rig.client.ask(Preview(distance=3.0, velocity=7.0), "x")
+        reply = await rig.send(MoveRelative(distance=3.0, velocity=7.0))
+
+    assert disabled.packets == enabled.packets
+    assert (disabled.velocity, disabled.acceleration) == (reply.velocity, reply.acceleration)
+    assert disabled.duration_s == pytest.approx(reply.duration_s)
+
+
+async def test_a_preview_of_a_move_needs_a_speed_above_0():
+    async with dialect_rig(V4) as rig:
+        await rig.until(lambda state: state.link == "up")
+        for velocity in (-1.0, 0.0):
+            plan = await rig.rig.client.ask(Preview(position=5.0, velocity=velocity), "x")
+            assert (plan.refusal.code, plan.duration_s) == ("value_out_of_range", None)
+        assert (await rig.rig.client.ask(Preview(velocity=-1.0), "x")).refusal is None
+
+
+async def test_an_acceleration_at_its_limit_is_not_rounded_beyond_it():
+    step = 1 / 0.017179869184 / 1000
+    limits = {"acceleration": 3.6 * step, "velocity": 20}
+    async with dialect_rig(V4, limits=limits, acceleration=3.6 * step) as rig:
+        await rig.power_on()
+
+        reply = await rig.send(MoveVelocity(velocity=20.0))
+
+        assert reply.acceleration == pytest.approx(3 * step)
+        assert 19.999 < reply.velocity <= 20.0
+
+
+async def test_a_limit_below_the_smallest_acceleration_of_the_drive_refuses_the_move():
+    async with dialect_rig(V4, limits={"acceleration": 0.03}, acceleration=0.03) as rig:
+        await rig.power_on()
+
+        with pytest.raises(LdcndError, match=r"too small for the drive, the least is 58\.2") as refusal:
+            await rig.send(MoveVelocity(velocity=1.0))
+
+        assert refusal.value.code == "value_out_of_range"

@@ -8,12 +8,13 @@ import pytest
 from pydantic import ValidationError
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.errors import LeaseHeld, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.errors import LeaseHeld, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
 from ldcnd.model.commands import MoveVelocity, Power, Stop
 from ldcnd.model.leases import Acquire
 from ldcnd.model.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot
 from ldcnd.model.samples import IoSample, LinkState, TelemetryItem
 from ldcnd.planning.plan import plan_bus
+from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo
 from tests.support.dialect_rig import GAINS
@@ -202,3 +203,73 @@ async def test_outputs_need_the_lease_of_the_line_and_no_latched_stop():
 def test_impossible_modules_are_refused_in_the_configuration(module, message):
     with pytest.raises(ValidationError, match=message):
         config(**module)
+
+
+class Unanswered(FaultInjector):
+    """Loses the replies of the module to these codes, or the requests."""
+
+    def __init__(self, *codes: int, executed: bool = True) -> None:
+        super().__init__(FaultPlan())
+        self._codes, self._executed, self._on = codes, executed, False
+
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        packet = data[data.rfind(b"\xaa") :]
+        self._on = len(packet) > 2 and packet[1] == 2 and packet[2] & 15 in self._codes
+        return FaultyRequest((None,) * len(data) if self._on and not self._executed else tuple(data))
+
+    def reply(self, data: bytes, at_s: float) -> FaultyReply:
+        return FaultyReply(b"" if self._on else data)
+
+
+async def set_io_unanswered(rig: RunningRig, chain, faults: Unanswered, **asked: object) -> None:
+    chain._injector = faults
+    try:
+        with pytest.raises(ReplyTimeout):
+            await set_io(rig, **asked)
+    finally:
+        chain._injector = FaultInjector(FaultPlan())
+
+
+@pytest.mark.parametrize("executed", [True, False])
+async def test_an_output_keeps_its_level_when_another_is_set_after_a_lost_reply(executed):
+    chain = chain_of()
+    async with cabinet(chain) as (rig, io):
+        await set_io(rig, low=[4, 9])
+        await set_io_unanswered(rig, chain, Unanswered(6, executed=executed), high=[4])
+        held = io.latch & 0b1000
+
+        await set_io(rig, high=[9])
+
+        assert io.latch == held | 0b1_0000_0000
+
+
+@pytest.mark.parametrize("executed", [True, False])
+async def test_a_line_of_which_it_is_unknown_whether_it_is_an_output_is_to_be_named(executed):
+    chain = chain_of()
+    async with cabinet(chain) as (rig, io):
+        await set_io_unanswered(rig, chain, Unanswered(0, executed=executed), high=[4])
+        outputs = io.outputs
+        assert (await sample(rig, lambda each: each.outputs is None)).outputs is None
+
+        with pytest.raises(RegisterUnknown, match="line 4") as refusal:
+            await set_io(rig, high=[9])
+
+        assert (io.outputs, refusal.value.remedy) == (outputs, "name line 4, too")
+        await set_io(rig, high=[4, 9])
+        assert (io.outputs, io.latch) == (0b1_0000_1000, 0b1_0000_1000)
+
+
+@pytest.mark.parametrize("executed", [True, False])
+async def test_a_pwm_output_that_is_unknown_is_to_be_named(executed):
+    chain = chain_of()
+    async with cabinet(chain) as (rig, io):
+        await set_io_unanswered(rig, chain, Unanswered(4, executed=executed), pwm1=1.0)
+        pwm = io.pwm
+
+        with pytest.raises(RegisterUnknown, match="pwm 1"):
+            await set_io(rig, pwm2=1.0)
+        await set_io(rig, high=[4])
+
+        assert io.pwm == pwm
+        await set_io(rig, pwm1=0.0, pwm2=1.0)
+        assert io.pwm == (0, 255)

@@ -115,6 +115,7 @@ class LdcnNetwork(Network):
         self._watches: dict[int, ModuleWatch | IoModule] = {}
         self._was_up = False
         self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
+        self._half_reset = False  # an attempt to reset the line has failed: who has received it is not known
         self._disturbed = False  # an attempt to reset the line has failed on the way
         self._placed: set[int] = set()
         self._expected = _expected(specs, line)
@@ -174,7 +175,9 @@ class LdcnNetwork(Network):
             drive.forget()
         for module in self._io.values():
             module.forget()
+        self._half_reset = True
         modules, found = await self._start_afresh()
+        self._half_reset = False
         return self._up(modules, remarks + found, reset=True)
 
     async def _adopt(self) -> Adopted:
@@ -255,11 +258,12 @@ class LdcnNetwork(Network):
     def _take_over(self, adopted: Adopted) -> tuple[str, ...]:
         """Learn what the drives are doing that have not restarted; return remarks."""
         self._rate.working = adopted.baud
+        known, self._half_reset = self._was_up and not self._half_reset, False
         for address, drive in self._drives.items():
             if address not in self._restarted:
-                drive.adopted(adopted.states[address], known=self._was_up)
+                drive.adopted(adopted.states[address], known=known)
         for address, module in self._io.items():
-            if address not in self._restarted and not self._was_up:
+            if address not in self._restarted and not known:
                 module.adopted()
         remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
         remarks += [f"address {address} had lost power and is disabled" for address in sorted(self._restarted)]
