@@ -57,3 +57,12 @@ def test_what_was_written_to_eeprom_is_expected_from_the_next_power_on_on():
     assert not audit.read(PLACE, 40)
     assert not audit.read(PLACE, 60)
     assert audit.differences == ""
+
+
+def test_after_a_write_whose_reply_was_lost_either_value_is_expected():
+    for memory in Memory:
+        for value in (40, 60):
+            audit = known()
+            audit.may_have_written(LABEL, 60, memory)
+            assert not audit.read(PLACE, value)
+            assert audit.differences == ""

@@ -100,6 +100,14 @@ class ParameterAudit:
         else:
             self._stored.pop(label, None)  # a reset would undo it
 
+    def may_have_written(self, label: str, value: int, memory: Memory) -> None:
+        """The reply to a write was lost: the value of before is as expected as the new one."""
+        if memory is Memory.EEPROM:
+            self._stored[label] = value
+        else:
+            self._held.pop(label, None)
+            self._found.pop(label, None)
+
 
 log = get_logger("smartstep")
 
@@ -146,7 +154,13 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
         self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
         self._audit = ParameterAudit()
         self._parameters = UnitParameters(
-            self.words, spec.profile, spec.eeprom, others, self._cleared, self._audit.wrote
+            self.words,
+            spec.profile,
+            spec.eeprom,
+            others,
+            self._cleared,
+            self._audit.wrote,
+            self._audit.may_have_written,
         )
         self.tracer = self._tracer = SmartStepTracer(bus, self.words, spec.profile)
         self._rates_hz = spec.rates_hz

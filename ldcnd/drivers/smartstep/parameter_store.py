@@ -43,6 +43,7 @@ from ldcnd.errors import (
     BadReply,
     BusBusy,
     BusDown,
+    BusError,
     DriveFault,
     NotSupported,
     OutcomeUnknown,
@@ -102,6 +103,7 @@ class UnitParameters(ParameterAccess):
         others: Mapping[int, str],
         cleared: Callable[[], None],
         wrote: Callable[[ParameterValue, Memory], None] = lambda _value, _memory: None,
+        may_have_written: Callable[[str, int, Memory], None] = lambda _label, _value, _memory: None,
     ) -> None:
         """Prepare the access; sends nothing.
 
@@ -112,6 +114,8 @@ class UnitParameters(ParameterAccess):
             others: the other axes of its line, by unit number.
             cleared: called when a counter was cleared.
             wrote: called with a parameter that was written, or holds what was to be written, and into which memory.
+            may_have_written: called with the label of a parameter, a value and a memory when it is unknown whether the
+                drive has taken the value.
         """
         self._words = words
         self._profile = profile
@@ -119,6 +123,7 @@ class UnitParameters(ParameterAccess):
         self._others = others
         self._cleared = cleared
         self._wrote = wrote
+        self._may_have_written = may_have_written
 
     @property
     def _axis(self) -> str:
@@ -185,7 +190,11 @@ class UnitParameters(ParameterAccess):
     @override
     async def write(self, request: WriteParameter) -> Written:
         parameter = self._find(request.parameter, unlisted=request.unlisted)
-        written = await self._write(parameter, request)
+        try:
+            written = await self._write(parameter, request)
+        except BusError:
+            self._may_have_written(parameter.label, request.value, request.memory)
+            raise
         self._wrote(written.value, request.memory)
         return written
 
