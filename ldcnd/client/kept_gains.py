@@ -143,14 +143,14 @@ async def open_loop(axis: Axis) -> None:
 
 
 async def load(axis: Axis, gains: dict[str, int]) -> None:
-    """Open the loop and load gains: a closed one would turn any position error into a jump.
+    """Open the loop and load gains to stay: a closed one would turn any position error into a jump.
 
     Raises:
         LdcndError: as the daemon refused it.
         WrongState: it does not come to rest.
     """
     await open_loop(axis)
-    await axis.set_gains(**gains)
+    await axis.set_gains(**gains, lent=False)
 
 
 async def restore(axis: Axis, kept: KeptGains) -> None:

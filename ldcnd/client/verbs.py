@@ -294,6 +294,7 @@ class AxisVerbs(ABC):
         el: int | None = None,
         deadband: int | None = None,
         sr: int | None = None,
+        lent: bool = False,
     ) -> CommandReply:
         """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
 
@@ -308,9 +309,11 @@ class AxisVerbs(ABC):
             deadband: Amplifier deadband compensation.
             sr: Servo rate divisor; it changes the unit of velocities in the drive, so only an axis at standstill
                 accepts it.
+            lent: The gains are for a trial: when control of the axis ends in any way, its loop is opened at rest, and
+                the gains of before are loaded again before it closes. It needs a lease.
         """
         return await self._send(
-            lambda: SetGains(kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr)
+            lambda: SetGains(kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr, lent=lent)
         )
 
     async def list_parameters(self) -> ParameterList:

@@ -111,7 +111,7 @@ class HoldingOutput(Step):
     async def _approach(site: Site, axis: Axis, output: int, el: int, origin: int) -> list[tuple[int, float]]:
         """Move to and fro with an output limit; return direction and output at rest of each motion until it trips."""
         kp = min(math.ceil(PWM_PER_GAIN * output / (SATURATED_SHARE * el)), REGISTER_MOST)
-        await axis.set_gains(kp=kp, kd=min(DAMPING * kp, REGISTER_MOST), ki=0, il=0, ol=output, el=el)
+        await axis.set_gains(kp=kp, kd=min(DAMPING * kp, REGISTER_MOST), ki=0, il=0, ol=output, el=el, lent=True)
         velocity, acceleration = _profile(site)
         sign = -1 if site.info.direction == "reverse" else 1
         first = -1 if sign * (await rest_counts(axis) - origin) > 0 else 1

@@ -424,10 +424,12 @@ class TakesGains(ABC):
 
     Attributes:
         gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
-            acknowledged last, before that the configuration's; None without either.
+            acknowledged last, before that the configuration's; None without either. It may be set to others.
+        holds_gains: the drive is known to hold them.
     """
 
     gains: Gains | None
+    holds_gains: bool
 
     @abstractmethod
     async def set_gains(self, gains: Gains) -> None:

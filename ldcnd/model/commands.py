@@ -539,6 +539,9 @@ class SetGains(AxisCommand[CommandReply]):
     """Amplifier deadband compensation."""
     sr: int | None = Field(default=None, ge=1, le=0xFF)
     """Servo rate divisor; it changes the unit of velocities in the drive, so only an axis at standstill accepts it."""
+    lent: bool = False
+    """The gains are for a trial: when control of the axis ends in any way, its loop is opened at rest, and the gains of
+    before are loaded again before it closes. It needs a lease."""
 
 
 class MoveAnalog(AxisCommand[CommandReply]):

@@ -200,6 +200,8 @@ FIRST_READING_DELAY_S = 0.005
 """Delay between the start of a motion and the request for the reading at its end, seconds."""
 SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
+GAINS_BACK_S = 10.0
+"""Longest wait for rest before the loop of an axis with gains of a trial is opened, seconds."""
 STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
 """Of two stops that no drive has confirmed, the stronger one is sent again."""
 
@@ -612,6 +614,22 @@ class AxisService:
         reply = self._commands.renew_jog(request, command_id)
         self._queue.wake()
         return reply
+
+    async def take_gains_back(self) -> None:
+        """Control has ended: open the loop at rest if gains were lent; the next motion loads those of before.
+
+        A closed loop is not given other gains: any position error would become a jump.
+        """
+        if not self._commands.take_gains_back():
+            return
+        log.warning("lent gains taken back", axis=self.config.name)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(GAINS_BACK_S):
+                while self.at_work and self._commands.gains_differ and not self._gate.closed:
+                    self._changed.clear()
+                    await self._changed.wait()
+        if self._commands.gains_differ:  # else another client's motion has loaded them already
+            await self.bring_to_rest(StopMode.OFF)
 
     def planned(self, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:
         """Return what this axis would do for its share of a group move, by itself; no effect.

@@ -22,6 +22,7 @@ from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
 from ldcnd.errors import (
     DriveFault,
+    LeaseRequired,
     NotSupported,
     OutcomeUnknown,
     Remedy,
@@ -70,6 +71,7 @@ class AxisCommands:
         procedure: what is under way and takes more than one step; None otherwise.
         step_due: its next step is due.
         holds: the jogs that are held.
+        own_gains: those of the axis while a client has lent it others; None otherwise.
     """
 
     def __init__(self, motion: AxisMotion) -> None:
@@ -80,6 +82,7 @@ class AxisCommands:
         self._tracker = motion.tracker
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
+        self.own_gains: Gains | None = None
         self._moved: tuple[Permit, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
         self._retry_s: float | None = None  # when the step that was not taken is taken again
 
@@ -487,8 +490,32 @@ class AxisCommands:
         if changed.sr != gains.sr:
             guards.check_stands(tracker)
         self._check_tracking_step(changed)
+        if not request.lent:
+            await permit.set_gains(changed)
+            self.own_gains = None
+            return self._motion.reply(permit)
+        if request.lease is None:
+            raise LeaseRequired(
+                f"axis {self._config.name}: gains are lent for as long as a lease lasts, and the command names none",
+                axis=self._config.name,
+                remedy=Remedy("{}", step("acquire", "acquire one first")),
+            )
+        self.own_gains = self.own_gains or gains  # before they are sent: a lost reply leaves open which ones act
         await permit.set_gains(changed)
         return self._motion.reply(permit)
+
+    def take_gains_back(self) -> bool:
+        """Have the drive hold the gains of the axis from its next motion on; tell whether others were lent to it."""
+        own, self.own_gains = self.own_gains, None
+        if own is None or not isinstance(self._driver, TakesGains):
+            return False
+        self._driver.gains = own
+        return True
+
+    @property
+    def gains_differ(self) -> bool:
+        """Whether the drive holds other gains than it should, or may."""
+        return isinstance(self._driver, TakesGains) and not self._driver.holds_gains
 
     def _check_tracking_step(self, gains: Gains) -> None:
         """Refuse a position error limit that the next set-point of `track` could exceed.

@@ -317,18 +317,27 @@ class LeaseWatch:
         moving = [name for name in lease.axes if self._rig.axes[name].tracker.moving is not Moving.NO]
         if not leave_running:
             self._lost(lease, moving, "released while it moved", None)
+        self._take_gains_back(lease.axes)
         for name in sorted(moving) if leave_running else ():
             self._note(name, lease, CommandStatus.DONE, "released; what moves was left running on purpose", None)
         return lease
 
-    def _lost(self, lease: Lease, axes: Iterable[str], cause: str, code: ErrorCode | None) -> None:
+    def _take_gains_back(self, axes: Iterable[str]) -> None:
+        if self.group is None:
+            return
         for name in sorted(axes):
+            self.group.create_task(self._rig.axes[name].take_gains_back(), name=f"gains of {name}")
+
+    def _lost(self, lease: Lease, axes: Iterable[str], cause: str, code: ErrorCode | None) -> None:
+        axes = sorted(axes)
+        for name in axes:
             axis = self._rig.axes[name]
             self._note(name, lease, CommandStatus.ABORTED, f"{cause}; policy: {axis.config.loss.client.value}", code)
             if self.group is not None:
                 self.group.create_task(
                     apply_policy(axis, axis.config.loss.client, f"loss of control: {cause}"), name=f"client loss {name}"
                 )
+        self._take_gains_back(axes)
 
     def _note(self, axis: str, lease: Lease, status: CommandStatus, reason: str, code: ErrorCode | None) -> None:
         self._events.note(

@@ -216,11 +216,13 @@ class Daemon:
         try:
             async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
                 for name, axis in self.rig.axes.items():
-                    group.create_task(
-                        apply_policy(axis, axis.config.loss.daemon, "the daemon ends"), name=f"rest {name}"
-                    )
+                    group.create_task(self._bring_to_rest(axis), name=f"rest {name}")
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
+
+    async def _bring_to_rest(self, axis: AxisService) -> None:
+        await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
+        await axis.take_gains_back()
 
     async def _keep_references(self) -> None:
         """Keep where each axis is while its line is still up; bounded."""

@@ -243,9 +243,18 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         return self.profile.servo_cycle_s * (self._book.next_divisor or 1)
 
     @property
-    def gains(self) -> Gains | None:  # type: ignore[override]
+    def gains(self) -> Gains | None:
         """See `TakesGains`."""
         return self._book.gains
+
+    @gains.setter
+    def gains(self, gains: Gains | None) -> None:
+        self._book.gains = gains
+
+    @property
+    def holds_gains(self) -> bool:  # type: ignore[override]
+        """See `TakesGains`."""
+        return self._book.loaded
 
     @override
     def registers(self) -> tuple[Register, ...]:
