@@ -394,8 +394,8 @@ class StopLatched(RequestRefused):
     way_out = "send `reset`"
 
 
-class CommandAborted(LdcndError):
-    """Another command, a stop or a loss policy ended the command early; the client raises it where a program waits."""
+class CommandAborted(RequestRefused):
+    """Another command, a halt, a stop or a loss policy ended the command early, or came before it began."""
 
     code = ErrorCode.ABORTED
     way_out = "look at the events: they tell what ended it"

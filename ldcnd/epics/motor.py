@@ -444,6 +444,10 @@ class MotorRecord:
         try:
             self._movable()
             motion = await starting() if self._halts == halts else None
+        except CommandAborted:
+            if self._halts == halts:
+                raise
+            motion = None  # a halt was put while the motion was on its way to the daemon
         except BaseException as error:
             self._pending -= 1
             await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))

@@ -1,6 +1,7 @@
 """Every fault of the manuals' tables, from the simulated cause to the fault topic and back; on the jumping clock."""
 
 import asyncio
+from contextlib import asynccontextmanager
 from dataclasses import replace
 
 import pytest
@@ -33,6 +34,7 @@ from tests.support.dialect_rig import (
     SC,
     V1,
     V4,
+    adopting_rig,
     dialect_rig,
 )
 
@@ -207,11 +209,21 @@ async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_ax
         assert (await rig.done(nearer)).state is AxisState.STANDSTILL
 
 
+@asynccontextmanager
+async def near_the_end_of_the_counter(dialect, plant=PLANT):
+    """Take over a drive that an earlier host has left 500 counts before its counter wraps; no profile goes there."""
+    bounds = {"pwm": {"duty": 0.1}, "acceleration": 2000}
+    async with dialect_rig(dialect, plant, **bounds) as before:
+        before.drive.loop.renumber((1 << 31) - 500)
+    async with adopting_rig(dialect, before, **bounds) as rig:
+        await rig.power_on()
+        await rig.send(SetPosition(position=0.0))
+        yield rig
+
+
 @named((V1, LS_182AP))
 async def test_a_counter_that_wrapped_means_nothing_before_a_new_reference(dialect):
-    async with dialect_rig(dialect, pwm={"duty": 0.1}, acceleration=2000) as rig:
-        await rig.power_on()
-        rig.drive.loop.renumber((1 << 31) - 500)
+    async with near_the_end_of_the_counter(dialect) as rig:
         await rig.send(SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there
         await rig.until_fault(lambda faults: faults.active)
         await rig.until(lambda state: state.command is None)
@@ -233,9 +245,7 @@ async def test_a_counter_that_wrapped_means_nothing_before_a_new_reference(diale
 @named((V4, LS_182AP))
 async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dialect):
     far_index = replace(PLANT, index_width_counts=40, index_at_counts=8000, index_spacing_counts=100_000)
-    async with dialect_rig(dialect, far_index, pwm={"duty": 0.1}, acceleration=2000) as rig:
-        await rig.power_on()
-        rig.drive.loop.renumber((1 << 31) - 500)
+    async with near_the_end_of_the_counter(dialect, far_index) as rig:
         await rig.send(SetPwm(duty=0.1, duration_s=0.3))
         await rig.until_fault(lambda faults: faults.active)
         await rig.until(lambda state: state.command is None)
@@ -294,15 +304,16 @@ async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_clo
 
 @named(DIALECTS)
 async def test_a_counter_that_wraps_is_a_warning(dialect):
-    async with dialect_rig(dialect, pwm={"duty": 0.1}, acceleration=2000) as rig:
-        await rig.power_on()
-        rig.drive.loop.renumber((1 << 31) - 500)
-
+    async with near_the_end_of_the_counter(dialect) as rig:
         await rig.send(SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there
         sample = await rig.until_fault(lambda faults: faults.active)
 
-        assert (codes(sample), sample.first.stops) == (["position_wrap"], False)
-        assert sample.first.text == FaultCode.POSITION_WRAP.remedy
+        (wrapped,) = sample.active
+        assert (wrapped.code, wrapped.stops, wrapped.text) == (
+            "position_wrap",
+            False,
+            FaultCode.POSITION_WRAP.remedy,
+        )
         state = await rig.rig.client.state(AXIS)
         assert (state.state, state.referenced) == (AxisState.CONTINUOUS_MOTION, False)
 

@@ -228,6 +228,9 @@ async def set_io_unanswered(rig: RunningRig, chain, faults: Unanswered, **asked:
             await set_io(rig, **asked)
     finally:
         chain._injector = FaultInjector(FaultPlan())
+    async with asyncio.timeout(5.0):  # a module that has not answered for a while is identified anew
+        while not rig.daemon.rig.buses[0].bus.proofs.all_hold():
+            await asyncio.sleep(0.01)
 
 
 @pytest.mark.parametrize("executed", [True, False])

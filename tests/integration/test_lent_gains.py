@@ -12,7 +12,7 @@ from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
-SOFT = SetGains(kp=3, kd=10, lent=True)
+SOFT = SetGains(kp=120, kd=1000, lent=True)
 
 
 def gains(chain, address):
@@ -32,7 +32,7 @@ async def test_a_trial_that_is_cut_short_leaves_the_loop_open_and_the_next_motio
         await rig.client.command(name, Power(on=True, lease=lease))
         before = gains(chain, address)
         await rig.client.command(name, SOFT.model_copy(update={"lease": lease}))
-        assert gains(chain, address).kp == 3
+        assert gains(chain, address).kp == 120
         if moving:
             await rig.client.command(name, Jog(velocity=1.0, hold_s=1.0, lease=lease))
 

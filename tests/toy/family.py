@@ -18,9 +18,11 @@ from ldcnd.config.axis import MovedAxisConfig
 from ldcnd.config.bus import BusConfig
 from ldcnd.config.simulated_line import SimulatedLineConfig
 from ldcnd.drivers.driver import (
+    NO_CEILING,
     AnalogMotion,
     AxisReading,
     AxisSpec,
+    Ceiling,
     Drive,
     HomeCapture,
     Motion,
@@ -133,7 +135,7 @@ class ToyStage(Moves):
         return exchange(self.spec.address, Op.STATUS)
 
     @override
-    def quantise(self, motion: Motion) -> Motion:
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
         return motion
 
     @override

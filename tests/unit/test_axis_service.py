@@ -15,6 +15,7 @@ from ldcnd.errors import (
     AxisUnreachable,
     BadReply,
     BusDown,
+    CommandAborted,
     CommandExpired,
     LdcndError,
     LeaseExpired,
@@ -315,7 +316,7 @@ async def test_a_buffered_move_does_not_begin_after_a_policy_has_brought_the_axi
             await asyncio.sleep(0.1)
             await bench.axis.bring_to_rest(StopMode.SMOOTH)
             await asyncio.sleep(0.001)
-            assert isinstance(waiting.result(), StopLatched)  # at once, not when the axis stands
+            assert isinstance(waiting.result(), CommandAborted)  # at once, not when the axis stands
             await bench.settled()
 
         assert bench.drive.calls == ["stop"]

@@ -81,7 +81,7 @@ BESIDE_A_DAEMON = {
     "top",
     "tuning",
 }
-MODULES_OF_A_DAEMON = 180
+MODULES_OF_A_DAEMON = 184
 MODELS_OF_A_DAEMON = 184
 """The most of our modules, and models, that there are when a daemon opens its lines: most of the time until then."""
 DAEMON = """

@@ -43,6 +43,7 @@ from ldcnd.drivers.tracer import Tracer
 from ldcnd.errors import (
     BadReply,
     BusError,
+    CommandAborted,
     LdcndError,
     NotSupported,
     OutcomeUnknown,
@@ -688,7 +689,7 @@ class AxisService:
                 self._not_confirmed()
             self.telemetry.state(self._clock.now_ns())
 
-    def _overtake(self, by: Permit | None) -> StopLatched:
+    def _overtake(self, by: Permit | None) -> StopLatched | CommandAborted:
         """Make all queued commands and permits void, except the caller's; return the refusal."""
         self._gate.overtake(by)
         self._changed.set()
@@ -779,6 +780,7 @@ class AxisService:
     async def _confirmed_stop(self, mode: StopMode, verb: Verb, rounds: int, command_id: str | None = None) -> bool:
         if not self.tracker.energised:
             mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
+        stands = verb is Verb.HALT and self.tracker.command is None and self.tracker.moving is Moving.NO
         for _ in range(rounds):
             try:
                 mode = await self._moves.stop(mode)
@@ -790,7 +792,7 @@ class AxisService:
             if mode is StopMode.OFF:
                 self._commands.switched_off()
                 self.tracker.powered(on=False, now_s=self._clock.now_s())
-            else:
+            elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
             if self._pending is None or STRENGTH[mode] >= STRENGTH[self._pending]:
                 self._pending = None

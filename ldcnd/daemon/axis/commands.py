@@ -21,6 +21,7 @@ from ldcnd.daemon.axis.procedures.velocity import COUNTER_SHARE, VelocityChange,
 from ldcnd.daemon.axis.state import Completion
 from ldcnd.drivers.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
 from ldcnd.errors import (
+    CommandAborted,
     DriveFault,
     LeaseRequired,
     NotSupported,
@@ -232,7 +233,7 @@ class AxisCommands:
         except OutcomeUnknown:
             # what was started must not be started again: the readings tell how it goes
             return self._tracker.command is not None and self._tracker.command.completion is Completion.PROCEDURE
-        except StopLatched:
+        except (StopLatched, CommandAborted):
             raise
         except (RequestRefused, DriveFault) as error:
             if self._tracker.energised and not procedure.outlived(self._tracker):

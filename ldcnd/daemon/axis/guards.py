@@ -39,6 +39,7 @@ from ldcnd.drivers.network import Network
 from ldcnd.errors import (
     AccelerationLimit,
     AxisUnreachable,
+    CommandAborted,
     NotReferenced,
     NotSupported,
     PositionLimit,
@@ -371,7 +372,7 @@ class Permit:
         """Raise when the command was overtaken.
 
         Raises:
-            StopLatched: a stop has come since.
+            StopLatched, CommandAborted: a stop has come since, or another command.
             ShuttingDown: the daemon ends.
         """
         if self._gate.closed:
@@ -402,7 +403,8 @@ class Permit:
         """Raise when nothing of this command may move the axis now.
 
         Raises:
-            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
+            CommandAborted,
+        LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
                 speed override of 0.
         """
         self.to_move()()
@@ -534,11 +536,15 @@ class Gate:
         name = self.tracker.name
         return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
 
-    def overtaken(self, what: str) -> StopLatched:
-        """Return the refusal of a command that a stop has overtaken."""
+    def overtaken(self, what: str) -> StopLatched | CommandAborted:
+        """Return the refusal of a command that a stop has overtaken, or a halt, which latches nothing."""
         name = self.tracker.name
-        return StopLatched(
-            f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
+        if self.tracker.stop_latched:
+            return StopLatched(
+                f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
+            )
+        return CommandAborted(
+            f"axis {name}: {what} was overtaken by a command that came later", axis=name, remedy="send it again"
         )
 
 

@@ -17,6 +17,7 @@ from ldcnd.daemon.command.ledger import Entry, EventLog, Ledger
 from ldcnd.daemon.command.rig_commands import RigCommands
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import (
+    CommandAborted,
     CommandExpired,
     DuplicateDaemon,
     InternalError,
@@ -476,6 +477,8 @@ def _status(error: LdcndError) -> CommandStatus:
     match error:
         case OutcomeUnknown():
             return CommandStatus.UNKNOWN
+        case CommandAborted():
+            return CommandStatus.ABORTED
         case RequestRefused():
             return CommandStatus.REFUSED
         case _:

@@ -20,7 +20,7 @@ from ldcnd.drivers.ldcn.packet import Status, StatusItem, decode_status
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
 from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset
 from ldcnd.drivers.network import GroupSpec
-from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
+from ldcnd.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.exchange import Effect, Exchange
 
 ReplyT = TypeVar("ReplyT")
@@ -305,7 +305,7 @@ class LineRate:
         while True:
             try:
                 return identity_in(await ask())
-            except StopLatched:
+            except (StopLatched, CommandAborted):
                 continue  # a stop of this axis took the question off the queue: it says nothing about the module
             except (ReplyTimeout, OutcomeUnknown, BadReply, PacketRejected):
                 return None

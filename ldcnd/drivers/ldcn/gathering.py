@@ -49,7 +49,7 @@ from ldcnd.drivers.ldcn.addressing import (
 from ldcnd.drivers.ldcn.adoption import MOTION_ITEMS, WATCH_S, moves
 from ldcnd.drivers.ldcn.commands import Node, unanswered
 from ldcnd.drivers.ldcn.packet import Status, check_status
-from ldcnd.errors import BadReply, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
+from ldcnd.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.exchange import Effect, Exchange, ReplyVerdict
 from ldcnd.log import get_logger
 
@@ -267,7 +267,7 @@ class Gathering:
         while True:
             try:
                 status = await self._at(baud, asked)
-            except StopLatched:
+            except (StopLatched, CommandAborted):
                 continue  # a stop took the question off the queue: it says nothing about the module
             except (ReplyTimeout, OutcomeUnknown, BadReply, PacketRejected):
                 return Heard(None) if received else None
@@ -282,7 +282,7 @@ class Gathering:
         """Send a packet whose effect is seen otherwise."""
         try:
             await self._at(baud, exchange)
-        except (OutcomeUnknown, BadReply, PacketRejected, StopLatched) as error:
+        except (OutcomeUnknown, BadReply, PacketRejected, StopLatched, CommandAborted) as error:
             log.debug("not acknowledged", bus=self._bus.settings.name, reason=error.message)
 
     # -- steps -------------------------------------------------------------------------------------------------------
