@@ -14,18 +14,19 @@ from tests.mutants.changes import Mutant, mutants_of
 from tests.mutants.covering import ROOT, Covering, record
 
 SUBJECTS = (
-    "ldcnd/daemon/command/*.py", "ldcnd/daemon/axis/*.py", "ldcnd/daemon/axis/procedures/*.py", "ldcnd/bus/*.py",
+    "ldcnd/daemon/command/*.py", "ldcnd/daemon/axis/*.py", "ldcnd/daemon/axis/procedures/*.py",
+    "ldcnd/daemon/line/*.py", "ldcnd/bus/*.py",
     *(f"ldcnd/drivers/ldcn/{name}.py" for name in (
-        "adoption", "commands", "controls", "faults", "groups", "network", "packet", "path", "received", "record",
-        "registers", "servo", "trajectory",
+        "addressing", "adoption", "commands", "controls", "faults", "groups", "io_module", "network", "packet", "path",
+        "received", "record", "registers", "servo", "trajectory",
     )),
     *(f"ldcnd/drivers/smartstep/{name}.py" for name in (
         "commands", "drive", "ledger", "modes", "monitors", "network", "packet", "parameter_store", "parameters",
-        "transfer", "words",
+        "trace", "trace_check", "trace_result", "transfer", "words",
     )),
     "ldcnd/messaging/hand_over.py", "ldcnd/messaging/reads.py",
 )  # fmt: skip
-"""Admission, authority, ledger, guards, planner, tracker, policies, procedures, bus, status decoding, parameters."""
+"""Admission, authority, ledger, guards, planner, tracker, policies, procedures, lines, status decoding, parameters."""
 TESTS = ("tests/unit", "tests/property", "tests/integration", "tests/fuzz", "tests/drivers")
 EQUIVALENTS = Path(__file__).with_name("equivalents.toml")
 REQUIRED = 0.95
@@ -40,7 +41,9 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0, help="of tests for one mutant")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--tests", nargs="+", default=TESTS, help="which tests")
-    parser.add_argument("--subjects", nargs="+", default=SUBJECTS, help="which modules are changed")
+    parser.add_argument(
+        "--subjects", nargs="+", default=SUBJECTS, help="which modules are changed, or functions: PATH::Class.function"
+    )
     parser.add_argument("--recorded", action="store_true", help="use the recorded coverage as it is")
     parser.add_argument("--anew", action="store_true", help="judge also what the same test has killed before")
     options = parser.parse_args()
@@ -48,8 +51,8 @@ def main() -> int:
     ends_s = time.monotonic() + 60 * options.minutes
     if not options.recorded:
         record(options.tests)
-    paths = sorted({str(path.relative_to(ROOT)) for glob in options.subjects for path in ROOT.glob(glob)})
-    candidates = [mutant for path in paths for mutant in mutants_of(path, ROOT)]
+    candidates = mutants_in(options.subjects)
+    paths = sorted({mutant.path for mutant in candidates})
     count = min(options.count or len(candidates), len(candidates))
     mutants = sorted(candidates, key=lambda mutant: mutant.rank(options.seed))[:count]
     print(f"seed {options.seed}: {count} of {len(candidates)} mutants of {len(paths)} modules", flush=True)
@@ -60,10 +63,24 @@ def main() -> int:
     return report(mutants, campaign.judgements, time.monotonic() - ends_s + 60 * options.minutes)
 
 
+def mutants_in(subjects: Sequence[str]) -> list[Mutant]:
+    """Return all changes of modules (globs) and functions; end the program where a subject names nothing."""
+    found: dict[Mutant, None] = {}
+    for subject in subjects:
+        glob, _, function = subject.partition("::")
+        paths = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob(glob))
+        mutants = [mutant for path in paths for mutant in mutants_of(path, ROOT)]
+        named = [mutant for mutant in mutants if f"{mutant.place}.".startswith(f"{function}." if function else "")]
+        if not paths or (function and not named):
+            sys.exit(f"{subject}: there is nothing of that name to change")
+        found |= dict.fromkeys(named)
+    return list(found)
+
+
 def report(mutants: Sequence[Mutant], judgements: Sequence[Judgement], took_s: float) -> int:
     """Print the figures and what lives; return the exit status."""
     equivalents = {
-        (known["path"], known["place"], known["change"])
+        (known["path"], known["place"], known["kind"], known.get("nth", 1))
         for known in tomllib.loads(EQUIVALENTS.read_text(encoding="utf-8"))["equivalent"]
     }
     found = Counter(judgement.verdict for judgement in judgements)
@@ -71,7 +88,7 @@ def report(mutants: Sequence[Mutant], judgements: Sequence[Judgement], took_s: f
     for judgement in sorted(judgements, key=lambda each: each.number):
         mutant = mutants[judgement.number]
         lives = judgement.verdict in (Verdict.SURVIVED, Verdict.UNCOVERED)
-        is_argued = (mutant.path, mutant.place, mutant.change) in equivalents
+        is_argued = mutant.address in equivalents
         if lives and not is_argued:
             living.append(f"{judgement.verdict}: {mutant}")
         elif is_argued and not lives:

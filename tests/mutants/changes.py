@@ -33,6 +33,7 @@ class Mutant:
         kind: which of the changes of that node.
         change: the code before and after.
         ordinal: how many alike there are before it in its place.
+        nth: which of its kind it is in its place, from 1.
     """
 
     path: str
@@ -43,6 +44,12 @@ class Mutant:
     kind: str
     change: str
     ordinal: int = 0
+    nth: int = 1
+
+    @property
+    def address(self) -> tuple[str, str, str, int]:
+        """What names the change without its text: module, function, kind, and which of that kind."""
+        return self.path, self.place, self.kind, self.nth
 
     def rank(self, seed: int) -> bytes:
         """Return what orders mutants at random for a seed, and keeps that order when others come and go."""
@@ -58,7 +65,8 @@ class Mutant:
         return compile(ast.fix_missing_locations(tree), str(file), "exec", dont_inherit=True)
 
     def __str__(self) -> str:
-        return f"{self.path}:{self.lines[0]} {self.place}: {self.change}"
+        nth = f" (nth = {self.nth})" if self.nth > 1 else ""
+        return f"{self.path}:{self.lines[0]} {self.place}: {self.change}{nth}"
 
 
 def mutants_of(path: str, root: Path) -> Iterator[Mutant]:
@@ -67,6 +75,7 @@ def mutants_of(path: str, root: Path) -> Iterator[Mutant]:
     places = {id(tree): ("", "")} | dict(_places(tree, "", ""))
     left_alone = {id(part) for node in ast.walk(tree) for root_of in _left_alone(node) for part in ast.walk(root_of)}
     alike: Counter[tuple[str, str]] = Counter()
+    of_kind: Counter[tuple[str, str]] = Counter()
     for number, node in enumerate(ast.walk(tree)):
         if id(node) in left_alone:
             continue
@@ -76,7 +85,9 @@ def mutants_of(path: str, root: Path) -> Iterator[Mutant]:
                 continue  # any test would miss the attribute
             before = ast.unparse(node.test if isinstance(node, ast.If) else node).partition("\n")[0][:SHOWN]
             change = f"{kind}: {before}"
-            yield Mutant(path, place, function, _lines(node), number, kind, change, alike[place, change])
+            of_kind[place, kind] += 1
+            count = of_kind[place, kind]
+            yield Mutant(path, place, function, _lines(node), number, kind, change, alike[place, change], count)
             alike[place, change] += 1
 
 

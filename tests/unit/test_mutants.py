@@ -1,13 +1,12 @@
 """The tool behind `make mutants`: what it changes, and which tests it runs for a change."""
 
 import json
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
 
-from tests.mutants.__main__ import EQUIVALENTS, SUBJECTS, TESTS, report
+from tests.mutants.__main__ import mutants_in, report
 from tests.mutants.campaign import Judgement, Verdict
 from tests.mutants.changes import Mutant, mutants_of
 from tests.mutants.covering import ROOT, Covering
@@ -96,17 +95,24 @@ def test_a_campaign_fails_on_a_survivor_and_on_too_few_killed(
     assert f"survived: {chosen[0]}" in capsys.readouterr().out
 
 
-def test_every_subject_and_folder_of_tests_exists():
-    assert [glob for glob in (*SUBJECTS, *TESTS) if not list(ROOT.glob(glob))] == []
+def test_a_change_is_addressed_by_its_function_and_kind_whatever_the_names_in_it(tmp_path: Path):
+    def addresses(text: str) -> list[tuple[str, str, str, int]]:
+        (tmp_path / "module.py").write_text(text)
+        return [mutant.address for mutant in mutants_of("module.py", tmp_path)]
+
+    renamed = MODULE.replace("speed", "rate").replace("check", "examine")
+
+    assert addresses(MODULE) == addresses(renamed)
+    assert len(set(addresses(MODULE))) == len(addresses(MODULE))
 
 
-def test_what_is_argued_to_be_equivalent_is_still_in_the_code():
-    argued = tomllib.loads(EQUIVALENTS.read_text())["equivalent"]
-    known = {
-        (mutant.path, mutant.place, mutant.change)
-        for path in {each["path"] for each in argued}
-        for mutant in mutants_of(path, ROOT)
+def test_subjects_are_modules_and_functions_and_one_that_names_nothing_ends_the_campaign():
+    changes = "tests/mutants/changes.py"
+
+    assert {mutant.place for mutant in mutants_in([f"{changes}::Mutant.__str__", f"{changes}::_places"])} == {
+        "Mutant.__str__",
+        "_places",
     }
-
-    assert [each for each in argued if (each["path"], each["place"], each["change"]) not in known] == []
-    assert all(each["reason"].strip() for each in argued)
+    assert "_kinds" in {mutant.place for mutant in mutants_in([changes])}
+    with pytest.raises(SystemExit, match="no_such"):
+        mutants_in([f"{changes}::no_such"])
