@@ -15,7 +15,9 @@ import structlog
 
 from tests.bench import (
     bus_efficiency,
+    client_sample,
     console,
+    counts,
     round_trip,
     saturated_command,
     scaling,
@@ -25,7 +27,7 @@ from tests.bench import (
 )
 from tests.bench.bus_efficiency import FLOOR, FLOORS, MINIMAL, Conditions, Result
 from tests.bench.machine_speed import MachineSpeed
-from tests.bench.processes import TooBusy, build_programs
+from tests.bench.processes import ROOT, TooBusy, build_programs
 from tests.bench.report import LEAST_ROUNDS, Row, paired, table
 from tests.bench.sources import NoCompiler
 
@@ -58,6 +60,8 @@ PARTS = (
     "round-trip",
     "stops",
     "jumping-clock",
+    "client",
+    "counts",
 )
 
 
@@ -120,6 +124,8 @@ def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> 
         round_trip.rows,
         stops_under_load.rows,
         partial(virtual_time.rows, virtual_s),
+        client_sample.rows,
+        partial(counts.rows, ROOT, before),
     )
     return dict(zip(PARTS, found, strict=True))
 
