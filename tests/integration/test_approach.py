@@ -88,6 +88,7 @@ async def test_two_motions_are_one_command_with_one_target(dialect):
         assert sum(event.status == "done" for event in events) == 1
 
 
+@pytest.mark.promise("approach-keeps-limits")
 @pytest.mark.parametrize("ending", [Halt(), Stop()], ids=["halt", "stop"])
 @pytest.mark.parametrize("after_s", [0.1, 0.55, 0.75])
 async def test_a_halt_or_a_stop_in_either_motion_ends_the_move(ending, after_s):
@@ -118,6 +119,7 @@ async def test_an_aborting_move_in_mid_approach_goes_to_its_own_goal_from_below(
         assert lowest > -6.2
 
 
+@pytest.mark.promise("approach-keeps-limits")
 async def test_an_approach_that_would_leave_the_limits_is_refused_and_nothing_moves():
     async with dialect_rig(LS_182AP, approach=FROM_BELOW, limits=LIMITS) as rig:
         await rig.power_on()

@@ -56,6 +56,7 @@ async def test_a_leased_rig_moves_under_a_lease_only():
         assert {holder.client for holder in holders.holders} == {None}
 
 
+@pytest.mark.promise("stop-in-any-state")
 async def test_stop_and_halt_never_need_a_lease():
     async with running_rig(leased()) as rig:
         await rig.until("x", lambda state: state.link == "up")
@@ -72,6 +73,7 @@ async def test_stop_and_halt_never_need_a_lease():
             await rig.until("x", lambda state: state.state is AxisState.STANDSTILL and state.stop_latched)
 
 
+@pytest.mark.promise("loss-of-control")
 @pytest.mark.parametrize("lease_s", [SHORTEST_LEASE_S, 0.3, 1.0])
 async def test_an_axis_halts_when_its_client_disappears(lease_s):
     async with running_rig(leased()) as rig:

@@ -70,6 +70,7 @@ async def moving(served, *options):
         await running.communicate()
 
 
+@pytest.mark.promise("ctrl-c-halts")
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 async def test_a_waited_move_that_is_interrupted_is_halted(served, ending):
     async with moving(served) as running:

@@ -165,6 +165,7 @@ async def test_a_stop_in_the_middle_stays_latched_and_the_gains_are_put_back(tmp
         assert await rig.registers() == GAINS
 
 
+@pytest.mark.promise("latch-outlasts-programs")
 async def test_a_stop_between_a_trip_and_its_reset_stays_latched_and_ends_the_step(tmp_path, monkeypatch):
     async with commissioning_rig(tmp_path, STANDS) as rig:
         rig.drive.shaft.stalled = True
@@ -427,6 +428,7 @@ def pressing(rig, *sides):
     return asyncio.create_task(press())
 
 
+@pytest.mark.promise("held-step-ends")
 @pytest.mark.parametrize(
     ("step", "said", "script"), [("home", "search 1:", {"how many": "3"}), ("speed", "followed", {"how far may": "4"})]
 )
@@ -460,6 +462,7 @@ async def test_no_further_motion_begins_once_the_key_is_released(step, said, scr
         assert begun == []
 
 
+@pytest.mark.promise("held-step-ends")
 async def test_a_search_goes_as_the_preview_has_said_whatever_the_daemon_was_started_with(tmp_path, monkeypatch):
     text = rig_text().replace('method = "index", velocity = 0.5', 'method = "index", velocity = 0.6')
     async with commissioning_rig(tmp_path, {"how many": "2"}, text=text) as rig:
@@ -646,6 +649,7 @@ async def test_two_sessions_keep_the_results_of_each_other(tmp_path):
         assert again.record.of("load").result.state is StepState.DONE
 
 
+@pytest.mark.promise("held-step-ends")
 async def test_what_a_person_has_agreed_to_is_what_is_run(tmp_path):
     answers = iter(["yes", "no"])
 

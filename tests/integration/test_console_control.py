@@ -37,6 +37,7 @@ async def stands(console, axis):
     return (await console.rig.client.state(axis)).moving is Moving.NO
 
 
+@pytest.mark.promise("page-that-closes")
 async def test_a_page_that_goes_halts_what_it_moved_and_gives_up_control(console):
     async with open_page(console.app, console.browser) as page:
         await running_at(console, page, 1.0)
@@ -167,6 +168,7 @@ async def test_a_jog_runs_for_as_long_as_the_page_says_that_it_is_held(console):
         assert await holder(console, "x") == page.client
 
 
+@pytest.mark.promise("page-that-closes")
 async def test_a_jog_ends_when_nothing_is_heard_of_the_hand_that_holds_it(console):
     async with open_page(console.app, console.browser) as page:
         await jogging(console, page, 1.0)

@@ -30,6 +30,7 @@ def chain(seed: int) -> Chain:
     )
 
 
+@pytest.mark.promise("reading-judged")
 @pytest.mark.parametrize("seed", [1, 2])
 async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_published(seed: int):
     async with running_rig(rig_config(), {"line0": chain(seed)}) as rig:
@@ -51,6 +52,7 @@ async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_publish
     assert [state.state for state in states if state] == [AxisState.STANDSTILL] * 4
 
 
+@pytest.mark.promise("reading-judged")
 async def test_relative_moves_go_as_far_as_they_are_told():
     async with running_rig(rig_config(), {"line0": chain(3)}) as rig:
         line = rig.daemon.rig.axes["x"]

@@ -195,6 +195,7 @@ def commanded(chain, names="xy"):
     return [drive(chain, address).loop.trajectory.position / FRACTION / 1000 for address in range(1, len(names) + 1)]
 
 
+@pytest.mark.promise("line-all-or-none")
 @pytest.mark.parametrize("velocity", [1.0, 10.0, 20.0])
 async def test_axes_on_a_line_leave_it_by_no_more_than_was_said_before(velocity):
     chain = chain_of()
@@ -222,6 +223,7 @@ async def test_axes_on_a_line_leave_it_by_no_more_than_was_said_before(velocity)
     assert max(abs(each.velocity) for each in reply.replies) <= velocity * 1.001
 
 
+@pytest.mark.promise("line-all-or-none")
 async def test_a_line_that_would_be_left_too_far_moves_nothing():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
@@ -235,6 +237,7 @@ async def test_a_line_that_would_be_left_too_far_moves_nothing():
     assert [drive(chain, address).loop.position for address in (1, 2)] == [0, 0]
 
 
+@pytest.mark.promise("line-all-or-none")
 async def test_a_member_of_a_line_beyond_its_limit_keeps_all_at_rest():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:

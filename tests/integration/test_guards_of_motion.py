@@ -69,6 +69,7 @@ async def test_a_start_that_waits_behind_a_busy_line_is_withdrawn_by_a_stop():
         assert abs(rig.position_mm) < 0.5
 
 
+@pytest.mark.promise("stop-in-any-state")
 @pytest.mark.parametrize("share", [n / 12 for n in range(13)])
 async def test_a_stop_on_a_busy_line_wins_at_any_instant_of_a_move(share):
     """The sweep of stops over a move's packets, while polls fill the line."""
@@ -87,6 +88,7 @@ async def test_a_stop_on_a_busy_line_wins_at_any_instant_of_a_move(share):
         assert before < 3.0
 
 
+@pytest.mark.promise("stop-latches")
 async def test_a_reset_in_mid_stop_keeps_the_latch():
     async with dialect_rig(V4, acceleration=20) as rig:
         await rig.power_on()

@@ -95,6 +95,7 @@ async def test_it_does_not_begin_before_every_line_is_up(tmp_path, changes_s):
     assert found.why == "line0: the line is not up"
 
 
+@pytest.mark.promise("heartbeat-ends")
 async def test_it_stops_when_a_line_no_longer_answers_and_goes_on_when_it_does(tmp_path, changes_s):
     async with beating_rig(tmp_path, changes_s) as (rig, chain):
         loop = asyncio.get_running_loop()
@@ -127,6 +128,7 @@ async def test_it_stops_when_one_drive_is_lost(tmp_path, changes_s):
     assert found.why == "y: the drive does not answer"
 
 
+@pytest.mark.promise("heartbeat-ends")
 async def test_it_stops_while_a_stop_is_not_confirmed(tmp_path, changes_s):
     async with beating_rig(tmp_path, changes_s) as (rig, chain):
         chain.modules[3].power(on=False, at_s=asyncio.get_running_loop().time())
@@ -276,6 +278,7 @@ def pipe(path):
         os.close(descriptor)
 
 
+@pytest.mark.promise("heartbeat-ends")
 @pytest.mark.real_time
 async def test_sigstop_a_hung_loop_and_sigkill_end_the_changes_within_the_bound(tmp_path):
     config, endpoint = tmp_path / "rig.toml", f"tcp/127.0.0.1:{free_port()}"

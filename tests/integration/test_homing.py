@@ -340,6 +340,7 @@ async def test_on_a_bad_line_a_search_ends_with_the_right_reference_or_with_a_re
         assert rig.drive.loop.search is None or state.state is AxisState.ERROR_STOP
 
 
+@pytest.mark.promise("motions-without-end")
 async def test_every_search_ends_in_the_drive_even_without_a_host():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()

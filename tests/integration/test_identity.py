@@ -80,6 +80,7 @@ async def test_outputs_are_not_set_in_a_servo_that_holds_the_address_of_the_modu
         assert not taken(rig)
 
 
+@pytest.mark.promise("proven-before-changed")
 async def test_a_line_that_is_down_takes_no_motion_after_a_stop_and_a_reset():
     async with two_servos() as (rig, chain):
         with pytest.raises(OutcomeUnknown, match="sent again"):
@@ -144,6 +145,7 @@ async def test_a_drive_that_was_out_of_reach_is_identified_before_it_takes_a_com
         await rig.client.command("x", Power(on=True))
 
 
+@pytest.mark.promise("moving-shaft-not-caught")
 async def test_a_loop_is_not_closed_while_the_shaft_coasts():
     """A heavy rotor: the drive would hold it at once, at whatever speed."""
     async with dialect_rig(V4, COASTING, velocity=40, acceleration=400) as rig:

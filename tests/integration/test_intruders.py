@@ -74,6 +74,7 @@ def four_drives() -> ChainSpec:
     return ChainSpec(tuple(ModuleSpec(name) for name in ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))
 
 
+@pytest.mark.promise("foreign-program-found")
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize(
     ("tamper", "on", "code"),
@@ -108,6 +109,7 @@ async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(a
     assert not sent & {Command.SET_GAIN, Command.LOAD_TRAJECTORY, Command.START_MOTION, Command.RESET_POSITION}
 
 
+@pytest.mark.promise("contradiction-stops")
 @pytest.mark.parametrize(("axis", "position", "at"), [("x", 80.0, 30_000), ("z", 45.0, 40_000)])
 async def test_a_counter_that_another_program_sets_in_mid_motion_costs_the_reference_and_halts_the_axis(
     axis, position, at
@@ -142,6 +144,7 @@ async def test_a_drive_that_was_reset_is_said_when_it_has_its_address_again():
     assert [event.code for event in events] == ["drive_reset"]
 
 
+@pytest.mark.promise("foreign-program-found")
 async def test_gains_that_nothing_shows_are_written_again_before_the_loop_is_closed():
     """A drive near 0 that was reset while disabled, or got other gains, shows nothing of it: no status has gains."""
     chain = build_chain(four_drives())

@@ -104,6 +104,7 @@ async def test_the_counter_counts_what_it_is_told_to():
         assert last.counter - first.counter == pytest.approx(625_000 * elapsed_s, rel=0.01)
 
 
+@pytest.mark.promise("outputs-by-command")
 async def test_a_module_that_loses_power_has_inputs_again_and_nothing_is_sent_to_it_by_itself():
     chain = chain_of()
     async with cabinet(chain) as (rig, io):
@@ -182,6 +183,7 @@ def test_the_polls_of_modules_are_part_of_the_plan():
     assert [each.axis for each in silent.polls] == ["x", "address 2"]
 
 
+@pytest.mark.promise("outputs-by-command")
 async def test_outputs_need_the_lease_of_the_line_and_no_latched_stop():
     async with cabinet() as (rig, io):
         lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=30.0))

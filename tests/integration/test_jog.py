@@ -41,6 +41,7 @@ async def hold(rig, jog, for_s, velocity):
         await rig.send(Jog(velocity=velocity, hold_s=HOLD_S, renews=jog.command_id))
 
 
+@pytest.mark.promise("jog-while-renewed")
 @dialects
 @pytest.mark.parametrize("velocity", [5.0, -5.0])
 async def test_a_jog_runs_while_it_is_renewed_and_ends_when_it_is_not(dialect, velocity):
@@ -106,6 +107,7 @@ async def test_a_jog_ends_at_the_software_limit_and_is_over_then(dialect):
             await rig.send(Jog(velocity=1.0))
 
 
+@pytest.mark.promise("jog-while-renewed")
 @pytest.mark.parametrize("dialect", [SC, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_a_jog_that_is_over_is_not_begun_again_by_a_late_renewal(dialect):
     async with ready(dialect) as rig:
@@ -122,6 +124,7 @@ async def test_a_jog_that_is_over_is_not_begun_again_by_a_late_renewal(dialect):
         assert await position(rig) == pytest.approx(before, abs=0.01)
 
 
+@pytest.mark.promise("jog-while-renewed")
 @pytest.mark.parametrize("dialect", [SC, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_a_renewal_after_a_halt_or_a_stop_moves_nothing(dialect):
     async with ready(dialect) as rig:
@@ -190,6 +193,7 @@ async def test_another_client_cannot_renew_under_a_lease_that_it_has_not():
             await rig.send(Jog(velocity=2.0, renews=jog.command_id))
 
 
+@pytest.mark.promise("jog-ends-in-drive")
 @pytest.mark.parametrize("dialect", [SC, V4], ids=lambda dialect: dialect.name)
 async def test_a_lost_line_ends_a_jog_within_the_goal_of_the_drive(dialect):
     async with ready(dialect, jog_reach_s=1.0) as rig:

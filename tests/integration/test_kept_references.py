@@ -267,6 +267,7 @@ async def test_a_reference_that_is_lost_under_a_daemon_is_off_the_disk_before_it
     assert (kept, left) == ([tmp_path / "references" / "x.json"], [])
 
 
+@pytest.mark.promise("kept-reference")
 async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_reference(tmp_path):
     """Address, identity and rate are what they were, and even the counter is near where it was."""
 
@@ -283,6 +284,7 @@ async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_re
     assert "its mark is 0 and was " in said[0]
 
 
+@pytest.mark.promise("kept-reference")
 @pytest.mark.parametrize(
     ("tamper", "why"),
     [
@@ -377,6 +379,7 @@ async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_ref
 # -- a crash between what happens and what is written ------------------------
 
 
+@pytest.mark.promise("kept-reference")
 async def test_a_crash_right_behind_a_new_origin_never_brings_back_the_old_one(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -456,6 +459,7 @@ async def test_a_reference_that_cannot_be_removed_from_the_disk_is_made_void_in_
     assert re.search("its mark is 36... and was 3...:", said[0])
 
 
+@pytest.mark.promise("kept-reference")
 async def test_where_neither_disk_nor_drive_can_forget_a_reference_there_is_no_other(tmp_path, monkeypatch):
     def read_only(path: Path, *_text: str) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))

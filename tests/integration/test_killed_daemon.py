@@ -68,6 +68,7 @@ async def test_sigkill_in_mid_move_loses_neither_position_nor_motion(tmp_path):
     assert still == 0
 
 
+@pytest.mark.promise("motions-without-end")
 async def test_what_a_killed_daemon_has_started_ends_within_its_bound(tmp_path):
     link, config = tmp_path / "line0", tmp_path / "adopt.toml"
     simulated = (ROOT / "config" / "simulated.toml").read_text().replace("margin_ms = 50", "margin_ms = 250")

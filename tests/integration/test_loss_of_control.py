@@ -48,6 +48,7 @@ async def jogs_on(rig: RunningRig, axis: str) -> bool:
     return (await rig.client.state(axis)).state is AxisState.CONTINUOUS_MOTION
 
 
+@pytest.mark.promise("loss-of-control")
 async def test_who_takes_one_axis_by_force_stops_all_that_its_holder_moved():
     async with running_rig(config()) as rig:
         await jogging(rig, await acquired(rig, "ann", *BOTH), "y")
@@ -76,6 +77,7 @@ async def test_who_exchanges_a_lease_for_one_that_covers_more_keeps_moving():
         assert await jogs_on(rig, "y")
 
 
+@pytest.mark.promise("loss-of-control")
 @pytest.mark.parametrize("leave_running", [False, True])
 async def test_a_release_in_mid_motion_stops_unless_it_is_to_leave_it_running(leave_running):
     async with running_rig(config()) as rig:
@@ -183,6 +185,7 @@ async def test_a_client_that_freezes_in_mid_motion_has_its_axis_do_what_the_poli
     assert position.value == pytest.approx(target, abs=0.05) if target else 4.0 < position.value < 7.0
 
 
+@pytest.mark.promise("error-ends-in-order")
 @pytest.mark.parametrize("part", ["health", "leases", "liveliness"])
 async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(monkeypatch, part):
     broken = asyncio.Event()

@@ -72,6 +72,8 @@ async def test_an_orderly_end_is_no_loss_of_a_drive():
     assert [record for record in records if record["event"] == "drive does not answer"] == []
 
 
+@pytest.mark.promise("moving-unknown")
+@pytest.mark.promise("loss-of-line")
 @pytest.mark.parametrize(
     ("policy", "stands"),
     [(LossPolicy.HALT, True), (LossPolicy.QUICK_STOP, True), (LossPolicy.RUN_TO_TARGET, False)],
@@ -90,6 +92,7 @@ async def test_a_drive_that_still_moves_when_the_line_is_back_does_what_its_poli
         assert before > 10.0  # it moved on while nobody could reach it
 
 
+@pytest.mark.promise("start-moves-nothing")
 async def test_after_a_lost_line_nothing_resumes_and_nothing_is_believed():
     chain = simulated_chain()
     async with running_rig(chains={"line0": chain}) as rig:
@@ -109,6 +112,7 @@ async def test_after_a_lost_line_nothing_resumes_and_nothing_is_believed():
             await rig.client.command("x", MoveAbsolute(position=0.0))
 
 
+@pytest.mark.promise("loss-of-line")
 @pytest.mark.parametrize(
     ("policy", "moves_on"), [(LossPolicy.HALT, False), (LossPolicy.POWER_OFF, False), (LossPolicy.RUN_TO_TARGET, True)]
 )

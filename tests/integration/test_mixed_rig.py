@@ -282,6 +282,7 @@ async def drive_changes(rig: RunningRig) -> list[tuple[str | None, str | None]]:
     return [(event.code, event.reason) for event in events if event.verb == "drive_changed"]
 
 
+@pytest.mark.promise("foreign-program-found")
 async def test_a_parameter_that_another_program_has_changed_is_found_within_a_minute(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:

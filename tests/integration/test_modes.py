@@ -234,6 +234,7 @@ async def test_a_stop_ends_a_duty_at_once():
         assert rig.position_mm == pytest.approx(where, abs=0.02)
 
 
+@pytest.mark.promise("stop-in-any-state")
 @pytest.mark.parametrize("turns", range(1, 20, 2))
 @pytest.mark.parametrize(
     "command",

@@ -23,6 +23,7 @@ async def true_speed(rig: DialectRig) -> float:
     return (rig.position_mm - before) / 0.2
 
 
+@pytest.mark.promise("motions-without-end")
 @pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_a_duty_that_a_daemon_has_left_is_ended_by_the_next_one(dialect):
     async with dialect_rig(dialect, pwm=PWM, acceleration=2000, loss=RUN_ON) as rig:

@@ -219,6 +219,7 @@ def instants(dialect: Dialect, name: str, count: int) -> list[float]:
     return [dice.uniform(0.0, 0.02) if at % 2 else dice.uniform(0.02, BOUNDED[name].bound_s) for at in range(count)]
 
 
+@pytest.mark.promise("motions-without-end")
 @pytest.mark.parametrize("dialect", MODELS, **names)
 @pytest.mark.parametrize("name", BOUNDED)
 async def test_a_motion_ends_within_its_bound_when_the_daemon_is_killed(dialect, name):
@@ -258,6 +259,7 @@ async def test_a_jog_that_was_changed_on_its_way_ends_without_a_host_on_sc_alone
         assert (await travelled(rig, 2.0) > 1.0) is runs_on
 
 
+@pytest.mark.promise("jog-ends-in-drive")
 @pytest.mark.parametrize(("dialect", "bound_s"), [(SC, 1.0), (V4, HORIZON_S), (LS_182AP, HORIZON_S)], **names)
 async def test_a_jog_that_is_held_ends_at_its_goal_in_the_drive_when_the_daemon_is_killed(dialect, bound_s):
     async with powered(dialect, {"jog_reach_s": HORIZON_S}) as rig:

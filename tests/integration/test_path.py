@@ -131,6 +131,7 @@ async def test_a_group_whose_leader_answers_for_it_walks_a_path_too(leader):
     assert math.dist(places(chain)[1], (TRIANGLE["z"][-1], TRIANGLE["c"][-1])) < 0.05
 
 
+@pytest.mark.promise("path-checked-whole")
 async def test_a_path_beyond_a_limit_or_too_far_from_its_line_moves_nothing():
     chain = sc_chain()
     async with two_sc(chain) as rig:
@@ -182,6 +183,7 @@ async def underrun(_rig: ChainRig, chain: Chain) -> None:
     drive(chain, 1).loop.trajectory.path._points.clear()
 
 
+@pytest.mark.promise("path-checked-whole")
 @pytest.mark.parametrize("what", [halt_one, stop_one, trip, underrun])
 @pytest.mark.parametrize("after_s", [0.3, 1.7])
 async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRig, Chain], Awaitable[None]], after_s):
@@ -201,6 +203,7 @@ async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRi
     assert all(state is not None and state.command is None for state in states)
 
 
+@pytest.mark.promise("path-ends-with-daemon")
 async def test_if_the_daemon_dies_the_axes_stand_at_the_end_of_their_buffers():
     chain = sc_chain()
     async with two_sc(chain) as rig:
@@ -216,6 +219,7 @@ async def test_if_the_daemon_dies_the_axes_stand_at_the_end_of_their_buffers():
     assert from_polyline(wanted, [(0.0, 0.0), *zip(TRIANGLE["z"], TRIANGLE["c"], strict=True)]) < said.deviation + 0.001
 
 
+@pytest.mark.promise("path-checked-whole")
 @pytest.mark.parametrize("by_force", [False, True])
 async def test_a_path_whose_sender_has_lost_one_axis_is_fed_no_further(by_force):
     chain = sc_chain()
@@ -238,6 +242,7 @@ async def test_a_path_whose_sender_has_lost_one_axis_is_fed_no_further(by_force)
     assert Command.ADD_PATH_POINTS not in later
 
 
+@pytest.mark.promise("path-checked-whole")
 async def test_a_stop_at_any_instant_of_a_path_is_the_last_that_moves():
     for tenth in range(1, 12):
         chain = sc_chain()

@@ -65,6 +65,7 @@ async def unplugged(rig: RunningRig, chain: Chain) -> None:
     await rig.until("x", lambda state: state.link is LinkState.DOWN)
 
 
+@pytest.mark.promise("stop-until-confirmed")
 async def test_a_stop_sent_while_the_line_is_down_reaches_the_drive_when_it_is_back():
     chain = chain_of_four()
     async with jogging(chain) as rig:
@@ -93,6 +94,7 @@ async def test_a_stop_sent_while_the_line_is_down_reaches_the_drive_when_it_is_b
         assert CommandStatus.DONE in told
 
 
+@pytest.mark.promise("stop-until-confirmed")
 async def test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_rate():
     chain = chain_of_four()
     async with jogging(chain, baud=19_200) as rig:
@@ -128,6 +130,7 @@ async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
         assert await stands(chain)
 
 
+@pytest.mark.promise("stop-until-confirmed")
 async def test_a_drive_that_was_mute_is_stopped_as_soon_as_it_answers():
     chain = chain_of_four()
     async with jogging(chain) as rig:
@@ -194,6 +197,7 @@ async def starting(chain: Chain, **bus: object):
                 await running
 
 
+@pytest.mark.promise("stop-during-bring-up")
 async def test_stops_during_bring_up_are_answered_at_once_and_do_not_restart_it():
     loop = asyncio.get_running_loop()
     async with starting(chain_of_four()) as rig:
@@ -228,6 +232,7 @@ async def test_a_stop_before_a_line_is_taken_over_stops_what_still_moves_there()
         assert (await rig.client.state("x")).enabled  # brought to rest, not switched off
 
 
+@pytest.mark.promise("stop-until-confirmed")
 async def test_a_stop_reaches_drives_of_a_line_that_cannot_be_brought_up():
     """One module is missing from the configuration's view, so the bring-up fails; the others can be stopped."""
     chain = chain_of_four()
@@ -242,6 +247,7 @@ async def test_a_stop_reaches_drives_of_a_line_that_cannot_be_brought_up():
         assert await stands(chain)
 
 
+@pytest.mark.promise("reset-at-speed")
 async def test_a_moving_axis_in_error_stop_is_not_switched_off_by_a_reset():
     chain = chain_of_four()
     async with jogging(chain) as rig:
@@ -262,6 +268,7 @@ async def test_a_moving_axis_in_error_stop_is_not_switched_off_by_a_reset():
         await rig.client.command("x", Reset())
 
 
+@pytest.mark.promise("loss-of-line")
 async def test_a_latched_axis_that_moves_when_its_line_is_back_comes_to_rest_whatever_the_policy_says():
     chain = chain_of_four()
     async with jogging(chain) as rig:

@@ -85,6 +85,7 @@ async def test_a_buffered_move_that_has_become_too_late_is_refused():
         await stays_at_first_target(rig)
 
 
+@pytest.mark.promise("permission-at-motion")
 async def test_a_buffered_move_of_a_lease_that_was_released_is_refused():
     async with running_rig(config()) as rig:
         async with moving_to_first_target(rig) as held:
@@ -156,6 +157,7 @@ async def test_a_buffered_move_goes_on_under_a_lease_that_its_holder_has_widened
         assert (await rig.client.last("x", "position")).value == pytest.approx(60.0, abs=0.05)
 
 
+@pytest.mark.promise("refused-abort-halts-nothing")
 @pytest.mark.parametrize(
     "command",
     [
@@ -194,6 +196,7 @@ async def test_a_stop_between_the_halt_and_the_start_of_an_aborting_move_wins():
         assert state.stop_latched
 
 
+@pytest.mark.promise("permission-at-motion")
 async def test_a_homing_whose_lease_was_lost_begins_no_further_leg():
     """The axis stands on its switch: the first leg moves off it; the search would be the second one."""
     rig_config = config()
@@ -259,6 +262,7 @@ async def test_limits_are_those_of_the_plan_at_the_start():
             await held.command("x", MoveAbsolute(position=1e6, buffer_mode=BufferMode.BUFFERED), 30.0)
 
 
+@pytest.mark.promise("one-id-one-motion")
 async def test_a_replay_after_thousands_of_halts_is_answered_and_moves_nothing():
     async with running_rig(config(authority="open")) as rig:
         await rig.until("x", lambda state: state.link == "up")
@@ -288,6 +292,7 @@ MOVES = {"load", "start", "track", "power", "set_gains", "start_group", "start_p
 MAY_CALL = "guards.py"
 
 
+@pytest.mark.promise("permission-at-motion")
 def test_nothing_in_the_daemon_but_a_permit_calls_what_can_move_a_drive():
     folder = Path(ldcnd.daemon.__file__).parent
     found = []
@@ -325,6 +330,7 @@ def busy_line_before(rig: RunningRig, monkeypatch, call: str) -> asyncio.Event:
     return queued
 
 
+@pytest.mark.promise("permission-at-motion")
 @pytest.mark.parametrize("call", ["load", "start"])
 async def test_a_packet_that_waits_for_the_line_is_not_sent_once_its_lease_has_ended(call, monkeypatch):
     async with running_rig(config(LossPolicy.RUN_TO_TARGET)) as rig:

@@ -86,6 +86,7 @@ async def test_a_jog_under_way_changes_its_speed_with_any_drive():
             assert await speed(rig) == pytest.approx(4.0, abs=0.3)
 
 
+@pytest.mark.promise("override-0")
 @dialects
 async def test_at_0_percent_what_moves_halts_nothing_begins_and_nothing_goes_on_by_itself(dialect):
     async with dialect_rig(dialect, pwm=PWM, tracking=TRACKING) as rig:
@@ -119,6 +120,7 @@ async def test_at_0_percent_the_loop_may_be_closed():
         assert (await rig.until(lambda state: state.enabled)).state is AxisState.STANDSTILL
 
 
+@pytest.mark.promise("override-0")
 async def test_a_move_that_waits_is_not_begun_at_0_percent():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
@@ -130,6 +132,7 @@ async def test_a_move_that_waits_is_not_begun_at_0_percent():
             await waiting
 
 
+@pytest.mark.promise("override-0")
 async def test_anyone_may_lower_it_and_raising_it_needs_control():
     async with dialect_rig(LS_182AP) as rig:
         held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))

@@ -44,6 +44,7 @@ async def leave_x_moving(chain, config, *, to=50.0):
         await rig.kill()
 
 
+@pytest.mark.promise("start-moves-nothing")
 async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_adopts():
     chain = chain_of()
     await leave_x_moving(chain, simulated_config())
@@ -203,6 +204,7 @@ async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_move
     assert drive(chain, 1).loop.servo_on
 
 
+@pytest.mark.promise("rejoin-resets-nothing")
 @pytest.mark.parametrize("stopped", [False, True])
 async def test_a_drive_that_a_restarted_one_keeps_from_hearing_is_not_reset(stopped):
     chain = chain_of()
@@ -254,6 +256,8 @@ async def test_a_line_that_was_lost_while_its_rate_changed_is_brought_to_one_rat
     assert drive(chain, 2).loop.servo_on
 
 
+@pytest.mark.promise("moving-unknown")
+@pytest.mark.promise("motions-without-end")
 @pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9, 3.0])
 async def test_a_motion_without_an_end_that_a_host_has_left_moves_until_it_was_ended(counts_per_tick):
     chain = chain_of()
@@ -364,6 +368,7 @@ async def referenced_after(chain, **bus):
         return {name: axis.tracker.referenced for name, axis in rig.daemon.rig.axes.items()}
 
 
+@pytest.mark.promise("reference-at-reset")
 @pytest.mark.parametrize("baud", [9600, 19_200, 57_600, 115_200])
 async def test_a_reset_of_drives_that_an_earlier_host_has_used_gives_no_reference(baud):
     chain = chain_of()
@@ -384,6 +389,7 @@ async def test_drives_that_were_powered_off_and_on_between_two_daemons_are_where
     assert all((await referenced_after(chain)).values())
 
 
+@pytest.mark.promise("reference-at-reset")
 @pytest.mark.parametrize("place", range(4))
 @pytest.mark.parametrize("baud", [19_200, 115_200])
 async def test_one_drive_that_was_powered_on_does_not_stand_for_those_that_kept_their_power(place, baud):
@@ -396,6 +402,7 @@ async def test_one_drive_that_was_powered_on_does_not_stand_for_those_that_kept_
     assert not any((await referenced_after(chain, baud=baud)).values())
 
 
+@pytest.mark.promise("reference-at-reset")
 async def test_a_drive_whose_shaft_turns_while_it_is_reset_is_not_referenced():
     chain = chain_of()
     turning = asyncio.create_task(turn(chain, 2), name="turning")

@@ -147,6 +147,7 @@ def campaign(seeds: range) -> None:
     assert len(seeds) / 3 < accepted <= moved < len(seeds)
 
 
+@pytest.mark.promise("one-id-one-motion")
 @pytest.mark.timeout(300)
 def test_one_command_id_makes_one_motion_at_most():
     campaign(range(SCHEDULES // 3))

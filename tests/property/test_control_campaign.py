@@ -309,6 +309,7 @@ SEEDS_OF_BEFORE = (5149,)
 """Schedules that were wrong once: a stop behind a packet that switched the motor off closed its loop again."""
 
 
+@pytest.mark.promise("kill-moves-nothing-twice")
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     "seeds", [*(range(first, first + 50) for first in range(0, 300, 50)), SEEDS_OF_BEFORE], ids=str

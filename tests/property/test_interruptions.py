@@ -386,6 +386,7 @@ def interrupted(seed: int, chosen: Chosen, *, kill: bool) -> Interruptions:
     return came
 
 
+@pytest.mark.promise("kill-moves-nothing-twice")
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
 def test_a_daemon_may_be_interrupted_anywhere(kill):

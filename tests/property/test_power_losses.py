@@ -194,6 +194,7 @@ def flaws_of(seeds: range) -> list[str]:
     return [flaw for seed in seeds if (flaw := play(seed))]
 
 
+@pytest.mark.promise("address-only-of-its-place")
 def test_no_module_ever_has_the_address_of_another_place_and_the_chain_comes_back() -> None:
     print("seeds 0 to 49")
     assert flaws_of(range(50)) == []

@@ -214,6 +214,7 @@ async def test_a_fault_that_shows_while_the_loop_is_open_is_reset_as_well():
         assert bench.drive.calls == ["reset"]
 
 
+@pytest.mark.promise("stop-latches")
 @pytest.mark.parametrize(("fault", "call"), [(OVERHEAT, "reset"), (WARNING, "clear_warnings")])
 async def test_a_stop_that_comes_during_a_reset_keeps_its_latch(fault, call):
     async with axis_bench() as bench:
@@ -247,6 +248,7 @@ async def test_a_reset_waits_for_a_stop_that_no_drive_has_confirmed():
         assert bench.drive.calls == []
 
 
+@pytest.mark.promise("latch-outlasts-programs")
 async def test_a_reset_of_faults_only_clears_no_latch():
     async with axis_bench() as bench:
         bench.show(enabled=False, faults=(OVERHEAT,))

@@ -507,6 +507,7 @@ async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(g
         assert "position_jump" not in [fault.code for fault in bench.tracker.active_faults]
 
 
+@pytest.mark.promise("contradiction-stops")
 async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_has_the_motor_stopped():
     async with axis_bench() as bench:
         verdicts = [
@@ -606,6 +607,7 @@ async def test_a_referenced_line_counts_from_the_drives_zero_again():
         assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (True, 0.0)
 
 
+@pytest.mark.promise("energy-out-always-sent")
 async def test_of_an_axis_out_of_reach_only_what_takes_energy_out_is_sent():
     async with axis_bench() as bench:
         bench.axis.disconnected()
@@ -620,6 +622,7 @@ async def test_of_an_axis_out_of_reach_only_what_takes_energy_out_is_sent():
     assert bench.drive.told == [("stop", StopMode.SMOOTH), ("stop", StopMode.OFF)]
 
 
+@pytest.mark.promise("energy-out-always-sent")
 @pytest.mark.parametrize("command", [Halt(), Power(on=False)])
 async def test_what_a_silent_drive_has_not_confirmed_is_said_to_be_so_and_waits_to_be_sent_again(command):
     async with axis_bench() as bench:

@@ -184,6 +184,7 @@ async def test_only_whole_groups_are_stopped_by_one_packet():
     assert pair.bus.sent == []
 
 
+@pytest.mark.promise("stop-closes-no-loop")
 async def test_no_packet_for_all_closes_the_loop_of_a_member_that_was_switched_off():
     pair = await Pair().up()
     await pair.drives["a"].stop(StopMode.OFF)

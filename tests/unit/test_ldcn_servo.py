@@ -249,6 +249,7 @@ async def test_only_the_switches_ahead_of_a_motion_are_armed(motion, armed):
     assert drive.module.loop.search.control == armed
 
 
+@pytest.mark.promise("stop-closes-no-loop")
 @pytest.mark.parametrize("mode", [StopMode.SMOOTH, StopMode.ABRUPT])
 async def test_no_stop_closes_the_loop_of_a_motor_that_was_switched_off_or_is_being(mode):
     drive = await powered()

@@ -101,6 +101,7 @@ def test_what_is_not_over_is_never_forgotten(ledger):
     assert ledger.get(f"done-{ANSWERS_PER_SENDER + 9}")
 
 
+@pytest.mark.promise("one-id-one-motion")
 def test_a_replay_whose_answer_is_forgotten_is_refused(ledger):
     for number in range(ANSWERS_PER_SENDER + 1):
         done(ledger, f"c{number}")

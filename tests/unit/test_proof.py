@@ -68,6 +68,7 @@ async def test_what_is_sent_to_a_group_concerns_all_its_members():
         assert await sent(rig, Effect.CHANGES, GROUP) is None
 
 
+@pytest.mark.promise("proven-before-changed")
 async def test_proof_is_asked_when_the_turn_comes_and_not_before():
     rig = Rig()
     async with running(rig) as callers:
