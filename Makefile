@@ -43,6 +43,7 @@ fix: .venv/ready
 	.venv/bin/ldcnd schema python
 	.venv/bin/ldcnd schema keys docs/reference/keys.md
 	.venv/bin/ldcnd schema errors docs/reference/errors.md
+	$(PY) -m tests.support.verb_table
 
 # the site in build/docs, warnings as errors
 docs: .venv/ready

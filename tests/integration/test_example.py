@@ -75,11 +75,3 @@ async def test_a_joystick_jogs_while_its_button_and_stick_are_held(tmp_path):
     first, second = (float(line.split()[-1]) for line in (halted, unplugged))
     assert first < -1.0
     assert second < first + 0.5
-
-
-def test_the_example_is_thirty_lines_and_needs_nothing_of_ours():
-    text = EXAMPLE.read_text()
-
-    code = [line for line in text.splitlines() if line.strip()]
-    assert len(code) <= 32
-    assert "ldcnd" not in text

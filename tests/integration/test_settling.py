@@ -16,8 +16,6 @@ from ldcnd.errors import DriveFault
 from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, Stop
 from ldcnd.model.events import CommandEvent, CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.model.samples import AxisState, FaultSample, PositionSample, TelemetryItem
-from tests.bench.settle import settle_figures
-from tests.support.process import ROOT
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 DISTANCES = {"x": 5.0, "y": -5.0, "z": 5.0, "c": 90.0}
@@ -190,17 +188,3 @@ async def test_a_program_learns_that_its_move_did_not_settle():
         await axis.power(on=True)
         with pytest.raises(DriveFault, match="did not settle"):
             await (await axis.move_absolute(5.0)).done()
-
-
-@pytest.mark.parametrize("axis", DISTANCES)
-async def test_the_figures_of_the_documentation_are_those_of_the_simulated_axes(axis):
-    page = (ROOT / "docs" / "explanation" / "done.md").read_text(encoding="utf-8")
-    (row,) = (line for line in page.splitlines() if line.startswith(f"| {axis} |"))
-    distance, profile_ms, off_then, done_ms, off = (int(cell.split()[0]) for cell in row.split("|")[2:-1])
-
-    async with running_rig() as rig:
-        figures = await settle_figures(rig, axis, distance)
-
-    assert figures.profile_ms == profile_ms
-    assert (figures.off_then, figures.off) == (pytest.approx(off_then, abs=4), pytest.approx(off, abs=4))
-    assert figures.done_ms == pytest.approx(done_ms, abs=30)

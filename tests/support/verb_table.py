@@ -3,9 +3,7 @@
 import argparse
 import functools
 import inspect
-import re
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from types import CodeType, FunctionType
 
 import click
@@ -20,12 +18,11 @@ from ldcnd.model.frozen import Frozen
 from tests.support.process import ROOT
 
 PAGE = ROOT / "docs" / "reference" / "verbs.md"
-PLACES = ("client", "command line", "console", "documentation")
+PLACES = ("client", "command line")
 HEADER = """# Verbs
 
-Where can a verb be reached? This table is made from the command classes: the method of the client, the commands of the
-command line that send the class, the source of the console's page, the first page that tells how it is used. A cell
-with words says why a verb is not there as such.
+Where can a verb be reached? This table is made from the command classes: the method of the client, and the commands of
+the command line that send the class. A cell with words says why a verb is not there as such.
 
 """
 LEASE = "part of `Rig.control`"
@@ -36,24 +33,13 @@ EXPLAINED = {
     ("events", "client"): "`Rig.events` follows them without gaps",
     ("wire_log", "client"): "for people: `ldcnd bus wire-log`",
     ("rehearse", "client"): "for people: `ldcnd drill`",
-    ("acquire", "console"): "a page takes control by `/api/rigs/RIG/control`",
-    ("renew", "console"): "by itself while a page is open",
-    ("outcome", "console"): "the events of the rig show it",
-    ("rehearse", "console"): "a loss is rehearsed at the machine, with `ldcnd drill`",
-    ("read_monitors", "console"): "the page of the axis shows the monitors as they are published",
-    ("path", "console"): "for programs: a page walks no path",
-    ("acquire", "documentation"): "[console](../how-to/console.md): Take control",
-    ("renew", "documentation"): "`Rig.control` does it by itself",
     ("release", "command line"): "a lease of the command line ends with its command",
     ("renew", "command line"): "a command that holds control renews it by itself",
     ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
     ("rehearse", "command line"): "`ldcnd drill`",
     ("report_shadow", "command line"): "`ldcnd shadow`",
-    ("report_shadow", "console"): "the page of the axis shows what was reported",
 }
 """Why a verb is not in a place; everything else is there."""
-PLAIN_WORDS = {"path"}
-"""Verbs that stand for something else in the sources of the console."""
 METHODS_OF_RIGS = {
     "holders",
     "outcome",
@@ -65,14 +51,8 @@ METHODS_OF_RIGS = {
     "set_io",
     "set_io_timer",
 }
-NOT_FOR_READERS = {"verbs.md", "python.md", "keys.md", "cli.md", "errors.md", "lab-log.md", "glossary.md"}
-"""Pages that are made of the classes, or only define a word."""
-LAST = "write-a-client.md"
-"""For those who have no client library."""
 MOST_COMMANDS = 2
 """Of the command line in one cell."""
-PAGES = ("how-to", "tutorials", "reference", "explanation")
-"""Where a reader looks first."""
 
 
 def verb_table() -> str:
@@ -100,47 +80,12 @@ def _cell(command: type[Command[Frozen]], place: str) -> str:
 
 
 def _found(command: type[Command[Frozen]], place: str) -> str:
-    match place:
-        case "client":
-            kind = Axis if command.about is About.AXIS else Rig
-            name = method_name(command) if command.about is About.AXIS else command.verb
-            known = command.about is About.AXIS or name in METHODS_OF_RIGS
-            return f"`{kind.__name__}.{name}`" if known and hasattr(kind, name) else ""
-        case "command line":
-            return _commands_that_send(command)
-        case "console" if command.verb in PLAIN_WORDS:
-            return ""
-        case "console":
-            sources = [*ROOT.glob("ldcnd/console/static/**/*.js"), *ROOT.glob("ldcnd/console/*.py")]
-            return _in_sources(
-                rf"""["'`/]{command.verb}["'`]""",
-                (each for each in sources if "vendor" not in str(each) and each.name != "remedies.js"),
-            )
-        case _:
-            name = re.escape(command.verb).replace("_", "[_ -]")
-            strictly, loosely = rf"""(?:ldcnd[a-z -]* |["`.]){name}\b""", rf"\b{name}\b"
-            found = next((page for how in (strictly, loosely) for page in _pages() if _says(page, how)), None)
-            return f"[{found.stem}](../{found.parent.name}/{found.name})" if found else ""
-
-
-@functools.cache
-def _pages() -> list[Path]:
-    pages = [page for folder in PAGES for page in sorted((ROOT / "docs" / folder).glob("*.md"))]
-    return [*(page for page in pages if page.name not in (*NOT_FOR_READERS, LAST)), *(ROOT / "docs").glob(f"*/{LAST}")]
-
-
-def _says(page: Path, pattern: str) -> bool:
-    return re.search(pattern, page.read_text(encoding="utf-8")) is not None
-
-
-def _in_sources(pattern: str, files: Iterable[Path]) -> str:
-    """Return the first file that says it: a page before what pages are made of, the page of an axis last."""
-    places = ("pages", "parts", "session", "static", "console")
-    found = sorted(
-        (file for file in files if _says(file, pattern)),
-        key=lambda file: (file.name == "axis.js", places.index(file.parent.name), file),
-    )
-    return f"`{found[0].name}`" if found else ""
+    if place == "command line":
+        return _commands_that_send(command)
+    kind = Axis if command.about is About.AXIS else Rig
+    name = method_name(command) if command.about is About.AXIS else command.verb
+    known = command.about is About.AXIS or name in METHODS_OF_RIGS
+    return f"`{kind.__name__}.{name}`" if known and hasattr(kind, name) else ""
 
 
 def _commands_that_send(command: type[Command[Frozen]]) -> str:

@@ -41,32 +41,16 @@ OTHERS = {
 
 
 SLOW_TO_LOAD = {"structlog", "rich", "matplotlib", "textual", "starlette", "hypothesis"}
-MODULES_OF_A_CALL = 345
-MODELS_OF_CALLS = {
-    "stop": 64,
-    "why x": 59,
-    "lease list": 73,
-    "trace channels x": 97,
-    "axis list": 64,
-    "axis move x 1": 64,
-    "axis gains x --kp 1": 64,
-    "axis jog x 1 --for 1": 73,
-    "group move x=1 y=1": 98,
-}
-"""The most models that these calls of the command line make; with the modules, two thirds of the time of a call."""
+CALLS = ("stop", "trace channels x", "group move x=1 y=1")
 CALL = """
-import gc, sys
+import sys
 from ldcnd.cli.main import main
-from ldcnd.model.frozen import Frozen
-
-def models(of):
-    return sum(1 + models(model) for model in of.__subclasses__())
 
 sys.argv = ["ldcnd", *{words!r}]
 try:
     main()
 except SystemExit as end:
-    print(end.code, models(Frozen), gc.get_freeze_count(), *sys.modules, sep="\\n")
+    print(end.code, *sys.modules, sep="\\n")
 """
 BESIDE_A_DAEMON = {
     "bluesky",
@@ -81,9 +65,6 @@ BESIDE_A_DAEMON = {
     "top",
     "tuning",
 }
-MODULES_OF_A_DAEMON = 184
-MODELS_OF_A_DAEMON = 184
-"""The most of our modules, and models, that there are when a daemon opens its lines: most of the time until then."""
 DAEMON = """
 import asyncio, sys, time
 from pathlib import Path
@@ -92,11 +73,7 @@ from ldcnd.config.rig import load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.publish.contract import all_schemas
 from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.frozen import Frozen
 from ldcnd.planning.plan import require_plan
-
-def models(of):
-    return sum(1 + models(model) for model in of.__subclasses__())
 
 async def build(config):
     require_plan(config)
@@ -104,7 +81,7 @@ async def build(config):
         build_daemon(config, session, time.time_ns, "test")
 
 asyncio.run(build(load_config(Path({rig!r}))))
-print(all_schemas.cache_info().misses, models(Frozen), *sys.modules, sep="\\n")
+print(all_schemas.cache_info().misses, *sys.modules, sep="\\n")
 """
 
 
@@ -123,27 +100,20 @@ def test_the_client_loads_nothing_of_the_daemon(tmp_path: Path) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize(("words", "most"), MODELS_OF_CALLS.items())
-def test_a_call_of_the_command_line_loads_little(words: str, most: int, tmp_path: Path) -> None:
-    code, models, frozen, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
+@pytest.mark.parametrize("words", CALLS)
+def test_a_call_of_the_command_line_loads_little(words: str, tmp_path: Path) -> None:
+    code, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
 
-    print(f"{words}: {len(loaded)} modules, {models} models")
     assert code == "3"
     assert "ldcnd.messaging.zenoh_session" in loaded
     assert not {f"ldcnd.{name}" for name in OURS - {"cli"}} & set(loaded)
     assert not (OTHERS - {"click"} | SLOW_TO_LOAD) & set(loaded)
-    assert len(loaded) <= MODULES_OF_A_CALL
-    assert int(models) <= most
-    assert int(frozen) > 10_000  # what it has loaded, which the collector passes by
 
 
 def test_a_daemon_loads_one_family_and_generates_no_schema(tmp_path: Path) -> None:
-    schemas, models, *loaded = printed_by(DAEMON.format(rig=str(ROOT / "config" / "simulated.toml")), tmp_path)
+    schemas, *loaded = printed_by(DAEMON.format(rig=str(ROOT / "config" / "simulated.toml")), tmp_path)
 
-    print(f"a daemon: {sum(name.startswith('ldcnd') for name in loaded)} modules, {models} models")
     assert schemas == "0"
     assert [home for home in HOMES.values() if home.partition(":")[0] in loaded] == [HOMES[DEFAULT]]
     assert not {f"ldcnd.{name}" for name in BESIDE_A_DAEMON} & set(loaded)
     assert not (OTHERS - {"click", "serial", "serial_asyncio"} | SLOW_TO_LOAD - {"structlog"}) & set(loaded)
-    assert sum(name.startswith("ldcnd") for name in loaded) <= MODULES_OF_A_DAEMON
-    assert int(models) <= MODELS_OF_A_DAEMON

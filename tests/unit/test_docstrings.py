@@ -1,11 +1,5 @@
 """What docstrings must say: fields of models, in their schemas; packages, to those who come new."""
 
-import ast
-from pathlib import Path
-
-import pytest
-
-import ldcnd
 from ldcnd.model.frozen import Frozen, attribute_docstrings
 
 
@@ -45,17 +39,3 @@ def test_schemas_describe_their_fields():
     assert "description" not in schema["properties"]["silent"]
     assert schema["properties"]["other"] == {"$ref": "#/$defs/Base", "description": "A model."}
     assert schema["$defs"]["Base"]["properties"]["first"]["description"] == "Said of\nthe first."
-
-
-PACKAGES = sorted(path.parent for path in Path(ldcnd.__file__).parent.rglob("__init__.py"))
-
-
-@pytest.mark.parametrize("folder", PACKAGES[1:], ids=lambda path: path.name)
-def test_a_package_says_whom_it_serves_and_where_to_start(folder):
-    text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
-    if any(each in text for each in ("RE = RunEngine()", "The pages are files beside")):
-        return  # an example, or the one file, is the start
-
-    assert text.count("\n") >= 2
-    assert "Serve" in text or "for " in text.lower()
-    assert "Start with" in text

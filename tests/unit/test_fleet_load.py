@@ -4,22 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from tests.bench.fleet_load import Costs, Site, as_markdown, demands, uses
-from tests.support.process import ROOT
+from tests.bench.fleet_load import Costs, Site, demands, uses
 
 SITE, COSTS = Site(), Costs()
-PAGE = (ROOT / "docs" / "explanation" / "scale.md").read_text()
 
 
 def shares(site: Site, number: int) -> dict[str, float]:
     return {use.part: use.share for use in uses(site, COSTS, demands(site)[number])}
-
-
-def test_the_page_has_the_table_and_the_costs_of_the_model() -> None:
-    assert as_markdown(SITE, COSTS) in PAGE, "run `python -m tests.bench.fleet_load`"
-    for cost in (COSTS.daemon_us, COSTS.router_in_us, COSTS.router_out_us, COSTS.client_us):
-        assert f"| {cost:g} us |" in PAGE
-    assert f"| {COSTS.wire_bytes:g} bytes |" in PAGE
 
 
 def test_what_nobody_takes_at_the_root_does_not_load_it() -> None:

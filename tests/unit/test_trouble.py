@@ -1,7 +1,5 @@
 """What is wrong with an axis, in words, the worst first."""
 
-from importlib import resources
-
 import pytest
 
 from ldcnd.model.health import AxisHealth, ItemHealth
@@ -134,19 +132,3 @@ def test_polls_that_are_missed_explain_a_low_rate():
     found = axis_troubles(state(link=LinkState.DEGRADED), faults(), health(1.0))
 
     assert said(found) == notice("the drive missed its latest polls")
-
-
-def test_the_console_says_it_in_the_same_words():
-    script = resources.files("ldcnd.console").joinpath("static/parts/problems.js").read_text(encoding="utf-8")
-    shown = [
-        axis_troubles(state(link=LinkState.DOWN), None, None),
-        axis_troubles(state(link=LinkState.DEGRADED), None, None),
-        axis_troubles(state(stop_latched=True), None, None),
-        axis_troubles(state(stop_pending=True), None, None),
-    ]
-
-    for (trouble,) in shown:
-        assert f'"{trouble.text[0].upper()}{trouble.text[1:]}."' in script
-    assert "The line is not up: " in script
-    for part in ("In error stop: ", "reset it to go on", "ewer samples a second than asked for:"):
-        assert part in script
