@@ -1,93 +1,136 @@
-"""How many files one thing passes on its way through the house: `python -m tests.house` runs it and prints the way.
+"""How the house looks to somebody who follows one thing through it: `python -m tests.house`.
 
-A poll, a move and a trace request run on a whole daemon, on the jumping clock. A file is entered when one of its
-functions is called from another file; a function that goes on after an await has not been entered again. The simulated
-line, the client and the memory session stand in for the world outside: neither they nor what they call for themselves
-is on the way. They come in through the `DOORS`.
+It prints the files that a poll, a move, a move of the console's page, and a trace request of each family pass, with
+how often each is entered. `--twins` prints pairs of classes that hold nearly the same fields, `--counts` how large the
+house is.
+
+The flows run on a whole daemon, on the jumping clock. A file is entered when one of its functions is called from
+another file; a function that goes on after an await has not been entered again. The simulated line, the client and the
+memory session stand in for the world outside: neither they nor what they call for themselves is on the way. They come
+in through the `DOORS`. For a move of the console's page the client is inside.
 """
 
 import argparse
+import ast
 import asyncio
+import dis
 import inspect
+import logging
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import combinations
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
+
+import click
+import structlog
 
 import ldcnd
+from ldcnd.cli.main import cli
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.model.commands import MoveAbsolute, Power, SetPosition
+from ldcnd.model.parameters import ReadAlarms
 from ldcnd.model.traces import TakeTrace
 from ldcnd.sim.jumping_loop import JumpingLoop
+from ldcnd.sim.smartstep.variant import SimulatedVariant
+from tests.support.console_rig import open_page, running_console
 from tests.support.rig import SIMULATED, RunningRig, running_rig
+from tests.support.trace_rig import trace_config
 
 PACKAGE = Path(ldcnd.__file__).parent
-OUTSIDE = ("sim/", "client/", "messaging/memory_session.py", "log.py")
+SESSION = "messaging/memory_session.py"
+OUTSIDE = ("sim/", SESSION, "log.py")
 DOORS = ("data_received", "admit", "offer", "reply")
 """What the world outside calls: bytes of the line, and a query with its answer."""
-PROLOGUE_BYTES = 4
-"""Of byte code before the body of a coroutine: RETURN_GENERATOR, POP_TOP, and RESUME, where it is when it begins."""
 AXIS = "x"
 SETTLED_S = 0.1
+TURN_S = 0.0005
 QUIET_HZ = 0.01
 """Of all polls while a command is followed, so that none of them mixes with it."""
+WINGS = (
+    "sim", "console", "lab", "bluesky", "epics", "ros2", "recording", "top", "ops", "pki", "planning", "bench", "scan",
+    "doctor", "accept", "commissioning", "commissioning_page", "tuning", "shadow", "testing", "twin", "port", "secop",
+)  # fmt: skip
+"""Folders and modules, wherever they lie, that are no part of the core."""
+LEAST_SHARED, SHARE = 4, 0.6
+"""How many fields two twins have in common at least, and which share of the smaller one's these are."""
 
 
 @dataclass(slots=True)
 class Way:
-    """The files that were entered.
+    """The functions by which files were entered.
 
     Attributes:
-        entered: in order, without the repetitions that follow each other.
-        times: how often each was entered.
+        outside: what begins the names of files that are not on the way.
+        calls: file and function of each entrance, in order.
+        handed: the last function of the house that called a function of the session, by the name of the latter.
     """
 
-    entered: list[str] = field(default_factory=list)
-    times: Counter[str] = field(default_factory=Counter)
+    outside: tuple[str, ...] = (*OUTSIDE, "client/")
+    calls: list[tuple[str, str]] = field(default_factory=list)
+    handed: dict[str, str] = field(default_factory=dict)
 
     def step(self, frame: FrameType) -> None:
         """Take note of a call."""
-        file = room(frame)
-        if file is None or _goes_on(frame) or _outside(frame):
+        file, caller = self._room(frame), frame.f_back and self._room(frame.f_back)
+        if file is None:
+            if caller and _file(frame) == SESSION:
+                self.handed[frame.f_code.co_name] = f"{caller} {frame.f_back.f_code.co_qualname}"  # type: ignore[union-attr]
             return
-        if frame.f_back and room(frame.f_back) == file:
-            return
-        self.times[file] += 1
-        if not self.entered or self.entered[-1] != file:
-            self.entered.append(file)
+        if file != caller and not _goes_on(frame) and not self._is_outside(frame):
+            self.calls.append((file, frame.f_code.co_qualname))
 
     @property
-    def files(self) -> list[str]:
-        """The files, in the order of their first entrance."""
-        return list(dict.fromkeys(self.entered))
+    def first(self) -> str:
+        """The function by which the way began."""
+        return " ".join(self.calls[0])
+
+    @property
+    def last(self) -> str:
+        """The function by which it ended: what handed its answer or sample to the session, or answered the browser."""
+        if self.outside == OUTSIDE:
+            return " ".join(self.calls[-1])
+        return self.handed.get("_answer") or self.handed["publish"]
+
+    @property
+    def times(self) -> Counter[str]:
+        """How often each file was entered, in the order of their first entrance."""
+        return Counter(file for file, _ in self.calls)
+
+    def _room(self, frame: FrameType) -> str | None:
+        file = _file(frame)
+        return None if file is None or file.startswith(self.outside) else file
+
+    def _is_outside(self, frame: FrameType) -> bool:
+        """Tell whether a function runs for the world outside: called by it, but not through a door."""
+        inner, caller = frame, frame.f_back
+        while caller and _file(caller):
+            if self._room(caller) is None:
+                return inner.f_code.co_name not in DOORS
+            inner, caller = caller, caller.f_back
+        return False
 
 
-def room(frame: FrameType) -> str | None:
-    """Return the file of the daemon that a frame runs in; None for everything else."""
+def _file(frame: FrameType) -> str | None:
+    """Return the file of the package that a frame runs in; None for everything else."""
     file = frame.f_code.co_filename
-    if not file.startswith(str(PACKAGE)):
-        return None
-    name = file[len(str(PACKAGE)) + 1 :]
-    return None if name.startswith(OUTSIDE) else name
-
-
-def _outside(frame: FrameType) -> bool:
-    """Tell whether a function runs for the world outside: called by it, but not through a door."""
-    inner, caller = frame, frame.f_back
-    while caller and caller.f_code.co_filename.startswith(str(PACKAGE)):
-        if room(caller) is None:
-            return inner.f_code.co_name not in DOORS
-        inner, caller = caller, caller.f_back
-    return False
+    return file[len(str(PACKAGE)) + 1 :] if file.startswith(str(PACKAGE)) else None
 
 
 def _goes_on(frame: FrameType) -> bool:
     """Tell whether a coroutine or generator goes on behind an await or a yield, rather than begins."""
     can_wait = frame.f_code.co_flags & (inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ASYNC_GENERATOR)
-    return bool(can_wait) and frame.f_lasti > PROLOGUE_BYTES
+    return bool(can_wait) and frame.f_lasti > _beginning(frame.f_code)
+
+
+@cache
+def _beginning(code: CodeType) -> int:
+    """Return where a coroutine is when it begins: its first RESUME, behind the making of cells."""
+    return next(each.offset for each in dis.get_instructions(code) if each.opname == "RESUME")
 
 
 @contextmanager
@@ -106,18 +149,19 @@ def followed(way: Way) -> Iterator[None]:
 
 
 def _config(hz: float) -> RigConfig:
-    """Return the simulated rig with nothing but one axis, polled this often."""
+    """Return the simulated rig, with one axis that is polled this often and others that are hardly polled."""
     document = load_config(SIMULATED).model_dump(mode="json", exclude_unset=True)
     bus = document["bus"][0]
-    bus["axis"] = [
-        axis | {"rates": dict.fromkeys(("position", "velocity", "adc", "state"), hz)} for axis in bus["axis"]
-    ]
-    bus["stop_probe_hz"] = 0
+    for axis in bus["axis"]:
+        axis["rates"] = dict.fromkeys(
+            ("position", "velocity", "adc", "state"), hz if axis["name"] == AXIS else QUIET_HZ
+        )
+    bus |= {"stop_probe_hz": 0, "coalesce_ms": 0}
     return RigConfig.model_validate(document)
 
 
 async def poll() -> Way:
-    """Follow one poll: from the bytes of its reply to the samples on their way, the next request included."""
+    """Follow one poll: from the bytes of its reply until the session has its samples, the next request included."""
     way = Way()
     async with running_rig(_config(50.0)) as rig:
         await asyncio.sleep(1.0)
@@ -125,20 +169,26 @@ async def poll() -> Way:
         before = line.statistics.replies
         with followed(way):
             while line.statistics.replies == before:
-                way.entered.clear()
-                way.times.clear()
-                await asyncio.sleep(0.0005)
+                way.calls.clear()
+                way.handed.clear()
+                await asyncio.sleep(TURN_S)
+            while "publish" not in way.handed:
+                await asyncio.sleep(TURN_S)
     return way
 
 
 @asynccontextmanager
 async def _ready() -> AsyncIterator[RunningRig]:
     async with running_rig(_config(QUIET_HZ)) as rig:
-        await rig.until(AXIS, lambda state: state.link == "up")
-        await rig.client.command(AXIS, Power(on=True))
-        await rig.client.command(AXIS, SetPosition(position=0.0))
-        await asyncio.sleep(SETTLED_S)  # what these were told is over
+        await _make_ready(rig)
         yield rig
+
+
+async def _make_ready(rig: RunningRig) -> None:
+    await rig.until(AXIS, lambda state: state.link == "up")
+    await rig.client.command(AXIS, Power(on=True))
+    await rig.client.command(AXIS, SetPosition(position=0.0))
+    await asyncio.sleep(SETTLED_S)  # the events of these are over
 
 
 async def _command(send: Callable[[RunningRig], Awaitable[object]]) -> Way:
@@ -154,12 +204,45 @@ async def move() -> Way:
     return await _command(lambda rig: rig.client.command(AXIS, MoveAbsolute(position=5.0)))
 
 
+async def console_move() -> Way:
+    """Follow a move of a page of the console: from its request to the response."""
+    way = Way(outside=OUTSIDE)
+    async with running_console(_config(QUIET_HZ)) as console:
+        await _make_ready(console.rig)
+        async with open_page(console.app, console.browser) as page:
+            await page.take("sim", AXIS)
+            await asyncio.sleep(SETTLED_S)
+            with followed(way):
+                answer = await page.post(f"/api/rigs/sim/axes/{AXIS}/move_absolute", {"position": 5.0})
+            assert answer.status == 200, answer.document
+    return way
+
+
 async def trace() -> Way:
     """Follow one trace request: from its query to the answer that the trace is armed."""
     return await _command(lambda rig: rig.client.command(AXIS, TakeTrace(channels=("position",), samples=10)))
 
 
-FLOWS = {"poll": poll, "move": move, "trace": trace}
+async def smartstep_trace() -> Way:
+    """Follow a request for a trace by a SmartStep's own recorder, to the answer that it is armed."""
+    way = Way()
+    config = trace_config(SimulatedVariant(), {}, loaded=False)
+    async with running_rig(config.model_copy(update={"bus": config.bus[1:]})) as rig:
+        await rig.until("feed", lambda state: state.link == "up")
+        await rig.client.command("feed", ReadAlarms())  # the client knows the axis from now on
+        await asyncio.sleep(SETTLED_S)
+        with followed(way):
+            await rig.client.command("feed", TakeTrace(channels=("speed_feedback",), samples=10))
+    return way
+
+
+FLOWS = {
+    "poll": poll,
+    "move": move,
+    "move of the console": console_move,
+    "trace": trace,
+    "trace of a SmartStep": smartstep_trace,
+}
 
 
 def way_of(name: str) -> Way:
@@ -168,15 +251,73 @@ def way_of(name: str) -> Way:
         return runner.run(FLOWS[name]())
 
 
+def classes() -> dict[str, frozenset[str]]:
+    """Return the fields of every class of the package, those that its body annotates, by file and name."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                targets = (each.target for each in node.body if isinstance(each, ast.AnnAssign))
+                fields = frozenset(each.id for each in targets if isinstance(each, ast.Name))
+                found[f"{path.relative_to(PACKAGE)} {node.name}"] = fields
+    return found
+
+
+def twins() -> list[tuple[str, str, frozenset[str]]]:
+    """Return pairs of classes with the fields that they share, most first."""
+    pairs = []
+    for (one, ours), (other, theirs) in combinations(classes().items(), 2):
+        shared = ours & theirs
+        if len(shared) >= LEAST_SHARED and len(shared) >= SHARE * min(len(ours), len(theirs)):
+            pairs.append((one, other, shared))
+    return sorted(pairs, key=lambda pair: -len(pair[2]))
+
+
+def counts() -> dict[str, int]:
+    """Return how large the house is."""
+    files = sorted(PACKAGE.rglob("*.py"))
+    lines = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in files}
+    return {
+        "lines of Python": sum(lines.values()),
+        "lines of the core": sum(count for file, count in lines.items() if not _is_wing(file)),
+        "files": len(files),
+        "classes": len(classes()),
+        "twins": len(twins()),
+        "CLI commands": _commands(cli, click.Context(cli)),
+    }
+
+
+def _is_wing(file: Path) -> bool:
+    parts = file.relative_to(PACKAGE).with_suffix("").parts
+    return any(part in WINGS or part.startswith("metrics") for part in parts)
+
+
+def _commands(command: click.Command, context: click.Context) -> int:
+    if not isinstance(command, click.Group):
+        return 1
+    found = (command.get_command(context, name) for name in command.list_commands(context))
+    return sum(_commands(each, click.Context(each, parent=context)) for each in found if each)
+
+
 def main() -> None:
-    """Print the files of each flow, in order, with how often each is entered."""
-    for name in FLOWS:
+    """Print the files of each flow, in order, with how often each is entered; or twins; or counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--twins", action="store_true", help="print pairs of classes that hold nearly the same fields")
+    parser.add_argument("--counts", action="store_true", help="print lines, files, classes, twins and commands")
+    options = parser.parse_args()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    if options.twins:
+        for one, other, shared in twins():
+            print(f"{len(shared):3} {one} / {other}: {', '.join(sorted(shared))}")
+    if options.counts:
+        for what, count in counts().items():
+            print(f"{count:6} {what}")
+    for name in () if options.twins or options.counts else FLOWS:
         way = way_of(name)
-        print(f"{name}: {len(way.files)} files, {sum(way.times.values())} entrances")
-        for file in way.files:
-            print(f"  {way.times[file]:3} {file}")
+        print(f"{name}: {len(way.times)} files, {len(way.calls)} entrances, from {way.first} to {way.last}")
+        for file, times in way.times.items():
+            print(f"  {times:3} {file}")
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
     main()
