@@ -281,8 +281,8 @@ def test_the_largest_rig_is_planned_in_no_time():
     document = config(axes=31, overload="skip").model_dump()
     for number, axis in enumerate(document["bus"][0]["axis"], 1):
         axis["rates"] = {"position": 8.0 + 0.37 * number}
-    began_s = time.perf_counter()
+    began_s = time.process_time()
 
     plan_rig(RigConfig.model_validate(document))
 
-    assert time.perf_counter() - began_s < 5.0
+    assert time.process_time() - began_s < 5.0
