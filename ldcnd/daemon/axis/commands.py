@@ -100,8 +100,12 @@ class AxisCommands:
         match request:
             case Power(on=True):
                 return await self._power_on(permit)
-            case MoveAbsolute() | MoveRelative() | MoveVelocity():
-                return await self._begin_move(permit, request)
+            case MoveAbsolute():
+                return await self._move_absolute(permit, request)
+            case MoveRelative():
+                return await self._move_relative(permit, request)
+            case MoveVelocity():
+                return await self._move_velocity(permit, request)
             case SetPosition():
                 return await self._set_position(permit, request.position)
             case SetGains():
@@ -112,15 +116,6 @@ class AxisCommands:
                 return await self._reset(permit, faults_only=request.faults_only)
             case _:
                 raise NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
-
-    async def _begin_move(self, permit: Permit, request: MoveAbsolute | MoveRelative | MoveVelocity) -> CommandReply:
-        match request:
-            case MoveAbsolute():
-                return await self._move_absolute(permit, request)
-            case MoveRelative():
-                return await self._move_relative(permit, request)
-            case MoveVelocity():
-                return await self._move_velocity(permit, request)
 
     def _procedure_for(self, permit: Permit, request: AxisCommand[CommandReply]) -> Procedure | None:
         """Return what carries out a request that takes more than one step."""
