@@ -15,7 +15,7 @@ def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(ord
     seen = shared(order, drives, Load.HALF, SECONDS)
 
     assert seen.commands == pytest.approx(0.5, abs=0.06)  # it varies with the instant at which the line came up
-    assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
+    assert 1.0 < seen.longest_rounds <= 1.01 * MOST_ROUNDS
     assert 0.5 < seen.longest_wait <= MOST_WAIT
 
 
@@ -26,4 +26,4 @@ def test_commands_that_always_wait_leave_every_axis_a_poll_in_two_rounds(order, 
 
     assert CALLERS > COMMANDS_PER_POLL
     assert seen.commands > 0.6
-    assert 1.0 < seen.longest_rounds <= MOST_ROUNDS
+    assert 1.0 < seen.longest_rounds <= 1.01 * MOST_ROUNDS
