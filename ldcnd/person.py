@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 
 from ldcnd.errors import LdcndError
+from ldcnd.number_text import NotANumber, read_number
 
 YES = ("y", "yes")
 NO = ("n", "no")
@@ -93,8 +94,8 @@ class Person(ABC):
 def typed_number(text: str) -> float | None:
     """Return a number that was typed; None for any other text, and for one that is too large or too small."""
     try:
-        number = float(text)
-    except ValueError:
+        number = read_number(text)
+    except NotANumber:
         return None
     return number if not number or LEAST <= abs(number) <= MOST else None
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from ldcnd.bus.bus import Bus
+from ldcnd.cli.typed import Finite, Whole
 from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.driver import Gains
 from ldcnd.families.family import TrialMove, Tries
@@ -18,6 +19,7 @@ from ldcnd.families.known import DEFAULT, FAMILIES
 from ldcnd.families.opened import show_findings
 from ldcnd.log import configure_logging
 from ldcnd.model.health import Finding, Verdict
+from ldcnd.number_text import NotANumber, read_whole
 from ldcnd.version import version
 from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
 
@@ -34,11 +36,11 @@ TRIED = {name: family for name, family in FAMILIES.items() if isinstance(family,
 @click.option("--family", type=click.Choice(list(TRIED)), default=DEFAULT, show_default=True)
 @click.option("--units", default="1", show_default=True, help="Unit numbers, as 1,2, of drives that have some.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("acceptance"), show_default=True)
-@click.option("--move", "address", type=click.IntRange(1, 127), help="Let the drive at this address move, too.")
+@click.option("--move", "address", type=Whole(1, 127), help="Let the drive at this address move, too.")
 @click.option("--gains", help=f"For the move: {GAINS}.")
-@click.option("--counts", type=int, default=2000, show_default=True, help="How far, there and back.")
-@click.option("--velocity", type=click.FloatRange(1), default=1000.0, show_default=True, help="Counts per second.")
-@click.option("--acceleration", type=click.FloatRange(1), default=10_000.0, show_default=True, help="Counts per s^2.")
+@click.option("--counts", type=Whole(), default=2000, show_default=True, help="How far, there and back.")
+@click.option("--velocity", type=Finite(1), default=1000.0, show_default=True, help="Counts per second.")
+@click.option("--acceleration", type=Finite(1), default=10_000.0, show_default=True, help="Counts per s^2.")
 @click.option("--list", "list_only", is_flag=True, help="Print the assumptions and what would confirm them, and end.")
 def command(  # noqa: PLR0917 - click passes them by name
     port: str | None,
@@ -93,7 +95,7 @@ def _list() -> None:
 
 def _numbers(units: str) -> tuple[int, ...]:
     try:
-        return tuple(int(number) for number in units.split(","))
+        return tuple(read_whole(number) for number in units.split(","))
     except ValueError:
         raise click.UsageError(f"--units: {units!r} is not like 1,2") from None
 
@@ -103,7 +105,10 @@ def _move(
 ) -> TrialMove | None:
     if address is None:
         return None
-    numbers = [int(number) for number in (gains or "").split(",") if number.strip().isdigit()]
+    try:
+        numbers = [read_whole(number) for number in gains.split(",")] if gains else []
+    except NotANumber as error:
+        raise click.UsageError(f"--gains: {error}") from None
     if len(numbers) != len(GAINS.split(",")):
         raise click.UsageError(f"--move needs --gains {GAINS}, as in the configuration of the axis")
     if not sys.stdin.isatty():

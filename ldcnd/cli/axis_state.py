@@ -6,7 +6,7 @@ import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.quantities import decimals, sample_text, state_word
-from ldcnd.cli.typed import axis_of
+from ldcnd.cli.typed import Whole, axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
@@ -41,7 +41,7 @@ def faults(target: Target, axis: str) -> None:
 @click.command()
 @click.argument("axis", type=AXIS, default="*")
 @click.option("--item", type=click.Choice([item.value for item in TelemetryItem]), help="Only this item.")
-@click.option("--count", type=click.IntRange(min=1), help="End after this many samples.")
+@click.option("--count", type=Whole(min=1), help="End after this many samples.")
 @with_target
 def watch(target: Target, axis: str, item: str | None, count: int | None) -> None:
     """Show the telemetry of AXIS, an axis or an I/O module (or of all), as it comes."""

@@ -8,7 +8,7 @@ import click
 
 from ldcnd.cli.connection import AXIS, of_options
 from ldcnd.cli.sending import Sender, Sent, commanding
-from ldcnd.cli.typed import Finite
+from ldcnd.cli.typed import Finite, Whole
 from ldcnd.model.commands import AxisCommand
 from ldcnd.model.frozen import attribute_docstrings
 
@@ -68,4 +68,4 @@ def _kind(annotation: object) -> click.ParamType[Any]:
     kind = kinds[0]
     if isinstance(kind, type) and issubclass(kind, Enum):
         return click.Choice([each.value for each in kind])
-    return click.INT if kind is int else Finite()
+    return Whole() if kind is int else Finite()

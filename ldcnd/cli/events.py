@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.typed import axis_of
+from ldcnd.cli.typed import Whole, axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
@@ -13,7 +13,7 @@ from ldcnd.model.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLE
 
 @click.command()
 @click.option("--axis", type=AXIS, help="Only this axis.")
-@click.option("--count", type=click.IntRange(1, 1000), default=50, show_default=True, help="Maximum number of events.")
+@click.option("--count", type=Whole(1, 1000), default=50, show_default=True, help="Maximum number of events.")
 @click.option("--follow", is_flag=True, help="Go on with those that come, until Ctrl-C; none is lost silently.")
 @with_target
 def command(target: Target, axis: str | None, count: int, *, follow: bool) -> None:

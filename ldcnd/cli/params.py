@@ -8,7 +8,8 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.parameter_file import LARGEST, ParameterFile, as_toml, load_parameters
+from ldcnd.cli.parameter_file import ParameterFile, as_toml, load_parameters
+from ldcnd.cli.typed import Whole
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.parameters import (
@@ -22,20 +23,18 @@ from ldcnd.model.parameters import (
     RestartEepromCount,
     WriteParameter,
 )
+from ldcnd.number_text import NotANumber, read_word
 
 UNFINISHED = 1
 """Exit code: files or memories differ, or not everything was written."""
 
 
 def _word(_context: click.Context, _parameter: click.Parameter, value: str) -> int:
-    """Return a word without sign, given in decimal or as 0x and hexadecimal digits."""
+    """Return a word without sign, given in decimal, or hexadecimal as 0x0101 or 0101H."""
     try:
-        word = int(value, 0)
-    except ValueError:
-        raise click.BadParameter(f"{value!r} is not a number") from None
-    if not 0 <= word <= LARGEST:
-        raise click.BadParameter(f"{value} is not 0 to {LARGEST}")
-    return word
+        return read_word(value)
+    except NotANumber as error:
+        raise click.BadParameter(str(error)) from None
 
 
 @click.group()
@@ -74,7 +73,7 @@ def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
 @click.argument("value", callback=_word)
 @click.option("--eeprom", is_flag=True, help="Write permanently; the memory endures 10,000 writes.")
 @click.option("--unlisted", is_flag=True, help="Allow a number that the manual does not list.")
-@click.option("--confirm-unit", type=click.IntRange(0, 15), help="The unit number that writing Pn000 leads to.")
+@click.option("--confirm-unit", type=Whole(0, 15), help="The unit number that writing Pn000 leads to.")
 @with_target
 def set_parameter(
     target: Target, axis: str, parameter: str, value: int, confirm_unit: int | None, *, eeprom: bool, unlisted: bool
@@ -178,9 +177,7 @@ def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
 
 @command.command("restart-count")
 @click.argument("axis", type=AXIS)
-@click.option(
-    "--writes", type=click.IntRange(0, 10_000), default=0, help="Writes that the new drive has taken already."
-)
+@click.option("--writes", type=Whole(0, 10_000), default=0, help="Writes that the new drive has taken already.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @with_target
 def restart_count(target: Target, axis: str, writes: int, *, yes: bool) -> None:

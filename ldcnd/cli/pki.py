@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from ldcnd.cli.typed import Whole
 from ldcnd.errors import ConfigError
 from ldcnd.pki.access import Role
 
@@ -39,7 +40,7 @@ def init(folder: Path, name: str) -> None:
 @click.option("--role", type=click.Choice([role.value for role in Role]), required=True, help="What it may do.")
 @click.option("--host", "hosts", multiple=True, help="Host name at which a daemon or router is found; may be repeated.")
 @click.option("--ip", "addresses", multiple=True, help="The same, an IP address.")
-@click.option("--days", type=click.IntRange(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
+@click.option("--days", type=Whole(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
 def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
     """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
     _require_cryptography()

@@ -10,6 +10,7 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
+from ldcnd.cli.typed import Whole
 from ldcnd.client.rig_client import RigClient
 
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -22,7 +23,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
     type=FILE,
     help="The file to write, NAME.mcap; strftime codes stand for the start in UTC: run-%Y%m%d-%H%M%S.mcap, %% for %.",
 )
-@click.option("--rotate-mb", type=click.IntRange(1), default=250, show_default=True, help="Begin a new file then.")
+@click.option("--rotate-mb", type=Whole(1), default=250, show_default=True, help="Begin a new file then.")
 @with_target
 def command(target: Target, out: Path | None, rotate_mb: int) -> None:
     """Record everything that a rig publishes until SIGTERM or SIGINT; a killed recorder loses one second at most."""

@@ -9,6 +9,7 @@ from typing import Any, Self, TextIO
 
 import click
 
+from ldcnd.cli.typed import Whole
 from ldcnd.config.simulated_line import FaultPlanConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.families.family import PacketCutter, ServedLine, ServesLines
@@ -75,7 +76,7 @@ command = click.Command(
             ["--fault-plan"], type=click.Path(path_type=Path), help="What else may go wrong on the wires (TOML)."
         ),
         click.Option(["--baud-check"], is_flag=True, help="Bytes at another rate than a module's are garbage to it."),
-        click.Option(["--seed"], type=int, help="Of everything that is random: instead of the file's, or of 1."),
+        click.Option(["--seed"], type=Whole(), help="Of everything that is random: instead of the file's, or of 1."),
         click.Option(
             ["--wire-log"],
             type=click.Path(path_type=Path),

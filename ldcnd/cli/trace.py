@@ -10,7 +10,7 @@ from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.output import show_passing
-from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.cli.typed import Finite, Whole, axis_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
@@ -25,6 +25,7 @@ from ldcnd.model.traces import (
     TraceTrigger,
     TriggerKind,
 )
+from ldcnd.number_text import NotANumber, read_number
 
 UPLOAD_S = 600.0
 """A drive's memory over a busy line takes minutes at worst."""
@@ -35,10 +36,10 @@ def _interval(_context: click.Context, _parameter: click.Parameter, value: str) 
     if value == FASTEST:
         return FASTEST
     try:
-        seconds = float(value)
-    except ValueError:
+        seconds = read_number(value)
+    except NotANumber:
         seconds = 0.0
-    if not 0.0 < seconds < float("inf"):
+    if seconds <= 0.0:
         raise click.BadParameter(f"{value!r} is neither seconds nor {FASTEST!r}")
     return seconds
 
@@ -50,7 +51,7 @@ def _trigger(_context: click.Context, _parameter: click.Parameter, value: str | 
     channel, _, rest = value.partition(":")
     kind, _, level = rest.partition(":")
     try:
-        return TraceTrigger(channel=channel, kind=TriggerKind(kind), level=float(level or 0.0))
+        return TraceTrigger(channel=channel, kind=TriggerKind(kind), level=read_number(level or "0"))
     except ValueError:
         kinds = ", ".join(TriggerKind)
         raise click.BadParameter(f"{value!r} is not CHANNEL:KIND:LEVEL with one of {kinds}") from None
@@ -62,7 +63,7 @@ def _full_scale(_context: click.Context, _parameter: click.Parameter, values: tu
     for value in values:
         channel, _, largest = value.partition(":")
         try:
-            scales[channel] = float(largest)
+            scales[channel] = read_number(largest)
         except ValueError:
             raise click.BadParameter(f"{value!r} is not CHANNEL:LARGEST") from None
     return scales
@@ -86,8 +87,8 @@ def command() -> None:
 @click.argument("axis", type=AXIS)
 @click.option("--channel", "-c", "channels", multiple=True, required=True, help="What to record; may be repeated.")
 @click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
-@click.option("--samples", type=click.IntRange(2, MOST_SAMPLES), default=500, help="How many samples [500].")
-@click.option("--pre", type=click.IntRange(0), default=0, help="Number of them before the trigger [0].")
+@click.option("--samples", type=Whole(2, MOST_SAMPLES), default=500, help="How many samples [500].")
+@click.option("--pre", type=Whole(0), default=0, help="Number of them before the trigger [0].")
 @click.option("--trigger", callback=_trigger, help=f"CHANNEL:KIND:LEVEL; kinds: {', '.join(TriggerKind)}.")
 @click.option("--full-scale", multiple=True, callback=_full_scale, help="CHANNEL:LARGEST, to resolve it finer.")
 @click.option("--timeout", type=Finite(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")

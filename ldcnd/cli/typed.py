@@ -1,6 +1,5 @@
-"""Typed input: names with the nearest right one, finite numbers."""
+"""Typed input: names with the nearest right one, and numbers as `ldcnd.number_text` reads them."""
 
-import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -9,6 +8,7 @@ import click
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import UnknownAxis
 from ldcnd.model.meta import AxisInfo
+from ldcnd.number_text import NotANumber, read_number, read_whole
 
 NEAR = 0.4
 """How alike two names must be, from 0 to 1."""
@@ -44,10 +44,27 @@ class Finite(click.FloatRange):
 
     def convert(self, value: float | str, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return it; wrong usage if it is none."""
-        number = float(super().convert(value, param, ctx))  # type: ignore[arg-type]  # click hands over text
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number.", param, ctx)
-        return number
+        try:
+            number = read_number(value) if isinstance(value, str) else value
+        except NotANumber as error:
+            self.fail(f"{error}.", param, ctx)
+        return float(super().convert(number, param, ctx))
+
+    def _describe_range(self) -> str:
+        """Return its limits for help; nothing without limits."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
+
+class Whole(click.IntRange):
+    """A whole number, within limits if there are any."""
+
+    def convert(self, value: int | str, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return it; wrong usage if it is none."""
+        try:
+            number = read_whole(value) if isinstance(value, str) else value
+        except NotANumber as error:
+            self.fail(f"{error}.", param, ctx)
+        return int(super().convert(number, param, ctx))
 
     def _describe_range(self) -> str:
         """Return its limits for help; nothing without limits."""

@@ -32,7 +32,7 @@ from ldcnd.log import get_logger
 from ldcnd.messaging.codec import error_reply
 from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
 from ldcnd.model.frozen import Frozen
-from ldcnd.model.leases import Acquire
+from ldcnd.model.leases import Acquire, ListHolders
 from ldcnd.model.rig_commands import MoveTogether, MoveTogetherReply
 from ldcnd.model.samples import Moving
 
@@ -61,6 +61,8 @@ class Lost(Frozen):
     """The axis."""
     message: str
     """Why it has no control any more."""
+    taken_by: str | None = None
+    """The client that controls the axis instead; missing where none does."""
 
 
 class PageJog(Frozen):
@@ -284,7 +286,17 @@ class PageControl:
             del self._held[rig, axis]
             why = control.lost.message if control.lost else ""
             log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
-            self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=why)))
+            taker = await self._holder(rig, axis)
+            self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=why, taken_by=taker)))
+
+    async def _holder(self, rig: str, axis: str) -> str | None:
+        """Return who controls an axis that this page has lost; None where none does, or the daemon does not answer."""
+        try:
+            reply = await self._rigs.client(rig).ask(ListHolders())
+        except LdcndError:
+            return None
+        holder = next((each.client for each in reply.holders if each.axis == axis), None)
+        return None if holder == self.client else holder
 
 
 class Pages:

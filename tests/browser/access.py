@@ -5,15 +5,29 @@ from collections.abc import Mapping
 from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Page
 
-SCREENS = {"phone": (390, 844), "zoomed to 200 %": (640, 400), "laptop": (1280, 800), "large": (1920, 1080)}
+SCREENS = {
+    "phone": (390, 844),
+    "zoomed to 200 %": (640, 400),
+    "laptop": (1280, 800),
+    "desktop": (1440, 900),
+    "large": (1920, 1080),
+}
 """Widths and heights in pixels of the page; a laptop's screen has half as many at a zoom of 200 %."""
 FITS = """
 (width) => {
   const wrong = [];
   const page = document.documentElement.scrollWidth;
   if (page > width) wrong.push(`the page is ${page} wide`);
-  for (const field of document.querySelectorAll("input[type=number], select"))
-    if (field.clientWidth < 60) wrong.push(`${field.ariaLabel ?? field.id} is ${field.clientWidth} wide`);
+  for (const field of document.querySelectorAll("input[inputmode=decimal], select"))
+  {
+    let { left, right } = field.getBoundingClientRect();
+    for (let around = field.parentElement; around; around = around.parentElement) {
+      if (getComputedStyle(around).overflowX === "visible") continue;
+      const box = around.getBoundingClientRect();
+      [left, right] = [Math.max(left, box.left), Math.min(right, box.right)];
+    }
+    if (right - left < 60) wrong.push(`${Math.round(right - left)} of ${field.ariaLabel ?? field.id} can be seen`);
+  }
   for (const link of document.querySelectorAll("nav a")) {
     const box = link.getBoundingClientRect();
     if (box.left < 0 || box.right > width) wrong.push(`the link ${link.textContent} is off the screen`);

@@ -10,10 +10,12 @@ import { RigPage } from "./pages/rig.js";
 import { ScopePage } from "./pages/scope.js";
 import { TracePage } from "./pages/trace.js";
 import { TuningPage } from "./pages/tuning.js";
+import { number } from "./parts/format.js";
 import { problems } from "./parts/problems.js";
 import { Mark } from "./parts/state.js";
+import { overrideOf, slowed } from "./pages/rig_speed.js";
 import { StopAll } from "./parts/stop_all.js";
-import { controlled, dismissLost, keepControl, lost } from "./session/control.js";
+import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { feed } from "./session/feed.js";
 import { commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
 
@@ -50,14 +52,18 @@ function Summary() {
     ${feed.live ? "" : html`<${Mark} level="bad">No data from the console process<//> `}
     <${Mark} level=${worst}>
       ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : "Nothing needs attention"}<//>
+    ${[...rigs.values()].filter(slowed).map((rig) => html`<${Mark} level="warn"
+      >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": nothing moves" : ""}<//> `)}
     ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
   </p>`;
 }
 
 function Notices() {
-  return html`<div role="alert">
+  return html`<div class="notices" role="alert">
     ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
-    ${lost && html`<p class="notice mark" data-level="bad">${lost}
+    ${[...rigs.values()].filter((rig) => rig.worth).map((rig) => html`<p class="notice mark" key=${rig.name} data-level="bad"
+      >${rig.name}: no values. ${rig.worth.why}</p>`)}
+    ${lost.size > 0 && html`<p class="notice mark" data-level="bad">${lostInWords().join(" ")}
       <button type="button" class="plain" onClick=${dismissLost}>Dismiss</button></p>`}
   </div>`;
 }
@@ -85,8 +91,8 @@ function Console() {
   const [, title, Page] = PAGES.find(([page]) => page === at.page) ?? ["axis", at.axis ?? "Axis", AxisPage];
   useEffect(() => {
     const place = at.page === "axis" ? `Axis ${at.axis}` : title;
-    document.title = `${lost ? "Control lost – " : ""}${place} – ldcnd`;
-  }, [at.page, at.axis, lost]);
+    document.title = `${lost.size ? "Control lost – " : ""}${place} – ldcnd`;
+  }, [at.page, at.axis, lost.size]);
 
   return html`<a class="skip" href="#main" onClick=${(event) => {
     event.preventDefault();
@@ -97,9 +103,9 @@ function Console() {
       <${Navigation} at=${at} />
       <${Summary} />
       <${StopAll} />
+      <${Notices} />
     </header>
     <main id="main" tabindex="-1" ref=${main}>
-      <${Notices} />
       <${Guarded} key=${location.hash}><${Page} at=${at} /><//>
     </main>`;
 }

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.smartstep.parameters import find_parameter
+from ldcnd.number_text import NotANumber, read_word
 from ldcnd.person import Left, Person
 from ldcnd.tuning.smartstep.session import GAINS, SmartStepTuning, try_gains
 
@@ -59,7 +60,10 @@ def typed(text: str) -> tuple[str, int] | None:
     """Return number and value of a parameter from `EXAMPLE`; None from anything else."""
     name, _, value = text.partition("=")
     parameter = find_parameter(name)
-    return (parameter.label, int(value)) if parameter and value.isdecimal() else None
+    try:
+        return (parameter.label, read_word(value)) if parameter else None
+    except NotANumber:
+        return None
 
 
 def plan(wanted: Mapping[str, int]) -> str:

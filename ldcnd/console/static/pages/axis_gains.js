@@ -3,6 +3,8 @@
 import { html, useId, useState } from "../html.js";
 import { Action, Panel, Reason, Table } from "../parts/controls.js";
 import { number, words } from "../parts/format.js";
+import { NumberField, unread } from "../parts/number_field.js";
+import { Unread } from "../parts/number_text.js";
 import { Mark } from "../parts/state.js";
 import { GAINS } from "../session/contract.js";
 import { command } from "../session/control.js";
@@ -36,16 +38,15 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
     Object.entries(wanted).filter(([name, value]) => value !== null && value !== gains[name]?.value),
   );
   const count = Object.keys(changes).length;
-  const way = obstacle(axis, "set_gains") ?? (count ? null : "No new value differs from the present one.");
+  const way = obstacle(axis, "set_gains") ?? unread(wanted) ?? (count ? null : "No new value differs from the present one.");
 
   const rows = Object.values(gains).map(
     ({ name, value, provenance }) => html`<tr key=${name}>
     <th scope="row">${name} <small>${GAINS[name].title}</small></th>
     <td class="number">${number(value, 0)} <small><${ProvenanceWord} provenance=${provenance} /></small></td>
-    <td><input type="number" min=${GAINS[name].min} max=${GAINS[name].max} step="1" aria-label=${`New ${name}`}
-      value=${wanted[name] ?? ""}
-      onInput=${({ target }) => setWanted({ ...wanted, [name]: target.value === "" ? null : Number(target.value) })} />
-      <small>${GAINS[name].min} to ${GAINS[name].max} ${GAINS[name].unit}</small></td>
+    <td><${NumberField} plain label=${`New ${name}`} whole min=${GAINS[name].min} max=${GAINS[name].max}
+      value=${wanted[name]} onChange=${(value) => setWanted((last) => ({ ...last, [name]: value }))}
+      hint=${`${GAINS[name].min} to ${GAINS[name].max}`} /></td>
   </tr>`,
   );
 
@@ -61,7 +62,7 @@ export function GainsTable({ axis, wanted: given, onWanted }) {
       ${
         count
           ? `Write ${Object.entries(changes)
-              .map(([name, value]) => `${name} = ${value}`)
+              .map(([name, value]) => `${name} = ${value instanceof Unread ? "?" : value}`)
               .join(", ")}`
           : "Write gains"
       }<//></p>

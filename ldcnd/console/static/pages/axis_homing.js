@@ -1,7 +1,8 @@
 /** Homing with every condition; what is left empty comes from the axis's configuration. */
 
 import { html, useId, useState } from "../html.js";
-import { Action, Choice, Field, Panel, Reason } from "../parts/controls.js";
+import { Action, Choice, Panel, Reason } from "../parts/controls.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { HOME_METHODS, HOME_STOPS } from "../session/contract.js";
 import { words } from "../parts/format.js";
 import { command } from "../session/control.js";
@@ -14,13 +15,13 @@ export function HomePanel({ axis }) {
   const [values, setValues] = useState({});
   const [name, setName] = useState(0);
   const [toHome, toSet] = [useId(), useId()];
-  const set = (field) => (value) => setValues({ ...values, [field]: value === "" ? null : value });
+  const set = (field) => (value) => setValues((last) => ({ ...last, [field]: value === "" ? null : value }));
   const { unit } = axis.info;
   const empty = { hint: "empty: as configured" };
   const field = (label, of, key) =>
-    html`<${Field} label=${label} unit=${of} value=${values[key]} onChange=${set(key)} ...${empty} />`;
-  const way = obstacle(axis, "home");
-  const naming = obstacle(axis, "set_position") ?? (name === null ? "A position is missing." : null);
+    html`<${NumberField} label=${label} unit=${of} value=${values[key]} onChange=${set(key)} ...${empty} />`;
+  const way = obstacle(axis, "home") ?? unread(values);
+  const naming = obstacle(axis, "set_position") ?? unread({ Position: name }) ?? (name === null ? "A position is missing." : null);
 
   return html`<${Panel} title="Home">
     <div class="fields">
@@ -42,7 +43,8 @@ export function HomePanel({ axis }) {
     ${
       axis.can("set_position") &&
       html`<h3>Or set current position</h3>
-      <div class="fields"><${Field} label="Current position is" unit=${unit} value=${name} onChange=${setName} /></div>
+      <div class="fields"><${NumberField} label="Current position is" unit=${unit} value=${name} onChange=${setName}
+        meaning=${(text) => `${axis.name} then stands at ${text}`} /></div>
       <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} obstacle=${naming}
         reason=${toSet} title="Nothing moves; afterwards the axis counts as homed">Set position<//></p>
       ${naming && html`<${Reason} id=${toSet} text=${naming} />`}`

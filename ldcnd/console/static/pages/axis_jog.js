@@ -1,7 +1,8 @@
 /** Jog: run for as long as a button or an arrow key is held, or move by a step. */
 
 import { html, useId, useState } from "../html.js";
-import { Action, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
+import { Action, Panel, Reason, RefusalText } from "../parts/controls.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { number } from "../parts/format.js";
 import { HoldButton } from "../parts/hold_button.js";
 import { beginJog, command, endJog, jogRefusal } from "../session/control.js";
@@ -15,13 +16,13 @@ export function JogPanel({ axis }) {
   const [speed, setSpeed] = useState(axis.info.limits.velocity * FIRST_SHARE);
   const reason = useId();
   const { unit } = axis.info;
-  const missing = speed > 0 ? null : "A speed above 0 is missing.";
+  const missing = unread({ Speed: speed }) ?? (speed > 0 ? null : "A speed above 0 is missing.");
   const way = obstacle(axis, "jog", true) ?? missing;
   const stepWay = obstacle(axis, "move_relative") ?? missing;
 
   return html`<${Panel} title="Jog" note="Runs while you hold a button or, with a button focused, an arrow key; letting go halts.">
     <div class="fields">
-      <${Field} label="Speed" unit=${`${unit}/s`} value=${speed} onChange=${setSpeed} min="0" />
+      <${NumberField} label="Speed" unit=${`${unit}/s`} value=${speed} onChange=${setSpeed} min=${0} />
     </div>
     <p class="row jog" role="group" aria-label=${`Jog ${axis.name}`}>
       <${HoldButton} begin=${() => beginJog(axis, -speed)} end=${endJog} keys=${["ArrowLeft"]} obstacle=${way}

@@ -1,10 +1,11 @@
 /** Motions of an axis, each previewed by the daemon before it is commanded. */
 
 import { html, useEffect, useId, useState } from "../html.js";
-import { Action, Choice, enterSends, Field, Panel, Reason, RefusalText } from "../parts/controls.js";
+import { Action, Choice, enterSends, Panel, Reason, RefusalText, useOnce } from "../parts/controls.js";
 import { decimalsOf, duration, number } from "../parts/format.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { command, question } from "../session/control.js";
-import { obstacle } from "../session/obstacles.js";
+import { moves, obstacle } from "../session/obstacles.js";
 
 const PAUSE_MS = 250;
 /** Registers are whole numbers; so large a share of a value is worth a word. */
@@ -15,6 +16,7 @@ const KINDS = {
     field: "position",
     label: "Position",
     unit: (unit) => unit,
+    meaning: (axis, text) => `moves ${axis} to ${text}`,
     previewed: true,
   },
   move_relative: {
@@ -22,6 +24,7 @@ const KINDS = {
     field: "distance",
     label: "Distance",
     unit: (unit) => unit,
+    meaning: (axis, text) => `moves ${axis} by ${text}`,
     previewed: true,
   },
   move_velocity: {
@@ -29,9 +32,10 @@ const KINDS = {
     field: "velocity",
     label: "Velocity",
     unit: (unit) => `${unit}/s`,
+    meaning: (axis, text) => `runs ${axis} at ${text}`,
     previewed: true,
   },
-  set_pwm: { title: "with a raw duty", field: "duty", label: "Duty, −1 to 1", unit: () => "", previewed: false },
+  set_pwm: { title: "with a raw duty", field: "duty", label: "Duty, −1 to 1", unit: () => "", previewed: false, min: -1, max: 1 },
   move_analog: {
     title: "to a sensor value",
     field: "target",
@@ -63,26 +67,32 @@ export function MovePanel({ axis }) {
   const [verb, setVerb] = useState(kinds[0]);
   const [values, setValues] = useState({});
   const reason = useId();
-  const { field, label, unit, previewed } = KINDS[verb];
-  const set = (name) => (value) => setValues({ ...values, [name]: value });
+  const { field, label, unit, previewed, meaning, min, max } = KINDS[verb];
+  const once = useOnce();
+  const set = (name) => (value) => setValues((last) => ({ ...last, [name]: value }));
   const body = bodyOf(verb, values);
-  const missing = body === null ? `${label} is missing.` : null;
-  const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing;
+  const missing = unread(usedBy(verb, values)) ?? (body === null ? `${label} is missing.` : null);
+  const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing ?? once.obstacle(body, moves(axis));
+  const move = () => {
+    once.note(body);
+    return command(axis, verb, body);
+  };
 
   return html`<${Panel} title="Move">
     <div class="fields" onKeyDown=${enterSends}>
       <${Choice} label="Move" options=${kinds.map((each) => [each, KINDS[each].title])} value=${verb}
         onChange=${setVerb} />
-      <${Field} label=${label} unit=${unit(axis.info.unit)} value=${values[field]} onChange=${set(field)} />
+      <${NumberField} key=${verb} label=${label} unit=${unit(axis.info.unit)} value=${values[field]} onChange=${set(field)}
+        min=${min} max=${max} meaning=${meaning && ((text) => meaning(axis.name, text))} />
       ${
         verb === "set_pwm"
-          ? html`<${Field} label="For" unit="s" value=${values.duration_s} onChange=${set("duration_s")} />`
+          ? html`<${NumberField} key="for" label="For" unit="s" value=${values.duration_s} onChange=${set("duration_s")} />`
           : html`${
               verb !== "move_velocity" &&
-              html`<${Field} label="Velocity" unit=${`${axis.info.unit}/s`} value=${values.speed}
+              html`<${NumberField} key="speed" label="Velocity" unit=${`${axis.info.unit}/s`} value=${values.speed}
               onChange=${set("speed")} hint="empty: the axis default" />`
             }
-            <${Field} label="Acceleration" unit=${`${axis.info.unit}/s²`} value=${values.acceleration}
+            <${NumberField} key="acceleration" label="Acceleration" unit=${`${axis.info.unit}/s²`} value=${values.acceleration}
               onChange=${set("acceleration")} hint="empty: the axis default" />`
       }
       ${
@@ -92,24 +102,39 @@ export function MovePanel({ axis }) {
       }
       ${
         verb === "move_analog" &&
-        html`<${Field} label="For at most" unit="s" value=${values.timeout_s} onChange=${set("timeout_s")}
+        html`<${NumberField} key="timeout" label="For at most" unit="s" value=${values.timeout_s} onChange=${set("timeout_s")}
             hint="empty: as configured" />
-          <${Field} label="Distance at most" unit=${axis.info.unit} value=${values.reach} onChange=${set("reach")}
+          <${NumberField} key="reach" label="Distance at most" unit=${axis.info.unit} value=${values.reach} onChange=${set("reach")}
             hint="empty: as configured" />`
       }
       ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING}
         value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
     </div>
     ${previewed && html`<${Preview} axis=${axis} body=${body} field=${field} onNearest=${set(field)} />`}
-    <p class="row"><${Action} act=${() => command(axis, verb, body)} obstacle=${way} reason=${reason}
-      kind="main">Move<//></p>
+    <p class="row"><${Action} act=${move} obstacle=${way} reason=${reason}
+      kind="main" outcome=${(reply) => outcomeOf(axis, reply)}>Move<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
 }
 
-/** Return what the verb carries, or null while its main value is missing. */
+/** Return the values that a verb would send, by what their fields are called. */
+function usedBy(verb, values) {
+  const { field, label } = KINDS[verb];
+  const main = { [label]: values[field] };
+  if (verb === "set_pwm") return { ...main, For: values.duration_s };
+  const limits = { ...(verb !== "move_velocity" && { Velocity: values.speed }), Acceleration: values.acceleration };
+  const ends = verb === "move_analog" && { "For at most": values.timeout_s, "Distance at most": values.reach };
+  return { ...main, ...limits, ...ends };
+}
+
+function outcomeOf(axis, { position }) {
+  return position == null ? "Accepted." : `Accepted: ${axis.name} moves to ${position} ${axis.info.unit}.`;
+}
+
+/** Return what the verb carries, or null while a value is missing or cannot be read. */
 function bodyOf(verb, values) {
   const { field } = KINDS[verb];
+  if (unread(usedBy(verb, values))) return null;
   if (values[field] === null || values[field] === undefined) return null;
   if (verb === "set_pwm") return values.duration_s ? { duty: values.duty, duration_s: values.duration_s } : null;
   const body = { [field]: values[field], acceleration: values.acceleration ?? null };

@@ -2,7 +2,8 @@
 
 import { html, useEffect, useMemo, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
-import { Field, Panel, RefusalText, Table } from "../parts/controls.js";
+import { Panel, RefusalText, Table } from "../parts/controls.js";
+import { TextField } from "../parts/number_field.js";
 import { Curve } from "../parts/curve.js";
 import { CopiedCommand, Lines, QuestionPart } from "../parts/person.js";
 import { Mark } from "../parts/state.js";
@@ -106,7 +107,7 @@ function AxisChecklist({ name, overview }) {
     ${!overview.connected && html`<${Daemon} overview=${overview} />`}
     <${Activity} talk=${talk} title=${running?.title ?? "Last step"} overview=${overview} />
     <${Panel} title="Checklist" note="In this order the steps build on each other. Leave whenever you like: what is settled stays.">
-      <div class="fields"><${Field} label="Your name, for the report" type="text" value=${by} onChange=${named} maxlength="64" /></div>
+      <div class="fields"><${TextField} label="Your name, for the report" value=${by || null} onChange=${named} maxlength="64" /></div>
       ${view.running && html`<p class="reason">${running?.title} is going on; the others wait.</p>`}
       <ol class="checklist">
         ${view.steps.map((step) => html`<${Step} key=${step.name} step=${step} talk=${talk} by=${by} />`)}

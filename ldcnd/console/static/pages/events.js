@@ -1,7 +1,8 @@
 /** What has happened: every command of every rig, how it ended, and who sent it. */
 
 import { html, useEffect, useState } from "../html.js";
-import { Action, Choice, Field, Panel, RefusalText, Table } from "../parts/controls.js";
+import { Action, Choice, Panel, RefusalText, Table } from "../parts/controls.js";
+import { TextField } from "../parts/number_field.js";
 import { save } from "../parts/chart_view.js";
 import { dateAndClock, words } from "../parts/format.js";
 import { faultPage, Mark } from "../parts/state.js";
@@ -25,7 +26,7 @@ export function EventsPage() {
     for (const rig of all) if (rig.connected) earlier(rig).catch(setRefusal);
   }, [connected]);
 
-  const set = (name) => (value) => setOnly({ ...only, [name]: value ?? "" });
+  const set = (name) => (value) => setOnly((last) => ({ ...last, [name]: value ?? "" }));
   const axes = all
     .flatMap((rig) => [...rig.axes.values()])
     .map((axis) => [`${axis.rig.name}/${axis.name}`, `${axis.rig.name} · ${axis.name}`]);
@@ -40,7 +41,7 @@ export function EventsPage() {
         <${Choice} label="Axis" options=${[["", "all"], ...axes]} value=${only.axis} onChange=${set("axis")} />
         <${Choice} label="Status" options=${[["", "all"], ...COMMAND_STATUSES.map((each) => [each, each])]}
           value=${only.status} onChange=${set("status")} />
-        <${Field} label="Find" type="search" value=${only.text} onChange=${set("text")} />
+        <${TextField} label="Find" type="search" value=${only.text || null} onChange=${set("text")} />
       </div>
       <p class="row"><${Action} act=${() => save(new Blob([csvOf(found)], { type: "text/csv" }), "events.csv")}
         obstacle=${found.length ? null : "There is nothing to save."}>Save CSV<//></p>

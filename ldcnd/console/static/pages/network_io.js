@@ -1,8 +1,9 @@
 /** What one packet does to a whole line: a snapshot of all positions and inputs; and its PIC-I/O modules. */
 
 import { html, useState } from "../html.js";
-import { Action, Choice, Field, Panel, Table } from "../parts/controls.js";
+import { Action, Choice, Panel, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { ofRig } from "../session/control.js";
 
 const BECOMES = [
@@ -55,14 +56,14 @@ function Module({ rig, name }) {
     <div class="fields">
       <${Choice} label="Line" options=${LINES} value=${line} onChange=${setLine} />
       <${Choice} label="Becomes" options=${BECOMES} value=${becomes} onChange=${setBecomes} />
-      <${Field} label="PWM 1" value=${pwm.pwm1} onChange=${(pwm1) => setPwm({ ...pwm, pwm1 })} hint="0 to 1; empty: as it is" />
-      <${Field} label="PWM 2" value=${pwm.pwm2} onChange=${(pwm2) => setPwm({ ...pwm, pwm2 })} hint="0 to 1; empty: as it is" />
+      <${NumberField} label="PWM 1" value=${pwm.pwm1} min=${0} max=${1} onChange=${(pwm1) => setPwm((last) => ({ ...last, pwm1 }))} hint="0 to 1; empty: as it is" />
+      <${NumberField} label="PWM 2" value=${pwm.pwm2} min=${0} max=${1} onChange=${(pwm2) => setPwm((last) => ({ ...last, pwm2 }))} hint="0 to 1; empty: as it is" />
       <${Choice} label="Counts" options=${TIMER} value=${counts} onChange=${setCounts} />
     </div>
     <p class="row">
       <${Action} act=${() => told("set_io")} onDone=${setShown}>Read ${name}<//>
       <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line)] })} onDone=${setShown}>Set line ${line}<//>
-      <${Action} act=${() => told("set_io", pwm)} onDone=${setShown}>Set PWM<//>
+      <${Action} act=${() => told("set_io", pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })} onDone=${setShown}>Set PWM<//>
       <${Action} act=${() => told("set_io_timer", { mode: counts })} onDone=${setShown}>Count<//>
     </p>
     ${shown && html`<p role="status">Lines: ${levelsOf(shown.levels)}. Outputs: ${shown.outputs ? shown.outputs.join(", ") || "none" : "not known"}.</p>`}

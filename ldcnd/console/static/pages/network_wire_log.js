@@ -2,7 +2,8 @@
 
 import { html, useState } from "../html.js";
 import { save } from "../parts/chart_view.js";
-import { Action, Choice, Field } from "../parts/controls.js";
+import { Action, Choice } from "../parts/controls.js";
+import { TextField } from "../parts/number_field.js";
 import { ask, rigPath } from "../session/api.js";
 
 const SPANS = [1, 5, 30, 300];
@@ -18,7 +19,7 @@ export function WireLog({ rig, bus }) {
     <div class="fields">
       <${Choice} label="How far back" options=${SPANS.map((each) => [each, `${each} s`])} value=${seconds}
         onChange=${(value) => setSeconds(Number(value))} />
-      <${Field} label="Only lines with" type="search" value=${only} onChange=${(text) => setOnly(text ?? "")} />
+      <${TextField} label="Only lines with" type="search" value=${only || null} onChange=${(text) => setOnly(text ?? "")} />
     </div>
     <p class="row">
       <${Action} act=${() => fetchLog(rig, bus, seconds)} onDone=${setLines}

@@ -2,7 +2,8 @@
 
 import { html, useEffect, useState } from "../html.js";
 import { save } from "../parts/chart_view.js";
-import { Action, Choice, Field, Panel, RefusalText, Table, Tick } from "../parts/controls.js";
+import { Action, Choice, Panel, RefusalText, Table, Tick } from "../parts/controls.js";
+import { NumberField, TextField, unread } from "../parts/number_field.js";
 import { Mark } from "../parts/state.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -65,7 +66,7 @@ function Memories({ axis }) {
       </p>
       <${FilePicker} file=${file} onFile=${setFile} />
       <div class="fields">
-        <${Field} label="Find" type="search" value=${only.text}
+        <${TextField} label="Find" type="search" value=${only.text || null}
           onChange=${(text) => setOnly({ ...only, text: text ?? "" })} />
         <${Tick} label="Only what differs" checked=${only.differing}
           onChange=${(differing) => setOnly({ ...only, differing })} />
@@ -157,7 +158,9 @@ function Change({ axis, values, listed, onWritten }) {
   const held = values.find((each) => each.parameter === set.parameter);
   const word = set.text === undefined ? undefined : wordOf(set.text);
   const way =
-    obstacle(axis, "write_parameter") ?? (word === undefined ? "A value from 0 to 65535 is missing." : null);
+    obstacle(axis, "write_parameter") ??
+    unread({ "New unit number": set.confirm_unit }) ??
+    (word === undefined ? "A value from 0 to 65535 is missing." : null);
   const write = () => {
     const { parameter, memory, confirm_unit } = set;
     return command(axis, "write_parameter", { parameter, memory, confirm_unit, value: word });
@@ -167,15 +170,15 @@ function Change({ axis, values, listed, onWritten }) {
     <div class="fields">
       <${Choice} label="Parameter" options=${values.map((each) => [each.parameter, `${each.parameter} ${each.name}`])}
         value=${set.parameter} onChange=${select} />
-      <${Field} label="New value" type="text" unit=${info?.unit ?? ""} value=${set.text}
-        onChange=${(text) => setSet({ ...set, text: text ?? undefined })}
-        hint=${word === undefined ? "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} />
+      <${TextField} label=${html`New value${info?.unit && html` <span class="unit">${info.unit}</span>`}`} value=${set.text ?? null}
+        onChange=${(text) => setSet((last) => ({ ...last, text: text ?? undefined }))}
+        hint=${word === undefined ? set.text ? html`<span class="unread">“${set.text}” is not 0 to 65535, nor 0x0000 to 0xFFFF</span>` : "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} invalid=${set.text !== undefined && word === undefined} />
       <${Choice} label="Memory" options=${MEMORIES} value=${set.memory}
         onChange=${(memory) => setSet({ ...set, memory })} />
       ${
         set.parameter === "Pn000" &&
-        html`<${Field} label="New unit number, if it changes" value=${set.confirm_unit} min="0" max="15" step="1"
-        onChange=${(unit) => setSet({ ...set, confirm_unit: unit ?? null })} />`
+        html`<${NumberField} label="New unit number, if it changes" value=${set.confirm_unit} whole min=${0} max=${15}
+        onChange=${(unit) => setSet((last) => ({ ...last, confirm_unit: unit ?? null }))} />`
       }
     </div>
     ${

@@ -1,10 +1,11 @@
 /** Moves of a group: axes that start in the same servo cycle, or none of them. */
 
 import { html, useId, useState } from "../html.js";
-import { Action, enterSends, Field, Panel, Reason, Tick } from "../parts/controls.js";
+import { Action, enterSends, Panel, Reason, Tick, useOnce } from "../parts/controls.js";
 import { decimalsOf, number } from "../parts/format.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { moveTogether, previewLine } from "../session/control.js";
-import { obstacle } from "../session/obstacles.js";
+import { moves, obstacle } from "../session/obstacles.js";
 
 /** A panel for each group of a rig. */
 export function GroupMoves({ rig }) {
@@ -21,24 +22,31 @@ function GroupMove({ group, axes }) {
   const [straight, setStraight] = useState(false);
   const [line, setLine] = useState(null);
   const reason = useId();
+  const once = useOnce();
+  const body = unread({ ...targets, Velocity: speed }) ? null : { targets, speed, straight };
   const hindered = axes.find((axis) => obstacle(axis, "move_absolute"));
   const missing = axes.find(({ name }) => targets[name] === null || targets[name] === undefined);
   const way = hindered
     ? `${hindered.name}: ${obstacle(hindered, "move_absolute")}`
-    : missing && `The position of ${missing.name} is missing.`;
+    : (unread({ ...targets, Velocity: speed }) ??
+      (missing ? `The position of ${missing.name} is missing.` : once.obstacle(body, axes.some(moves))));
+  const move = () => {
+    once.note(body);
+    return moveTogether(axes, targets, speed, straight);
+  };
   return html`<${Panel} title=${`Group ${group}`} note="All start in the same servo cycle, or none; on a straight line they ramp alike and arrive together.">
     <div class="fields" onKeyDown=${enterSends}>
       ${axes.map(
-        ({ name, info, samples }) => html`<${Field} key=${name} label=${`${name} to`} unit=${info.unit} value=${targets[name]}
-        hint=${`now ${number(samples.position?.value, decimalsOf(info))}`}
-        onChange=${(value) => setTargets({ ...targets, [name]: value })} />`,
+        ({ name, info, samples }) => html`<${NumberField} key=${name} label=${`${name} to`} unit=${info.unit} value=${targets[name]}
+        meaning=${(text) => `moves ${name} to ${text};`} hint=${`now ${number(samples.position?.value, decimalsOf(info))}`}
+        onChange=${(value) => setTargets((last) => ({ ...last, [name]: value }))} />`,
       )}
-      <${Field} label="Velocity" unit=${`${axes[0].info.unit}/s`} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
+      <${NumberField} label="Velocity" unit=${`${axes[0].info.unit}/s`} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
     </div>
     <${Tick} label="Straight line" checked=${straight} onChange=${setStraight} />
-    <p class="row"><${Action} kind="main" act=${() => moveTogether(axes, targets, speed, straight)} obstacle=${way || null}
+    <p class="row"><${Action} kind="main" act=${move} obstacle=${way || null}
       reason=${reason}>Move ${axes.map(({ name }) => name).join(" and ")} together<//>
-      ${straight && html`<${Action} act=${async () => setLine(await previewLine(axes, targets, speed))} obstacle=${missing ? way : null}
+      ${straight && html`<${Action} act=${async () => setLine(await previewLine(axes, targets, speed))} obstacle=${missing || !body ? way : null}
         reason=${reason}>Preview the line<//>`}</p>
     ${straight && line && html`<p role="status">${number(line.duration_s, 2)} s, at most
       ${number(line.deviation, 4)} ${axes[0].info.unit} from the line.</p>`}

@@ -5,10 +5,21 @@ import { Action } from "../parts/controls.js";
 import { number } from "../parts/format.js";
 import { setSpeedOverride } from "../session/control.js";
 
+const FULL = 100;
 const SHARES = [0, 10, 25, 50, 100];
 
+/** Return the override of a rig in percent; undefined while it is not known. */
+export function overrideOf(rig) {
+  return [...rig.axes.values()].map((axis) => axis.state?.speed_override).find((each) => each !== undefined);
+}
+
+/** Tell whether a rig is known to move slower than commanded. */
+export function slowed(rig) {
+  return overrideOf(rig) < FULL;
+}
+
 export function SpeedOverride({ rig }) {
-  const shown = [...rig.axes.values()].map((axis) => axis.state?.speed_override).find((each) => each !== undefined);
+  const shown = overrideOf(rig);
   if (shown === undefined) return null;
   return html`<div class="row" role="group" aria-label=${`Speed override of ${rig.name}`}>
     <span role="status">Speed ${number(shown, 0)} %</span>

@@ -2,8 +2,9 @@
 
 import { html, useId, useMemo, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
-import { Action, Choice, Field, Panel, Reason, Tick } from "../parts/controls.js";
+import { Action, Choice, Panel, Reason, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { clock, dateAndClock, duration, words } from "../parts/format.js";
 import { axisPath } from "../session/api.js";
@@ -42,17 +43,23 @@ function TraceForm({ axis }) {
   const [chosen, setChosen] = useState(all.slice(0, 3));
   const [set, setSet] = useState(FIRST);
   const reason = useId();
-  const field = (name) => ({ value: set[name], onChange: (value) => setSet({ ...set, [name]: value }) });
+  const field = (name) => ({ value: set[name], onChange: (value) => setSet((last) => ({ ...last, [name]: value })) });
+  const used = {
+    Samples: set.samples,
+    Interval: set.interval_ms,
+    ...(set.trigger && { Level: set.level, "Samples before trigger": set.pre_trigger, "Wait at most": set.timeout_s }),
+  };
   const under = axis.trace && TRACE_UNDER_WAY.includes(axis.trace.phase);
   const way =
     obstacle(axis, "trace") ??
     (chosen.length ? null : "Choose a channel.") ??
     (under ? "A trace is under way." : null) ??
+    unread(used) ??
     (set.samples ? null : "How many samples?");
   const request = {
     channels: chosen,
     samples: set.samples,
-    timeout_s: set.timeout_s ?? FIRST.timeout_s,
+    timeout_s: (set.trigger && set.timeout_s) || FIRST.timeout_s,
     interval_s: set.interval_ms ? set.interval_ms / 1e3 : "fastest",
     ...(set.trigger && {
       pre_trigger: set.pre_trigger ?? 0,
@@ -68,15 +75,15 @@ function TraceForm({ axis }) {
       )}
     </fieldset>
     <div class="fields">
-      <${Field} label="Samples" ...${field("samples")} min="2" max=${MOST_SAMPLES} step="1" />
-      <${Field} label="Interval" unit="ms" ...${field("interval_ms")} hint="empty: as fast as can be" />
+      <${NumberField} label="Samples" ...${field("samples")} whole min=${2} max=${MOST_SAMPLES} />
+      <${NumberField} label="Interval" min=${0} unit="ms" ...${field("interval_ms")} hint="empty: as fast as can be" />
       <${Choice} label="Trigger" options=${[["", "none: at once"], ...chosen.map((name) => [name, words(name)])]} ...${field("trigger")} />
       ${
         set.trigger &&
         html`<${Choice} label="When it is" options=${TRIGGER_KINDS.map((each) => [each, each])} ...${field("kind")} />
-        <${Field} label="Level" hint="not used for signals" ...${field("level")} />
-        <${Field} label="Samples before trigger" ...${field("pre_trigger")} min="0" step="1" />
-        <${Field} label="Wait at most" unit="s" ...${field("timeout_s")} />`
+        <${NumberField} label="Level" hint="not used for signals" ...${field("level")} />
+        <${NumberField} label="Samples before trigger" ...${field("pre_trigger")} whole min=${0} />
+        <${NumberField} label="Wait at most" min=${0} unit="s" ...${field("timeout_s")} />`
       }
     </div>
     <p class="row">

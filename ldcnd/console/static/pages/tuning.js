@@ -2,9 +2,10 @@
 
 import { html, useId, useMemo, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
-import { Action, Choice, Field, Panel, Reason, Table, Tick } from "../parts/controls.js";
+import { Action, Choice, Panel, Reason, Table, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
 import { decimalsOf, duration, number, percent } from "../parts/format.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { look } from "../session/channels.js";
 import { useRigs } from "../session/rigs.js";
@@ -52,17 +53,18 @@ function TestMove({ axis }) {
   const reason = useId();
   const hindered =
     obstacle(axis, kind === "step" ? "track" : "move_relative") ??
+    unread({ Distance: distance, "Record after it": settleS }) ??
     (distance > 0 ? null : "A distance above 0 is missing.");
   return html`<${Panel} title="Test move" note=${`It moves ${axis.name}, and the next one moves it back.`}>
     <div class="fields">
       <${Choice} label="Shape" options=${Object.entries(MOVES).map(([key, { title }]) => [key, title])} value=${kind}
         onChange=${setKind} hint=${MOVES[kind].hint} />
-      <${Field} label="Distance" unit=${axis.info.unit} value=${distance} onChange=${setDistance} min="0" />
-      <${Field} label="Record after it" unit="s" value=${settleS} onChange=${setSettleS} min="0" max="60" />
+      <${NumberField} label="Distance" unit=${axis.info.unit} value=${distance} onChange=${setDistance} min=${0} />
+      <${NumberField} label="Record after it" unit="s" value=${settleS} onChange=${setSettleS} min=${0} max=${60} />
     </div>
     <p class="row"><${Action} kind="main" obstacle=${hindered} reason=${reason} onDone=${() => setWay(-way)}
       act=${() => runTest(axis, { kind, distance: way * distance, settleS: settleS ?? 0 })}
-      >Move ${number(way * (distance ?? 0), 3)} ${axis.info.unit} and record<//></p>
+      >Move ${distance > 0 ? `${way * distance}`.replace("-", "−") : "–"} ${axis.info.unit} and record<//></p>
     ${hindered && html`<${Reason} id=${reason} text=${hindered} />`}
     <${TraceProgress} trace=${axis.trace} />
   <//>`;

@@ -1,8 +1,9 @@
 /** Tuning a drive whose gains are parameters: change one in RAM, record while the machine moves, compare the runs. */
 
 import { html, useEffect, useState } from "../html.js";
-import { Action, Field, Panel, RefusalText, Table } from "../parts/controls.js";
+import { Action, Panel, RefusalText, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { NumberField, unread } from "../parts/number_field.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { arm } from "../session/captures.js";
 import { command } from "../session/control.js";
@@ -42,9 +43,9 @@ export function ParameterBench({ axis }) {
 
 function Gain({ axis, value, onWritten }) {
   const [wanted, setWanted] = useState(null);
-  const way = obstacle(axis, "write_parameter") ?? (wanted === null ? "A value is missing." : null);
+  const way = obstacle(axis, "write_parameter") ?? unread({ Value: wanted }) ?? (wanted === null ? "Type another value first." : null);
   return html`<div class="fields">
-    <${Field} label=${`${value.parameter} ${value.name}`} value=${wanted ?? value.active} min="0" max="65535" step="1"
+    <${NumberField} label=${`${value.parameter} ${value.name}`} value=${wanted ?? value.active} whole min=${0} max=${65535}
       onChange=${setWanted} hint=${value.active === value.stored ? null : `${value.stored} is stored`} />
     <p class="row"><${Action} obstacle=${way} onDone=${(reply) => onWritten(reply.value)}
       act=${() => command(axis, "write_parameter", { parameter: value.parameter, value: wanted, memory: "ram" }, PATIENCE_MS)}
@@ -61,8 +62,8 @@ function Record({ axis, gains, onRun }) {
     return { gains: gains.map(({ parameter, active }) => [parameter, active]), ...judged(capture) };
   };
   return html`<${Panel} title="Record" note="The pulses that move this drive come from elsewhere: let the machine move, then record.">
-    <div class="fields"><${Field} label="Duration" unit="s" value=${seconds} onChange=${setSeconds} min="1" max="60" /></div>
-    <p class="row"><${Action} kind="main" act=${record} onDone=${onRun} obstacle=${obstacle(axis, "trace")}>Record<//></p>
+    <div class="fields"><${NumberField} label="Duration" unit="s" value=${seconds} onChange=${setSeconds} min=${1} max=${60} /></div>
+    <p class="row"><${Action} kind="main" act=${record} onDone=${onRun} obstacle=${obstacle(axis, "trace") ?? unread({ Duration: seconds })}>Record<//></p>
     <${TraceProgress} trace=${axis.trace} />
   <//>`;
 }

@@ -1,30 +1,36 @@
-/** Controls: a button says in visible text why it cannot act now; a field has a label, a unit and a hint. */
+/** Controls: a button says in visible text why it cannot act now; a choice and a tick have labels. */
 
-import { html, useId, useState } from "../html.js";
+import { html, useId, useRef, useState } from "../html.js";
 import { inPageTerms } from "./remedies.js";
 import { faultPage } from "./state.js";
 
 /** A button that carries out `act`, shows what came of it, and cannot act while `obstacle` is a text.
 
  * It stays in the tab order then, so that everybody can reach the reason.
- * With `reason` the id of an element that shows the obstacle already.
+ * With `reason` the id of an element that shows the obstacle already. `outcome` says what a reply means.
  */
-export function Action({ act, obstacle = null, reason = null, kind = "", onDone, onRefused, title, children }) {
+export function Action({ act, obstacle = null, reason = null, kind = "", onDone, onRefused, title, outcome, children }) {
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
+  const pressed = useRef(false); // a second press comes before the first is drawn
   const [refusal, setRefusal] = useState(null);
+  const [said, setSaid] = useState("");
 
   async function press() {
-    if (obstacle || underWay) return;
+    if (obstacle || pressed.current) return;
+    pressed.current = true;
     setUnderWay(true);
     setRefusal(null);
+    setSaid("");
     try {
-      const outcome = await act();
-      onDone?.(outcome);
+      const reply = await act();
+      onDone?.(reply);
+      if (outcome) setSaid(outcome(reply));
     } catch (error) {
       if (onRefused) onRefused(error);
       else setRefusal(error);
     } finally {
+      pressed.current = false;
       setUnderWay(false);
     }
   }
@@ -35,8 +41,29 @@ export function Action({ act, obstacle = null, reason = null, kind = "", onDone,
       aria-describedby=${obstacle ? (reason ?? own) : null} title=${title} onClick=${press}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
+    ${outcome && html`<small role="status">${said}</small>`}
     <${RefusalText} refusal=${refusal} />
   </span>`;
+}
+
+const ONCE_MS = 1_000;
+
+/** Keep typed motions from being sent twice by a second Enter or a double click.
+
+ * Returns what notes a motion that is sent, and what returns why the same one cannot be sent now.
+ */
+export function useOnce() {
+  const last = useRef({ text: null, atMs: 0 });
+  return {
+    note: (body) => {
+      last.current = { text: JSON.stringify(body), atMs: performance.now() };
+    },
+    obstacle: (body, moving) => {
+      if (!body || last.current.text !== JSON.stringify(body)) return null;
+      const recent = performance.now() - last.current.atMs < ONCE_MS;
+      return recent || moving ? "This motion was sent just now: change a value, or wait until the axis stands." : null;
+    },
+  };
 }
 
 /** The one line under a group of controls that says why they cannot act. */
@@ -55,25 +82,11 @@ export function RefusalText({ refusal }) {
   </span>`;
 }
 
-/** A labelled input; an empty one is null, a number is a number. */
-export function Field({ label, unit, hint, value, onChange, type = "number", ...more }) {
-  const id = useId();
-  const told = `${id}-hint`;
-  const read = (text) => (text === "" ? null : type === "number" ? Number(text) : text);
-  return html`<div class="field">
-    <label for=${id}>${label}${unit && html` <span class="unit">${unit}</span>`}</label>
-    <input
-      id=${id} type=${type} step=${type === "number" ? "any" : null} value=${value ?? ""} autocomplete="off"
-      aria-describedby=${hint ? told : null} onInput=${(event) => onChange(read(event.target.value))} ...${more}
-    />
-    ${hint && html`<small id=${told}>${hint}</small>`}
-  </div>`;
-}
-
 /** Enter in a field does what the main button of its panel does. */
 export function enterSends(event) {
-  if (event.key !== "Enter" || event.target.tagName !== "INPUT") return;
+  if (event.key !== "Enter" || event.target.tagName !== "INPUT" || event.isComposing) return;
   event.preventDefault();
+  if (event.repeat) return;
   event.currentTarget.closest(".panel").querySelector("button.main").click();
 }
 

@@ -48,10 +48,18 @@ export function askAtOnce(path, body = {}, { patienceMs = PATIENCE_MS, keepalive
       "X-Ldcnd-Csrf": cookie("ldcnd_csrf"),
       ...(page && { "X-Ldcnd-Page": page }),
     },
-    body: JSON.stringify(body),
+    body: asJson(body),
     priority: "high",
     keepalive,
     signal: AbortSignal.timeout(patienceMs),
+  });
+}
+
+/** Return a message as JSON; throws for a number that is none, which JSON would turn into "left to the configuration". */
+export function asJson(message) {
+  return JSON.stringify(message, (_name, value) => {
+    if (typeof value === "number" && !Number.isFinite(value)) throw new Error("Nothing was sent: a number is none.");
+    return value;
   });
 }
 

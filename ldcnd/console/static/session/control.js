@@ -1,6 +1,6 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
-import { ask, axisPath, nameThisPage, rigPath } from "./api.js";
+import { ask, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { askHolders, changed, rigs } from "./rigs.js";
 
@@ -25,8 +25,8 @@ const held = new Map();
 /** The name under which this page controls axes; null while it is not connected. */
 export let client = null;
 
-/** Why control was lost last, for people; null when it was not. */
-export let lost = null;
+/** The axes of which control was lost, by why, until the operator has seen it; empty when none was. */
+export const lost = new Map();
 
 /** Why a jog did not begin, or ended by itself; null when the last one did what the hand did. */
 export let jogRefusal = null;
@@ -36,7 +36,7 @@ let holding = 0;
 
 /** Forget what was lost: the operator has seen it. */
 export function dismissLost() {
-  lost = null;
+  lost.clear();
   changed();
 }
 
@@ -55,7 +55,7 @@ export async function take(axes, force = false) {
   const body = { axes: axes.map((axis) => axis.name), force };
   await ask(`${rigPath(axes[0].rig.name)}/control`, body);
   for (const axis of axes) held.set(axis, false);
-  lost = null;
+  lost.clear();
   askHolders();
   changed();
 }
@@ -127,7 +127,7 @@ export function endJog() {
 }
 
 function say(message) {
-  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+  if (socket?.readyState === WebSocket.OPEN) socket.send(asJson(message));
 }
 
 /** Note that this page has set an axis in motion. */
@@ -161,23 +161,29 @@ function open() {
     endJog();
     client = null;
     nameThisPage(null);
-    if (held.size) {
-      lost = `Control of ${names([...held.keys()])} is lost: this page has lost its connection to the console. What it moved is halted.`;
-      held.clear();
-    }
+    for (const axis of held.keys()) noteLost(axis, "this page has lost its connection to the console. What it moved is halted.");
+    held.clear();
     changed();
     setTimeout(open, OPEN_AGAIN_MS);
   };
 }
 
-function forget({ rig, axis: name, message }) {
+function forget({ rig, axis: name, message, taken_by: taker }) {
   const axis = rigs.get(rig)?.axes.get(name);
-  if (!held.delete(axis)) return;
-  lost = `Control of ${name} is lost: ${message}`;
+  if (held.delete(axis)) noteLost(axis, message, taker);
 }
 
-function names(axes) {
-  return axes.map((axis) => axis.name).join(", ");
+function noteLost(axis, why, taker) {
+  const key = taker ? `${taker} ` : why;
+  lost.set(key, { taker, why, axes: [...(lost.get(key)?.axes ?? []), axis] });
+}
+
+/** Return what was lost, a sentence for each reason. */
+export function lostInWords() {
+  return [...lost.values()].map(({ taker, why, axes }) => {
+    const names = axes.map(({ name }) => name).join(", ");
+    return taker ? `${taker} took control of ${names}.` : `Control of ${names} is lost: ${why}`;
+  });
 }
 
 /** Return the fields that have a value: what is left empty is left to the configuration. */

@@ -13,7 +13,8 @@ const OLD_AFTER_S = 1.5;
 const OLD_AFTER_PERIODS = 4;
 /** A drive reports its velocity in whole counts a servo tick: below this share of the limit, positions say it better. */
 const SLOW_SHARE = 0.1;
-const SLOPE_S = 1;
+/** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
+const SLOPE_S = 0.5;
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
 /** An observer speaks every ten seconds: an hour and a half. */
@@ -27,6 +28,7 @@ export class Axis {
   holder = null;
   shadows = [];
   #positions = [];
+  #motion = { key: null, sinceNs: 0 };
   #arrived = new Map();
 
   constructor(rig, name) {
@@ -51,12 +53,17 @@ export class Axis {
     return this.info?.capabilities.includes(capability) ?? false;
   }
 
-  /** Velocity in units a second: of the drive, or while it is slow the slope of the positions of the last second. */
+  /** Velocity in units a second: of the drive, or while it is slow the slope of what was measured of this motion.
+
+   * What was measured before a motion has begun, or has ended, says nothing about it: null until something was measured since.
+   */
   get velocity() {
-    const told = this.samples.velocity?.value ?? null;
+    const { sinceNs } = this.#motion;
+    const sample = this.samples.velocity;
+    const told = sample && sample.t >= sinceNs ? sample.value : null;
     const [first, last] = [this.#positions[0], this.#positions.at(-1)];
     const limit = this.info?.limits.velocity ?? 0;
-    if (told === null || Math.abs(told) > SLOW_SHARE * limit || !first || last.t === first.t) return told;
+    if ((told !== null && Math.abs(told) > SLOW_SHARE * limit) || !first || last.t === first.t) return told;
     return ((last.value - first.value) * 1e9) / (last.t - first.t);
   }
 
@@ -71,6 +78,7 @@ export class Axis {
     else if (item === "trace") this.trace = sample;
     else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
     if (item === "position") this.#remember(sample);
+    if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
     if (sample) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
   }
@@ -95,7 +103,16 @@ export class Axis {
 
   #remember(sample) {
     const good = sample && sample.quality !== "bad";
-    this.#positions = good ? [...this.#positions, sample].filter(({ t }) => sample.t - t <= SLOPE_S * 1e9) : [];
+    const fits = ({ t }) => sample.t - t <= SLOPE_S * 1e9 && t >= this.#motion.sinceNs;
+    this.#positions = good ? [...this.#positions, sample].filter(fits) : [];
+  }
+
+  /** A motion begins or ends: only positions from then on belong to it. */
+  #noteMotion({ t, state, moving, command }) {
+    const key = `${state} ${moving} ${command?.command_id}`;
+    if (key === this.#motion.key) return;
+    this.#motion = { key, sinceNs: t };
+    this.#positions = this.#positions.filter((each) => each.t >= t);
   }
 
   #keep(where, name, sample) {

@@ -1,0 +1,75 @@
+/** Numbers that people type. The same rules as `ldcnd/number_text.py`; one table of cases tests both. */
+
+const NUMBER = /^([+\-−]?)(\d*)(?:([.,])(\d*))?(?:[eE]([+\-−]?\d+))?\s*([\s\S]*)$/;
+const NOT_FINITE = /^[+\-−]?\s*(?:inf|nan|∞)/i;
+/** What follows a number that has separators of thousands, as somewhere in the world, or is one of several. */
+const SEPARATED = /^[.,'’_\s]*\d/;
+const LONGEST_QUOTE = 40;
+
+/** Why a text is not taken as a number; it takes the place of the number, and nothing that holds it can be sent. */
+export class Unread {
+  constructor(message, text = "") {
+    this.message = message;
+    this.text = text;
+  }
+
+  /** Called for what is about to be sent. */
+  toJSON() {
+    throw new Error(`Nothing was sent: ${this.message}.`);
+  }
+
+  valueOf() {
+    return Number.NaN;
+  }
+}
+
+/** Return the number that a text stands for, null for an empty text, or why it is none.
+
+ * `unit` may stand behind the number; `whole`, `min` and `max` are what the number must be besides.
+ */
+export function readNumber(text, { unit = "", whole = false, min = -Infinity, max = Infinity } = {}) {
+  const written = text.trim();
+  if (!written) return null;
+  const value = numberOf(written, unit);
+  if (value instanceof Unread) return new Unread(value.message, text);
+  if (whole && !Number.isSafeInteger(value)) return new Unread(`${quoted(written)} is not a whole number`, text);
+  if (value < min || value > max) return new Unread(`${value} is not ${range(min, max)}`, text);
+  return value;
+}
+
+/** Return a range in words. */
+export function range(min, max) {
+  if (max === Infinity) return `${min} or more`;
+  return min === -Infinity ? `${max} or less` : `${min} to ${max}`;
+}
+
+function numberOf(written, unit) {
+  const quote = quoted(written);
+  if (NOT_FINITE.test(written)) return new Unread(`${quote} is not a finite number`);
+  if (/^[+\-−]?0[xX]/.test(written)) return new Unread(`${quote} is not a decimal number`);
+  const [, sign, whole, mark, part = "", power = "0", rest] = NUMBER.exec(written);
+  const digits = whole + part;
+  if (/(?![0-9])\p{Nd}/u.test(written)) return new Unread(`${quote} has other digits than 0 to 9`);
+  if (!digits) return new Unread(`${quote} is not a number`);
+  if (rest && !sameUnit(rest, unit)) {
+    if (SEPARATED.test(rest))
+      return new Unread(`${quote} is more than one number, or has thousands separators: type one number without them`);
+    if (/\d/.test(rest) || /^[.,+\-−]/.test(rest)) return new Unread(`${quote} is not one number`);
+    return new Unread(`${quoted(rest)} is not the unit here, ${unit ? `which is ${unit}` : "there is none"}`);
+  }
+  if (mark === "," && /^[1-9]\d{0,2}$/.test(whole) && part.length === 3)
+    return new Unread(`${quote} can mean ${whole}.${part} or ${whole}${part}: type one of them`);
+  const value = Number(`${sign.replace("−", "-")}${whole || "0"}.${part || "0"}e${power.replace("−", "-")}`);
+  if (!Number.isFinite(value)) return new Unread(`${quote} is too large`);
+  if (!value && /[1-9]/.test(digits)) return new Unread(`${quote} is too close to 0`);
+  return value || 0; // no minus zero
+}
+
+/** Units are compared as they look: ² is 2, and there are two characters for micro. */
+function sameUnit(written, unit) {
+  return unit !== "" && written.normalize("NFKC") === unit.normalize("NFKC");
+}
+
+function quoted(text) {
+  return `“${text.length > LONGEST_QUOTE ? `${text.slice(0, LONGEST_QUOTE)}…` : text}”`;
+}

@@ -1,0 +1,229 @@
+"""Numbers typed key by key into every field of every page, in two engines, while axes move and values come in."""
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from ldcnd.client.lease import control
+from ldcnd.model.commands import MoveVelocity, Power, SetPosition
+from ldcnd.number_text import NotANumber, read_number
+from tests.support.marionette import CONTROL, DELETE, ENTER, Firefox, firefox, open_firefox
+
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(900),
+]
+
+TABLE = json.loads((Path(__file__).parents[1] / "vectors" / "typed_numbers.json").read_text(encoding="utf-8"))
+TEXTS = [each["text"] for each in TABLE if len(each["text"]) <= len("1.234.567") and each.get("unit", "mm") == "mm"]
+MOVED = ("1.5", "1,5", "1.05", "0.05", "12.25", "-1.5", "−1,25", "1e1", ".5", "5.", "+2", "2.5 mm")  # noqa: RUF001
+REFUSED = ("1,234", "1.234,5", "1 2", "1.5 um", "0x10", "NaN", "--5")
+KEY_PAUSE_MS = 8
+PATIENCE_S = 45.0
+FIELDS = "input[inputmode=decimal]"
+TEXT_FIELDS = "input[type=search], input[type=text]:not([inputmode])"
+COUNT = f"""() => document.querySelectorAll("{FIELDS}").length"""
+FOCUS = """(fields, at) => document.querySelectorAll(fields)[at].focus()"""
+READ = """(fields) => [...document.querySelectorAll(fields)].map((field) => ({
+  label: field.labels[0]?.textContent ?? field.ariaLabel,
+  unit: field.labels[0]?.querySelector(".unit")?.textContent ?? "",
+  text: field.value,
+  invalid: field.ariaInvalid === "true",
+  refusal: field.parentElement.querySelector(".unread")?.textContent ?? "",
+  read: field.parentElement.querySelector(".read")?.textContent ?? "",
+}))"""
+REDRAWN = """() => { window.redraws ??= 0; const count = window.redraws;
+  if (!window.watched) { window.watched = true;
+    new MutationObserver(() => { window.redraws += 1; }).observe(document.body,
+      { subtree: true, childList: true, characterData: true }); }
+  return count; }"""
+CHOOSE = """(label, option) => {
+  const found = [...document.querySelectorAll("select")].find((each) => each.labels[0].textContent === label);
+  const wanted = [...found?.options ?? []].find((each) => each.textContent === option);
+  if (!wanted) return false;
+  found.value = wanted.value;
+  found.dispatchEvent(new Event("change", { bubbles: true }));
+  return true;
+}"""
+PRESS = """(text) => {
+  const found = [...document.querySelectorAll("button")].find((each) => each.textContent.trim() === text);
+  if (!found || found.getAttribute("aria-disabled")) return false;
+  found.click();
+  return true;
+}"""
+PLACES = [
+    ("axis/sim/x", None),
+    ("axis/sim/x", ("Move", "by a distance")),
+    ("axis/sim/x", ("Move", "at a velocity")),
+    ("axis/sim/x", ("Move", "with a raw duty")),
+    ("axis/sim/x", ("Move", "to a sensor value")),
+    ("trace/sim/x", ("Trigger", "position")),
+    ("tuning/sim/x", None),
+    ("rig", None),
+    ("network", None),
+    ("tuning/mixed/feed", None),
+    ("parameters/mixed/feed", "Read all"),
+]
+
+
+class Chromium:
+    """A page of Chromium, driven as `Firefox` is."""
+
+    def __init__(self, page):
+        self._page = page
+
+    async def open(self, url):
+        await self._page.goto(url)
+
+    async def evaluate(self, script, *arguments):
+        return await self._page.evaluate(f"(given) => ({script})(...given)", list(arguments))
+
+    async def keys(self, *strokes, pause_ms=0):
+        named = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter"}
+        for stroke in strokes:
+            if len(stroke) > 1 or stroke in named:
+                await self._page.keyboard.press("+".join(named.get(key, key) for key in stroke))
+            else:
+                await self._page.keyboard.type(stroke, delay=pause_ms)
+
+
+@asynccontextmanager
+async def open_chromium(house, _folder) -> AsyncIterator[Chromium]:
+    async with house.desk() as desk:
+        yield Chromium(desk.page)
+
+
+@asynccontextmanager
+async def open_gecko(house, folder) -> AsyncIterator[Firefox]:
+    program = firefox()
+    if program is None:
+        pytest.skip("no firefox-esr: install it, or say where one is in LDCND_FIREFOX")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        cookies = await desk.page.context.cookies()
+    async with open_firefox(program, folder) as window:
+        await window.open(f"{house.url}/")
+        for cookie in cookies:
+            given = {"name": cookie["name"], "value": cookie["value"], "path": "/", "httpOnly": cookie["httpOnly"]}
+            await window.command("WebDriver:AddCookie", cookie=given)
+        yield window
+
+
+ENGINES = pytest.mark.parametrize("engine", [open_chromium, open_gecko], ids=["chromium", "firefox"])
+
+
+async def until(window, script, *arguments, wanted=bool):
+    async with asyncio.timeout(PATIENCE_S):
+        while not wanted(found := await window.evaluate(script, *arguments)):
+            await asyncio.sleep(0.05)
+    return found
+
+
+async def type_over(window, text):
+    await window.keys(CONTROL + "a", *(text or DELETE), pause_ms=KEY_PAUSE_MS)
+
+
+@asynccontextmanager
+async def moving(house, *axes):
+    """Let axes run for as long as the context lasts."""
+    await house.sim.quiet(*axes)
+    async with control(house.sim.rig, "the test", *axes, lease_s=600, force=True) as held:
+        for axis in axes:
+            await house.sim.rig.command(axis, SetPosition(position=0.0))
+            await held.command(axis, Power(on=True))
+            await held.command(axis, MoveVelocity(velocity=0.05))
+        yield
+    await house.sim.quiet(*axes)
+
+
+async def go(window, house, place, choice):
+    await window.open("about:blank")
+    await window.open(f"{house.url}/#/{place}")
+    await until(window, "() => document.querySelector('h1, .rig') !== null")
+    if isinstance(choice, tuple):
+        await until(window, CHOOSE, *choice)
+    elif choice:
+        await until(window, PRESS, choice)
+    await until(window, COUNT)
+    await window.evaluate(REDRAWN)
+
+
+def judge(field, text):
+    """Return what is wrong with a field into which a text was typed; None when nothing is."""
+    if field["text"] != text:
+        return f"{field['label']}: {text!r} became {field['text']!r}"
+    try:
+        value = read_number(text, field["unit"]) if text.strip() else None
+    except NotANumber as error:
+        right = field["invalid"] and field["refusal"] == str(error)
+    else:
+        beyond = field["invalid"] and " is not " in field["refusal"]  # its range, or whole numbers only
+        shown = "" if value is None else f"{value:g}"
+        right = beyond or (not field["invalid"] and shown in field["read"])
+    return None if right else f"{field['label']}: {text!r} is taken as {field}"
+
+
+@ENGINES
+async def test_no_key_changes_what_was_typed_before_it(house, tmp_path, engine, capsys):
+    began_s, typed, wrong, fields = time.monotonic(), 0, [], 0
+    async with engine(house, tmp_path) as window, moving(house, "x", "y", "z"):
+        for place, choice in PLACES:
+            await go(window, house, place, choice)
+            count = await window.evaluate(COUNT)
+            fields += count
+            for nth, text in enumerate(TEXTS):
+                entries = [TEXTS[(nth + at) % len(TEXTS)] for at in range(count)]
+                before = await window.evaluate(REDRAWN)
+                for at, entry in enumerate(entries):
+                    await window.evaluate(FOCUS, FIELDS, at)
+                    await type_over(window, entry)
+                    typed += 1
+                await until(window, REDRAWN, wanted=lambda now, before=before: now > before)
+                found = await window.evaluate(READ, FIELDS)
+                assert len(found) == count, (place, text)
+                wrong += [each for each in map(judge, found, entries) if each]
+    with capsys.disabled():
+        took_s = time.monotonic() - began_s
+        print(
+            f"\n{engine.__name__}: {fields} fields x {len(TEXTS)} texts = {typed} entries,"
+            f" {len(wrong)} wrong, {took_s:.0f} s"
+        )
+    assert not wrong, wrong[:10]
+
+
+@ENGINES
+async def test_the_shaft_stands_where_the_text_says(house, tmp_path, engine):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", SetPosition(position=0.0))
+    async with engine(house, tmp_path) as window:
+        await go(window, house, "axis/sim/x", None)
+        await until(window, PRESS, "Take control")
+        await until(window, PRESS, "Enable")
+        await house.sim.until("x", lambda state: state.enabled)
+        labels = [each["label"] for each in await window.evaluate(READ, FIELDS)]
+        at = labels.index("Position mm")
+        stands = 0.0
+        for refused in REFUSED:
+            await window.evaluate(FOCUS, FIELDS, at)
+            await type_over(window, refused)
+            await window.keys(ENTER, ENTER)
+            assert (await window.evaluate(READ, FIELDS))[at]["refusal"]
+        assert abs(await house.sim.position("x") - stands) < 0.01
+        for text in MOVED:
+            stands = read_number(text, "mm")
+            await until(window, "() => document.querySelector('.now-state').textContent.includes('standstill')")
+            await window.evaluate(FOCUS, FIELDS, at)
+            await type_over(window, text)
+            said = (await window.evaluate(READ, FIELDS))[at]["read"]
+            assert said == f"moves x to {stands:g} mm"
+            await window.keys(ENTER)
+            await house.sim.reaches("x", stands, within=0.02)
