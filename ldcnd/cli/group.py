@@ -11,7 +11,7 @@ from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, halted
-from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.cli.typed import Finite, axis_of, number_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.events import ReadOutcome
 from ldcnd.model.rig_commands import (
@@ -126,7 +126,13 @@ def group_path(
     for each in corners:
         axis, _, places = each.partition("=")
         *via, end = places.split(",")
-        values = {"axis": axis, "via": via, "position": end, "velocity": velocity, "acceleration": acceleration}
+        values = {
+            "axis": axis,
+            "via": [number_of(place, each) for place in via],
+            "position": number_of(end, each),
+            "velocity": velocity,
+            "acceleration": acceleration,
+        }
         moves.append(of_options(AxisPath, **values, **who))
     request = of_options(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation)
 
@@ -149,6 +155,11 @@ def _shares(
     shares = []
     for each in moves:
         axis, _, position = each.partition("=")
-        values = {"axis": axis, "position": position, "velocity": velocity, "acceleration": acceleration}
+        values = {
+            "axis": axis,
+            "position": number_of(position, each),
+            "velocity": velocity,
+            "acceleration": acceleration,
+        }
         shares.append(of_options(AxisMove, **values, **who))
     return tuple(shares)

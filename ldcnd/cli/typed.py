@@ -37,6 +37,19 @@ async def axis_of(client: RigClient, name: str) -> AxisInfo:
     return axes[name]
 
 
+def number_of(text: str, written: str) -> float:
+    """Return the number in a part of an argument; wrong usage if it is none.
+
+    Args:
+        text: the part.
+        written: the argument that it is of, for the message.
+    """
+    try:
+        return read_number(text)
+    except NotANumber as error:
+        raise click.UsageError(f"{written!r}: {error}") from None
+
+
 class Finite(click.FloatRange):
     """A number, within limits if there are any."""
 

@@ -136,9 +136,9 @@ async def type_over(window, text):
 async def moving(house, *axes):
     """Let axes run for as long as the context lasts."""
     await house.sim.quiet(*axes)
-    async with control(house.sim.rig, "the test", *axes, lease_s=600, force=True) as held:
+    async with control(house.sim.rig, "the test", *axes, lease_s=60, force=True) as held:
         for axis in axes:
-            await house.sim.rig.command(axis, SetPosition(position=0.0))
+            await held.command(axis, SetPosition(position=0.0))
             await held.command(axis, Power(on=True))
             await held.command(axis, MoveVelocity(velocity=0.05))
         yield
