@@ -126,14 +126,8 @@ def group_path(
     for each in corners:
         axis, _, places = each.partition("=")
         *via, end = places.split(",")
-        values = {
-            "axis": axis,
-            "via": [number_of(place, each) for place in via],
-            "position": number_of(end, each),
-            "velocity": velocity,
-            "acceleration": acceleration,
-        }
-        moves.append(of_options(AxisPath, **values, **who))
+        corner, limits = [number_of(place, each) for place in via], {"velocity": velocity, "acceleration": acceleration}
+        moves.append(of_options(AxisPath, axis=axis, via=corner, position=number_of(end, each), **limits, **who))
     request = of_options(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation)
 
     async def work(client: RigClient) -> None:
@@ -155,11 +149,6 @@ def _shares(
     shares = []
     for each in moves:
         axis, _, position = each.partition("=")
-        values = {
-            "axis": axis,
-            "position": number_of(position, each),
-            "velocity": velocity,
-            "acceleration": acceleration,
-        }
-        shares.append(of_options(AxisMove, **values, **who))
+        limits = {"velocity": velocity, "acceleration": acceleration}
+        shares.append(of_options(AxisMove, axis=axis, position=number_of(position, each), **limits, **who))
     return tuple(shares)
