@@ -7,6 +7,7 @@ import pytest
 from ldcnd.model.commands import MoveVelocity, Power
 from ldcnd.model.leases import Acquire, ListHolders
 from ldcnd.model.parameters import ReadParameter
+from ldcnd.model.rig_commands import SetSpeedOverride
 from ldcnd.model.samples import TelemetryItem
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -148,6 +149,67 @@ async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
         assert not (await house.sim.rig.last("z", TelemetryItem.FAULT)).active
 
 
+WATCH_VELOCITY = """() => {
+  window.seen = [];
+  const look = () => window.seen.push([document.querySelector(".now-state .state").textContent,
+    [...document.querySelectorAll(".facts div")].find((each) => each.textContent.startsWith("velocity"))
+      .querySelector("dd").firstChild.textContent]);
+  new MutationObserver(look).observe(document.querySelector("main"),
+    { subtree: true, childList: true, characterData: true });
+}"""
+
+
+async def test_the_velocity_never_contradicts_the_state(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        await desk.page.evaluate(WATCH_VELOCITY)
+        move = desk.panel("Move")
+        await move.get_by_label("Move", exact=True).select_option("by a distance")
+        back = await house.sim.position("x") > 0
+        await move.get_by_label("Distance mm").fill("-10" if back else "10")
+        await move.get_by_label("Velocity mm/s").fill("5")
+        await desk.button("Move").click()
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await house.sim.until("x", lambda state: state.moving == "no")
+        await expect(desk.page.locator(".now-state .state")).to_have_text("standstill")
+        seen = await desk.page.evaluate("window.seen")
+
+    values = [(state, abs(float(text.replace("\u2212", "-")))) for state, text in seen if text != "\u2013"]
+    assert max(value for state, value in values if state == "standstill") < 0.2
+    moving = [value for state, value in values if state == "moving"]
+    assert len(moving) > 5
+    assert sorted(moving)[len(moving) // 2] == pytest.approx(5, abs=0.3)
+    assert min(moving[2:-2]) > 3
+
+
+async def test_a_speed_override_and_every_axis_that_was_lost_stand_on_top_of_every_page(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        every = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        await every.get_by_role("button", name="Take control of all").click()
+        await expect(desk.page.get_by_role("banner")).to_contain_text("You control x, y, z, c")
+        await house.sim.rig.ask(SetSpeedOverride(percent=0))
+        await desk.open("events")
+        await expect(desk.page.get_by_role("banner")).to_contain_text("speed override 0 %: nothing moves")
+
+        taken = Acquire(client="ada", axes=("x", "y", "z", "c"), lease_s=60, force=True)
+        lease = await house.sim.rig.ask(taken)
+        await desk.page.evaluate("scrollTo(0, document.body.scrollHeight)")
+        await expect(desk.page.get_by_role("banner")).to_contain_text("ada took control of")
+        for axis in ("x", "y", "z", "c"):
+            await expect(desk.page.get_by_role("banner").get_by_role("alert").first).to_contain_text(
+                re.compile(rf"took control of .*\b{axis}\b")
+            )
+        await expect(desk.page.get_by_text("ada took control of")).to_be_in_viewport()
+        await house.sim.rig.ask(SetSpeedOverride(percent=100, leases=(lease.lease,)))
+        await expect(desk.page.get_by_role("banner")).not_to_contain_text("speed override")
+
+
 async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
     await house.sim.quiet("c")
     async with house.desk() as desk:
@@ -158,7 +220,7 @@ async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
         taken = Acquire(client="another operator", axes=("c",), lease_s=60, force=True)
         lease = await house.sim.rig.ask(taken)
 
-        await expect(desk.page.get_by_text("Control of c is lost")).to_be_visible()
+        await expect(desk.page.get_by_text("another operator took control of c.")).to_be_visible()
         await expect(desk.page).to_have_title(re.compile("^Control lost . Axis c"))
         await expect(desk.panel("Control")).to_contain_text("Held by another operator")
         await expect(desk.button("Enable")).to_be_disabled()

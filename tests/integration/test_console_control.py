@@ -115,6 +115,7 @@ async def test_a_page_is_told_when_its_control_is_lost(console):
 
     assert (told["lost"]["rig"], told["lost"]["axis"]) == ("sim", "x")
     assert told["lost"]["message"]
+    assert told["lost"]["taken_by"] == "another"
     assert refused.document["code"] == "lease_required"
 
 
