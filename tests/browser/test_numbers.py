@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+import pytest_asyncio
 
 from ldcnd.client.lease import control
 from ldcnd.model.commands import MoveVelocity, Power, SetPosition
@@ -20,20 +21,32 @@ pytestmark = [
     pytest.mark.system,
     pytest.mark.real_time,
     pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(900),
+    pytest.mark.timeout(240),
 ]
 
 TABLE = json.loads((Path(__file__).parents[1] / "vectors" / "typed_numbers.json").read_text(encoding="utf-8"))
-TEXTS = [each["text"] for each in TABLE if len(each["text"]) <= len("1.234.567") and each.get("unit", "mm") == "mm"]
+LEFT_OUT = {
+    *("   ", "-0", "007", ",5", "1,5E\u22122", "1.234", "-12,345", "1'000", "1/2", "5-", "- 5", "-", "-inf", "1.5 MM"),
+    *("1\u066b5", "1\u0665", "100.5", "1;2", "1.234.567", "1.5 um", "Infinity", ".", "1e-999"),
+}
+"""Further cases of the readers; the browsers say nothing more about them."""
+TEXTS = [
+    each["text"]
+    for each in TABLE
+    if len(each["text"]) <= len("1.234.567") and each.get("unit", "mm") == "mm" and each["text"] not in LEFT_OUT
+]
 MOVED = ("1.5", "1,5", "1.05", "0.05", "12.25", "-1.5", "−1,25", "1e1", ".5", "5.", "+2", "2.5 mm")  # noqa: RUF001
 REFUSED = ("1,234", "1.234,5", "1 2", "1.5 um", "0x10", "NaN", "--5")
 KEY_PAUSE_MS = 8
 PATIENCE_S = 45.0
 FIELDS = "input[inputmode=decimal]"
-TEXT_FIELDS = "input[type=search], input[type=text]:not([inputmode])"
-COUNT = f"""() => document.querySelectorAll("{FIELDS}").length"""
-FOCUS = """(fields, at) => document.querySelectorAll(fields)[at].focus()"""
-READ = """(fields) => [...document.querySelectorAll(fields)].map((field) => ({
+FOUND = f"""[...document.querySelectorAll("{FIELDS}")].filter(
+  (field) => !panel || field.closest(".panel").querySelector("h2").textContent === panel)"""
+COUNT = f"(panel) => {FOUND}.length"
+FOCUS = f"(panel, at) => {FOUND}[at].focus()"
+READ = (
+    f"(panel) => {FOUND}"
+    """.map((field) => ({
   label: field.labels[0]?.textContent ?? field.ariaLabel,
   unit: field.labels[0]?.querySelector(".unit")?.textContent ?? "",
   text: field.value,
@@ -41,6 +54,7 @@ READ = """(fields) => [...document.querySelectorAll(fields)].map((field) => ({
   refusal: field.parentElement.querySelector(".unread")?.textContent ?? "",
   read: field.parentElement.querySelector(".read")?.textContent ?? "",
 }))"""
+)
 REDRAWN = """() => { window.redraws ??= 0; const count = window.redraws;
   if (!window.watched) { window.watched = true;
     new MutationObserver(() => { window.redraws += 1; }).observe(document.body,
@@ -61,18 +75,23 @@ PRESS = """(text) => {
   return true;
 }"""
 PLACES = [
-    ("axis/sim/x", None),
-    ("axis/sim/x", ("Move", "by a distance")),
-    ("axis/sim/x", ("Move", "at a velocity")),
-    ("axis/sim/x", ("Move", "with a raw duty")),
-    ("axis/sim/x", ("Move", "to a sensor value")),
-    ("trace/sim/x", ("Trigger", "position")),
-    ("tuning/sim/x", None),
-    ("rig", None),
-    ("network", None),
-    ("tuning/mixed/feed", None),
-    ("parameters/mixed/feed", "Read all"),
+    ("axis/sim/x", None, None),
+    ("axis/sim/x", ("Move", "by a distance"), "Move"),
+    ("axis/sim/x", ("Move", "at a velocity"), "Move"),
+    ("axis/sim/x", ("Move", "with a raw duty"), "Move"),
+    ("axis/sim/x", ("Move", "to a sensor value"), "Move"),
+    ("trace/sim/x", ("Trigger", "position"), None),
+    ("tuning/sim/x", None, None),
+    ("rig", None, None),
+    ("network", None, None),
+    ("tuning/mixed/feed", None, None),
+    ("parameters/mixed/feed", "Read all", None),
 ]
+"""Pages, what is chosen or pressed there first, and the panel whose fields are looked at, where not all are."""
+
+
+LEAST = {"tuning/mixed/feed": 8}
+"""Fields of a page that come one by one, as they are read from a drive."""
 
 
 class Chromium:
@@ -118,7 +137,13 @@ async def open_gecko(house, folder) -> AsyncIterator[Firefox]:
         yield window
 
 
-ENGINES = pytest.mark.parametrize("engine", [open_chromium, open_gecko], ids=["chromium", "firefox"])
+@pytest_asyncio.fixture(
+    scope="module", loop_scope="package", params=[open_chromium, open_gecko], ids=["chromium", "firefox"]
+)
+async def window(request, house, tmp_path_factory):
+    """A page of one engine."""
+    async with request.param(house, tmp_path_factory.mktemp("profile")) as page:
+        yield page
 
 
 async def until(window, script, *arguments, wanted=bool):
@@ -153,7 +178,7 @@ async def go(window, house, place, choice):
         await until(window, CHOOSE, *choice)
     elif choice:
         await until(window, PRESS, choice)
-    await until(window, COUNT)
+    await until(window, COUNT, None)
     await window.evaluate(REDRAWN)
 
 
@@ -172,58 +197,51 @@ def judge(field, text):
     return None if right else f"{field['label']}: {text!r} is taken as {field}"
 
 
-@ENGINES
-async def test_no_key_changes_what_was_typed_before_it(house, tmp_path, engine, capsys):
-    began_s, typed, wrong, fields = time.monotonic(), 0, [], 0
-    async with engine(house, tmp_path) as window, moving(house, "x", "y", "z"):
-        for place, choice in PLACES:
-            await go(window, house, place, choice)
-            count = await window.evaluate(COUNT)
-            fields += count
-            for nth, text in enumerate(TEXTS):
-                entries = [TEXTS[(nth + at) % len(TEXTS)] for at in range(count)]
-                before = await window.evaluate(REDRAWN)
-                for at, entry in enumerate(entries):
-                    await window.evaluate(FOCUS, FIELDS, at)
-                    await type_over(window, entry)
-                    typed += 1
-                await until(window, REDRAWN, wanted=lambda now, before=before: now > before)
-                found = await window.evaluate(READ, FIELDS)
-                assert len(found) == count, (place, text)
-                wrong += [each for each in map(judge, found, entries) if each]
+@pytest.mark.parametrize(("place", "choice", "panel"), PLACES, ids=str)
+async def test_no_key_changes_what_was_typed_before_it(house, window, place, choice, panel, capsys):
+    began_s, wrong, least = time.monotonic(), [], LEAST.get(place, 1)
+    async with moving(house, "x", "y", "z"):
+        await go(window, house, place, choice)
+        count = await until(window, COUNT, panel, wanted=lambda found: found >= least)
+        for nth in range(len(TEXTS)):
+            entries = [TEXTS[(nth + at) % len(TEXTS)] for at in range(count)]
+            before = await window.evaluate(REDRAWN)
+            for at, entry in enumerate(entries):
+                await window.evaluate(FOCUS, panel, at)
+                await type_over(window, entry)
+            await until(window, REDRAWN, wanted=lambda now, before=before: now > before)
+            found = await window.evaluate(READ, panel)
+            assert len(found) == count
+            wrong += [each for each in map(judge, found, entries) if each]
     with capsys.disabled():
         took_s = time.monotonic() - began_s
-        print(
-            f"\n{engine.__name__}: {fields} fields x {len(TEXTS)} texts = {typed} entries,"
-            f" {len(wrong)} wrong, {took_s:.0f} s"
-        )
+        engine = type(window).__name__
+        print(f"\n{engine} {place}: {count} fields x {len(TEXTS)} texts, {len(wrong)} wrong, {took_s:.0f} s")
     assert not wrong, wrong[:10]
 
 
-@ENGINES
-async def test_the_shaft_stands_where_the_text_says(house, tmp_path, engine):
+async def test_the_shaft_stands_where_the_text_says(house, window):
     await house.sim.quiet("x")
     await house.sim.rig.command("x", SetPosition(position=0.0))
-    async with engine(house, tmp_path) as window:
-        await go(window, house, "axis/sim/x", None)
-        await until(window, PRESS, "Take control")
-        await until(window, PRESS, "Enable")
-        await house.sim.until("x", lambda state: state.enabled)
-        labels = [each["label"] for each in await window.evaluate(READ, FIELDS)]
-        at = labels.index("Position mm")
-        stands = 0.0
-        for refused in REFUSED:
-            await window.evaluate(FOCUS, FIELDS, at)
-            await type_over(window, refused)
-            await window.keys(ENTER, ENTER)
-            assert (await window.evaluate(READ, FIELDS))[at]["refusal"]
-        assert abs(await house.sim.position("x") - stands) < 0.01
-        for text in MOVED:
-            stands = read_number(text, "mm")
-            await until(window, "() => document.querySelector('.now-state').textContent.includes('standstill')")
-            await window.evaluate(FOCUS, FIELDS, at)
-            await type_over(window, text)
-            said = (await window.evaluate(READ, FIELDS))[at]["read"]
-            assert said == f"moves x to {stands:g} mm"
-            await window.keys(ENTER)
-            await house.sim.reaches("x", stands, within=0.02)
+    await go(window, house, "axis/sim/x", None)
+    await until(window, PRESS, "Take control")
+    await until(window, PRESS, "Enable")
+    await house.sim.until("x", lambda state: state.enabled)
+    labels = [each["label"] for each in await window.evaluate(READ, None)]
+    at = labels.index("Position mm")
+    stands = 0.0
+    for refused in REFUSED:
+        await window.evaluate(FOCUS, None, at)
+        await type_over(window, refused)
+        await window.keys(ENTER, ENTER)
+        assert (await window.evaluate(READ, None))[at]["refusal"]
+    assert abs(await house.sim.position("x") - stands) < 0.01
+    for text in MOVED:
+        stands = read_number(text, "mm")
+        await until(window, "() => document.querySelector('.now-state').textContent.includes('standstill')")
+        await window.evaluate(FOCUS, None, at)
+        await type_over(window, text)
+        said = (await window.evaluate(READ, None))[at]["read"]
+        assert said == f"moves x to {stands:g} mm"
+        await window.keys(ENTER)
+        await house.sim.reaches("x", stands, within=0.02)
