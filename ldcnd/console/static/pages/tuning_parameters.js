@@ -42,12 +42,12 @@ export function ParameterBench({ axis }) {
 }
 
 function Gain({ axis, value, onWritten }) {
-  const [wanted, setWanted] = useState(null);
-  const way = obstacle(axis, "write_parameter") ?? unread({ Value: wanted }) ?? (wanted === null ? "Type another value first." : null);
+  const [wanted, setWanted] = useState(undefined); // until something is typed, the field has what is in use
+  const way = obstacle(axis, "write_parameter") ?? unread({ Value: wanted }) ?? (wanted == null ? "Type another value first." : null);
   return html`<div class="fields">
-    <${NumberField} label=${`${value.parameter} ${value.name}`} value=${wanted ?? value.active} whole min=${0} max=${65535}
+    <${NumberField} label=${`${value.parameter} ${value.name}`} value=${wanted === undefined ? value.active : wanted} whole min=${0} max=${65535}
       onChange=${setWanted} hint=${value.active === value.stored ? null : `${value.stored} is stored`} />
-    <p class="row"><${Action} obstacle=${way} onDone=${(reply) => onWritten(reply.value)}
+    <p class="row"><${Action} obstacle=${way} onDone=${(reply) => (onWritten(reply.value), setWanted(undefined))}
       act=${() => command(axis, "write_parameter", { parameter: value.parameter, value: wanted, memory: "ram" }, PATIENCE_MS)}
       >Write<//></p>
   </div>`;
