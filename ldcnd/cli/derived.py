@@ -52,7 +52,8 @@ class _FieldOption(click.Option):
     """An option for a field; its meaning is read from the source of the class when help is shown."""
 
     def __init__(self, command: type[Sent], field: str, kind: click.ParamType[Any]) -> None:
-        super().__init__([f"--{field.replace('_', '-')}"], type=kind)
+        is_flag = command.model_fields[field].annotation is bool
+        super().__init__([f"--{field.replace('_', '-')}"], type=None if is_flag else kind, is_flag=is_flag)
         self._command = command
         self._field = field
 

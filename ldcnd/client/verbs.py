@@ -1,10 +1,9 @@
 """The verbs of an axis as methods; made from the command classes by `ldcnd schema client`, not edited."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TypeVar
 
-from collections.abc import Mapping
 from ldcnd.client.motion import Motion
 from ldcnd.model.commands import (
     AxisCommand,
