@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.daemon.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
 from ldcnd.daemon.axis.guards import Right
-from ldcnd.daemon.axis.polling import ROUNDS
+from ldcnd.daemon.axis.plausibility import ROUNDS
 from ldcnd.drivers.driver import Fault, StopMode
 from ldcnd.drivers.network import BringUpReport
 from ldcnd.errors import (

@@ -20,7 +20,7 @@ from ldcnd.daemon.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.daemon.axis.kept import KeptFiles
 from ldcnd.daemon.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.daemon.axis.parameters import Parameters
-from ldcnd.daemon.axis.polling import ROUNDS, PlausibilityGate, Verdict, agree
+from ldcnd.daemon.axis.plausibility import ROUNDS, PlausibilityGate, Step, Verdict, agree
 from ldcnd.daemon.axis.procedures.jog import Hold
 from ldcnd.daemon.axis.reference import ReferenceKeeper
 from ldcnd.daemon.axis.state import (
@@ -248,7 +248,8 @@ class AxisService:
             modulo=config.modulo,
         )
         self._moves = moves = driver if isinstance(driver, Moves) else Unmoved(driver)
-        self._gate = Gate(moves, self.tracker)
+        self._plausibility = PlausibilityGate(config)
+        self._gate = Gate(moves, self.tracker, self._plausibility.expect)
         self._bus = bus
         self._clock = clock
         self._next_command_id = next_command_id
@@ -259,7 +260,6 @@ class AxisService:
         self._recalled: float | None = None
         self._motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, self._read, self.reference)
         self._commands = AxisCommands(self._motion)
-        self._plausibility = PlausibilityGate(config)
         self._queue = CommandQueue(config.name)
         parameters = parameters_of(driver)
         self._parameters = Parameters(driver, parameters) if parameters else None
@@ -356,36 +356,40 @@ class AxisService:
 
     def judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
-        tracker, gate = self.tracker, self._plausibility
+        tracker = self.tracker
         if self._pending is not None and tracker.stop_pending:
             self.stop_wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
             self.missed(BadReply(f"axis {self.config.name}: who answers was not identified", axis=self.config.name))
             return False
-        verdict = gate.judge(reading, timing, standing=tracker.command is None and tracker.at_rest)
-        if verdict is Verdict.BELIEVED:
-            if gate.confirmed:  # items that only the first of two readings has are valid as well
-                if gate.zeroed:
-                    self._changed_by_another(DRIVE_RESET, "its position counter has restarted at 0")
-                    tracker.referenced = False
-                    self._stop_what_is_not_understood()
-                elif gate.jumped:
-                    log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
-                    tracker.jumped()
-                    self._stop_what_is_not_understood()
-                first, first_timing = gate.confirmed
+        standing = tracker.command is None and tracker.at_rest and self._queue.free
+        judged = self._plausibility.judge(reading, timing, standing=standing)
+        if judged.verdict is Verdict.BELIEVED:
+            if judged.step:
+                self._stepped(judged.step, reading)
+            if judged.confirmed:  # items that only the first of two readings has are valid as well
+                first, first_timing = judged.confirmed
                 self.observed(first, first.asked - asked, first_timing)
             self.observed(reading, asked, timing)
-        elif verdict is Verdict.CONTRADICTS:
+        elif judged.verdict is Verdict.CONTRADICTS:
             now_ns = self._clock.now_ns()
             if tracker.contradicted(now_ns):
                 log.error("readings contradict each other", axis=self.config.name, counts=reading.position_counts)
                 self._stop_what_is_not_understood()
             self._changed.set()
             self.telemetry.stale(now_ns)
-        if gate.foreign:
+        if judged.foreign:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
-        return verdict is Verdict.ASK_AGAIN
+        return judged.verdict is Verdict.ASK_AGAIN
+
+    def _stepped(self, step: Step, reading: AxisReading) -> None:
+        """No motion has led to where the drive is: its counter was set, or the encoder slips."""
+        if step is Step.ZEROED:
+            self._changed_by_another(DRIVE_RESET, "its position counter has restarted at 0")
+        else:
+            log.error("position jumped", axis=self.config.name, counts=reading.position_counts)
+            self.tracker.jumped()
+        self._stop_what_is_not_understood()
 
     def _stop_what_is_not_understood(self) -> None:
         """Have a motor that may have voltage stopped at once; its line sends that again until the drive confirms it."""

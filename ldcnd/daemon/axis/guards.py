@@ -8,6 +8,7 @@ its turn, for the motion ahead of it, for the other members of its group, for a 
 judged by the state at its start, not by the state at its arrival.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn, Protocol
@@ -435,6 +436,7 @@ class Permit:
     async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
         self.ask_to_move()
+        self._gate.expect(motion)
         with only_while(self.to_move()):
             await self._gate.driver.load(motion, home=home)
 
@@ -457,6 +459,7 @@ class Permit:
             raise cannot(drive.spec, "track")
         condition = self.to_move()
         self.begin()
+        self._gate.expect(Motion(position_counts, math.inf, math.inf))
         with only_while(condition):
             await drive.track(position_counts)
 
@@ -496,9 +499,20 @@ class Permit:
         with only_while(self.ask):
             await drive.set_gains(gains)
 
+    def announce(self, motion: Motion, *, anywhere: bool = False) -> None:
+        """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
+        self._gate.expect(motion, anywhere=anywhere)
+
     def begin(self) -> None:
         """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
         self._begun = True
+
+
+class Expect(Protocol):
+    """See `PlausibilityGate.expect`."""
+
+    def __call__(self, motion: Motion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
+        """Take a motion that is about to be loaded."""
 
 
 class Gate:
@@ -507,13 +521,15 @@ class Gate:
     Attributes:
         driver: of the drive; nothing but permits and the axis's stops uses it.
         tracker: of its state.
+        expect: takes each motion that is about to be loaded.
         epoch: number of stops so far; a permit of an earlier epoch is void.
         closed: the daemon ends; no permit holds.
     """
 
-    def __init__(self, driver: Moves, tracker: AxisTracker) -> None:
+    def __init__(self, driver: Moves, tracker: AxisTracker, expect: Expect) -> None:
         self.driver = driver
         self.tracker = tracker
+        self.expect = expect
         self.epoch = 0
         self.closed = False
 

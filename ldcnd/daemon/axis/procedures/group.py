@@ -230,6 +230,7 @@ class GroupMember(Procedure):
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""
         self._announced = True
+        self.permit.announce(self.plan.motion)
         self.motion.begin(
             self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=self.plan
         )

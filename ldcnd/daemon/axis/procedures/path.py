@@ -334,6 +334,7 @@ class PathMember(Procedure):
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""
         self._announced = True
+        self.permit.announce(self.plan.motion, anywhere=True)
         self.motion.begin(
             self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=self.plan
         )
