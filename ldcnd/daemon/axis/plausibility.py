@@ -279,9 +279,10 @@ class PlausibilityGate:
             ways = [expected.ways(before.position_counts, passed_s) for expected in self._expected]
             low = min(low, 0.0, *(least for least, _ in ways))
             high = max(high, 0.0, *(most for _, most in ways))
-        # a velocity is whole counts in the last servo tick, which takes up to 130 ms: at least one is always missing
+        # a velocity is that of the last servo tick, which takes up to 130 ms, in whole counts: it shows what was
         resolution = max(before.velocity_resolution_counts_per_s, reading.velocity_resolution_counts_per_s)
-        blurred = NOISE_COUNTS + max(1.0, resolution * passed_s)
+        late = abs(reading.velocity_counts_per_s - before.velocity_counts_per_s) / resolution
+        blurred = NOISE_COUNTS + late + resolution * passed_s
         way = _way(before, reading)
         return max(0.0, low - blurred - way, way - high - blurred)
 
