@@ -92,6 +92,7 @@ class Story:
         self.tolerance = self.fastest = 0.0
         self.seen: deque[tuple[float, float, int]] = deque(maxlen=1000)
         self.stops: list[float] = []
+        self.open_at_s = 0.0
         self.set_by = 0
         self.judged = 0
 
@@ -110,6 +111,8 @@ class Story:
         gap_s = 1 / self.rate_hz + LINE_S
         self.tolerance = NOISE + EL / 8 + (self.fastest + 1 / tick_s) * gap_s
         if not one.loop.servo_on:
+            self.open_at_s = now_s
+        if now_s - self.open_at_s <= gap_s:
             self.tolerance += OPEN_LOOP_COUNTS_PER_S * gap_s
 
     async def look(self) -> None:
@@ -203,6 +206,7 @@ class Story:
 
     async def _befall(self, deed: str, by: int) -> None:
         one, loop = drive(self.chain, 1), asyncio.get_running_loop()
+        self._look(loop.time())
         match deed:
             case "set":
                 self.set_by = by

@@ -21,6 +21,7 @@ from ldcnd.errors import (
     LeaseExpired,
     NotSupported,
     OutcomeUnknown,
+    PacketRejected,
     PositionLimit,
     ReplyTimeout,
     ShuttingDown,
@@ -568,6 +569,59 @@ async def test_what_only_the_first_of_two_readings_was_asked_for_is_published_as
 
         assert bench.published(TelemetryItem.VELOCITY)
         assert bench.published(TelemetryItem.POSITION).seq == 0
+
+
+@pytest.mark.parametrize("error", [PacketRejected("damaged"), BadReply("lacks its position")])
+async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_and_is_stopped(error):
+    async with axis_bench() as bench:
+        await moving(bench)
+        for _ in range(2):
+            bench.axis.missed(error)
+        assert (bench.tracker.link, bench.axis.stop_is_pending) == (LinkState.DEGRADED, False)
+
+        for _ in range(8):
+            bench.axis.missed(error)
+
+        assert (bench.tracker.link, bench.tracker.moving) == (LinkState.DEGRADED, Moving.UNKNOWN)
+        assert bench.tracker.quality is Quality.UNCERTAIN
+        assert "replies_unusable" in [fault.code for fault in bench.tracker.active_faults]
+        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert bench.axis.stop_is_pending
+        await bench.axis.send_pending_stop()
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        bench.show()
+        assert (bench.tracker.link, bench.tracker.referenced) == (LinkState.UP, True)
+
+
+@pytest.mark.parametrize(
+    ("command", "cause", "remedy"),
+    [
+        (Halt(), "halt", "send it again"),
+        (Power(on=False), "power off", "send it again"),
+        (Stop(), "a stop", "send reset"),
+    ],
+)
+async def test_what_was_overtaken_says_by_what_and_which_way_out_is_true(command, cause, remedy):
+    async with axis_bench() as bench:
+        await moving(bench)
+        async with asyncio.TaskGroup() as group:
+            waiting = group.create_task(bench_refusal(bench), name="next")
+            await asyncio.sleep(0.01)
+            await bench.send(command)
+        refusal = waiting.result()
+
+        assert f"was overtaken by {cause}" in refusal.message
+        assert refusal.remedy == remedy
+        if "again" in remedy and command.verb is Verb.HALT:
+            await bench.pass_s(1.0, **STANDING)
+            await bench.send(THERE, "again")
+            assert bench.drive.calls[-1] == "start"
+
+
+async def bench_refusal(bench: AxisBench) -> LdcndError:
+    with pytest.raises((StopLatched, CommandAborted)) as refusal:
+        await in_turn(bench, buffered())
+    return refusal.value
 
 
 async def test_misses_take_an_axis_down_only_in_a_row():

@@ -47,6 +47,7 @@ from ldcnd.errors import (
     LdcndError,
     NotSupported,
     OutcomeUnknown,
+    PacketRejected,
     StopLatched,
     TooManyRequests,
     WrongState,
@@ -83,6 +84,8 @@ STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
 
 
+OVERTAKES = {Verb.POWER: "power off"}
+"""What is said of a command that overtakes others, where it is not its name."""
 UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
 """How a motion is stopped that is not understood any more, by `loss.bus`; smoothly otherwise."""
 
@@ -360,7 +363,7 @@ class AxisService:
         if self._pending is not None and tracker.stop_pending:
             self.stop_wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
-            self.missed(BadReply(f"axis {self.config.name}: who answers was not identified", axis=self.config.name))
+            self._nothing_came()  # from its drive: who answers was not identified
             return False
         standing = tracker.command is None and tracker.at_rest and self._queue.free
         judged = self._plausibility.judge(reading, timing, standing=standing)
@@ -395,7 +398,7 @@ class AxisService:
         """Have a motor that may have voltage stopped at once; its line sends that again until the drive confirms it."""
         if not self.tracker.energised or not self.stoppable:
             return
-        self._overtake(None)
+        self._overtake(None, "the stop of a motion that is not understood")
         if self._pending is None:
             self._pending = UNDERSTOOD_NO_MORE.get(self.config.loss.bus, StopMode.SMOOTH)
         self._not_confirmed()
@@ -403,7 +406,7 @@ class AxisService:
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
         if not self._proof.holds:
-            self.missed(BadReply(f"axis {self.config.name}: who answers was not identified", axis=self.config.name))
+            self._nothing_came()  # from its drive: who answers was not identified
             return
         tracker, arrivals = self.tracker, self._arrivals
         was_away = self._seen and tracker.link is LinkState.DOWN
@@ -471,8 +474,19 @@ class AxisService:
         if self.ask_at and not math.isinf(read_at_s):
             self.ask_at(read_at_s)
 
-    def missed(self, _error: BusError) -> None:
-        """Take note that a poll brought nothing."""
+    def missed(self, error: BusError) -> None:
+        """Take note that a poll brought nothing, or nothing that can be used."""
+        if not (self._proof.holds and isinstance(error, PacketRejected | BadReply)):
+            self._nothing_came()
+            return
+        now_ns = self._clock.now_ns()
+        if self.tracker.replied_in_vain(now_ns):
+            log.error("replies cannot be used", axis=self.config.name, reason=error.message)
+            self._stop_what_is_not_understood()
+            self._changed.set()
+        self.telemetry.stale(now_ns)
+
+    def _nothing_came(self) -> None:
         before = self.tracker.link
         self.tracker.missed(self._clock.now_ns())
         if self.tracker.link is not before:
@@ -577,7 +591,7 @@ class AxisService:
             permit.ask_to_move()
             self._commands.check(move)
             if self._commands.retargets(move):
-                self._overtake(permit)
+                self._overtake(permit, permit.verb)
                 return await execute()
             await self.bring_to_rest(StopMode.SMOOTH, by=permit)
         async with self._successors:  # those who wait are served in the order in which they came
@@ -680,7 +694,7 @@ class AxisService:
         """
         if not self.stoppable:
             return False
-        overtaken = self._overtake(by)
+        overtaken = self._overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
         if self._pending is None or STRENGTH[mode] > STRENGTH[self._pending]:
             self._pending = mode
         try:
@@ -693,9 +707,9 @@ class AxisService:
                 self._not_confirmed()
             self.telemetry.state(self._clock.now_ns())
 
-    def _overtake(self, by: Permit | None) -> StopLatched | CommandAborted:
-        """Make all queued commands and permits void, except the caller's; return the refusal."""
-        self._gate.overtake(by)
+    def _overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
+        """Make all queued commands and permits void, except the caller's; return the refusal, which names the cause."""
+        self._gate.overtake(by, cause)
         self._changed.set()
         overtaken = self._gate.overtaken("a queued command")
         self._queue.refuse(overtaken)

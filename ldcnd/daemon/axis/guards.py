@@ -531,15 +531,17 @@ class Gate:
         self.tracker = tracker
         self.expect = expect
         self.epoch = 0
+        self._cause = ""
         self.closed = False
 
     def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
         """Return the permit of a command, valid until the next stop."""
         return Permit(self, command_id, verb, right)
 
-    def overtake(self, by: Permit | None = None) -> None:
-        """Make all permits void, except the caller's."""
+    def overtake(self, by: Permit | None, cause: str) -> None:
+        """Make all permits void, except the caller's; the refusals of the others name the cause."""
         self.epoch += 1
+        self._cause = cause
         if by is not None:
             by.renew()
 
@@ -553,14 +555,19 @@ class Gate:
         return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
 
     def overtaken(self, what: str) -> StopLatched | CommandAborted:
-        """Return the refusal of a command that a stop has overtaken, or a halt, which latches nothing."""
-        name = self.tracker.name
-        if self.tracker.stop_latched:
+        """Return the refusal of a command that a stop has overtaken, or the latest cause that latches nothing."""
+        tracker = self.tracker
+        if tracker.stop_latched:
             return StopLatched(
-                f"axis {name}: {what} was overtaken by a stop", axis=name, remedy=Remedy("{}", step("reset"))
+                f"axis {tracker.name}: {what} was overtaken by a stop",
+                axis=tracker.name,
+                remedy=Remedy("{}", step("reset")),
             )
+        in_error = tracker.state is AxisState.ERROR_STOP
         return CommandAborted(
-            f"axis {name}: {what} was overtaken by a command that came later", axis=name, remedy="send it again"
+            f"axis {tracker.name}: {what} was overtaken by {self._cause}",
+            axis=tracker.name,
+            remedy=Remedy("{}", step("reset")) if in_error else "send it again",
         )
 
 

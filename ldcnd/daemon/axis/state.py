@@ -16,7 +16,8 @@ from ldcnd.model.meta import PastFault
 from ldcnd.model.samples import AxisState, FaultEntry, LinkState, Moving, Quality
 
 MISSES_UNTIL_DOWN = 3
-"""Consecutive failed polls after which the drive counts as lost."""
+"""Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
+which what it does is not understood."""
 REST_S = 0.25
 """Shortest time within `REST_COUNTS` that proves rest of a shaft without a profile of this daemon, seconds."""
 REST_COUNTS = 5
@@ -55,6 +56,11 @@ READINGS_CONTRADICT = Fault(
     " off, check gains, servo rate divisor and encoder, then send reset and home",
     loses_position=True,
 )
+REPLIES_UNUSABLE = Fault(
+    "replies_unusable",
+    "the drive replies, but polls reach it damaged or its replies make no sense: it is not known what it does; a stop"
+    " was sent; check the line for noise and its termination, then send reset",
+)
 REFERENCE_REFUSED = Fault(
     "reference_refused",
     "the reference that an earlier daemon has kept was refused",
@@ -80,6 +86,7 @@ OF_DAEMON = (
     NOT_SETTLED,
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
+    REPLIES_UNUSABLE,
     STOP_UNCONFIRMED,
 )
 """Faults that the daemon finds; the drive tells all others."""
@@ -294,7 +301,7 @@ class AxisTracker:
         self._own: tuple[Fault, ...] = ()  # faults that this daemon has found, until reset
         self.settle: SettleJudge | None = None
         self._ends_at_s: float | None = None  # when the profile under way should end
-        self._misses = 0
+        self._misses = self._in_vain = 0
         self._effective_from_s = 0.0
         self._rest = RestJudge()
 
@@ -358,7 +365,7 @@ class AxisTracker:
         faults = (*reading.faults, *self._own_now()) if self._own else reading.faults
         if reading.altered and DRIVE_CHANGED not in faults:
             faults = (*faults, DRIVE_CHANGED)
-        self._misses = 0
+        self._misses = self._in_vain = 0
         self.link = LinkState.UP
         if faults or self.active_faults:
             self._faults(faults, now_ns)
@@ -446,7 +453,7 @@ class AxisTracker:
 
     def contradicted(self, now_ns: int) -> bool:
         """The drive replies, and what it shows is not understood; tell whether that is new since the last reset."""
-        self._misses = 0
+        self._misses = self._in_vain = 0
         self.link = LinkState.UP
         self._rest.forget()
         new = READINGS_CONTRADICT not in self._own
@@ -457,6 +464,23 @@ class AxisTracker:
         if self.state is not AxisState.DISABLED:
             self._fail(READINGS_CONTRADICT.text)
         return new
+
+    def replied_in_vain(self, now_ns: int) -> bool:
+        """The drive replies, but not with a reading; tell whether that is now so for too long.
+
+        That is not silence: the link is degraded, never down.
+        """
+        self._misses, self._in_vain = 0, self._in_vain + 1
+        if self.link is LinkState.UP:
+            self.link = LinkState.DEGRADED
+        if self._in_vain < MISSES_UNTIL_DOWN or REPLIES_UNUSABLE in self._own or self.link is LinkState.DOWN:
+            return False
+        self._rest.forget()
+        self._own = (*self._own, REPLIES_UNUSABLE)
+        self._faults(self._own, now_ns)
+        if self.state is not AxisState.DISABLED:
+            self._fail(REPLIES_UNUSABLE.text)
+        return True
 
     def missed(self, now_ns: int) -> None:
         """Count a poll that brought nothing."""
@@ -615,7 +639,7 @@ class ObservedTracker(AxisTracker):
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:  # noqa: ARG002 - of the contract
         """Digest a reading."""
-        self._misses = 0
+        self._misses = self._in_vain = 0
         self.link = LinkState.UP
         self._faults((*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults, now_ns)
         if not self.active_faults:
