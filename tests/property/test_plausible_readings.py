@@ -303,6 +303,7 @@ def by_lot(seed: int) -> str:
 MOTIONS = ("move", "jog", "slow down", "home")
 
 
+@pytest.mark.promise("contradiction-stops")
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("speed", [2.0, 20.0])
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -315,6 +316,7 @@ def test_a_counter_that_another_host_sets_in_mid_motion_costs_the_reference_and_
         assert story.judged >= 5
 
 
+@pytest.mark.promise("contradiction-stops")
 @pytest.mark.parametrize("last", ["stop", "halt", "off"])
 @pytest.mark.parametrize(
     ("deed", "values"),

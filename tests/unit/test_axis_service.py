@@ -571,6 +571,7 @@ async def test_what_only_the_first_of_two_readings_was_asked_for_is_published_as
         assert bench.published(TelemetryItem.POSITION).seq == 0
 
 
+@pytest.mark.promise("contradiction-stops")
 @pytest.mark.parametrize("error", [PacketRejected("damaged"), BadReply("lacks its position")])
 async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_and_is_stopped(error):
     async with axis_bench() as bench:

@@ -928,7 +928,7 @@ async def test_a_member_that_leaves_while_the_drives_are_loaded_keeps_all_from_m
 async def test_a_stop_of_a_member_while_the_drives_are_loaded_keeps_all_from_moving():
     network = FakeNetwork()
     async with axis_bench() as one:
-        network.meanwhile = lambda: one.axis._gate.overtake(None, "a halt")
+        network.meanwhile = lambda: (one.tracker.latch_stop(), one.axis._gate.overtake(None, "a stop"))
         with pytest.raises(StopLatched):
             await joined(one, Meeting(network, frozenset({"x"})))
 
