@@ -145,6 +145,10 @@ class WireLogFile:
         """Take bytes for the host."""
         self._write(WireRecord(at_s, WireEvent.RECEIVED, data))
 
+    def remarked(self, text: str) -> None:
+        """Take what a module makes of the host's bytes where no reply shows it, as a comment."""
+        self._file.write(f"#   {text}\n")
+
     def end(self) -> None:
         """Write what is left of an unfinished packet."""
         self._flush(self._at_s)

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 from ldcnd.sim.faults import FaultInjector, FaultPlan
 
@@ -51,6 +52,36 @@ class Reply:
     byte_s: float
 
 
+def received_at(data: bytes, ratio: float) -> bytes:
+    """Return what a UART makes of bytes that are sent without a gap at another rate than its own.
+
+    A byte begins where the line is low, is sampled in the middle of each of its bits, and is passed on with any stop
+    bit, as a port does that checks no parity; the next one begins at the middle of the stop bit or later. A line that
+    was low all the time is a break: one byte of 0, and nothing more until it is high again.
+
+    Args:
+        data: what is sent, with eight data bits.
+        ratio: the receiver's rate, divided by the sender's.
+    """
+    levels = [level for value in data for level in (0, *(value >> bit & 1 for bit in range(8)), 1)]
+    received, at, step = bytearray(), 0.0, 1.0 / ratio  # in bits of the sender
+
+    def level(instant: float) -> int:
+        return levels[int(instant)] if instant < len(levels) else 1
+
+    while (start := next((bit for bit in range(int(at), len(levels)) if not levels[bit]), None)) is not None:
+        at = max(at, float(start))
+        if level(at + 0.5 * step):  # no start bit: a pulse too short for this rate
+            at += 0.5 * step
+            continue
+        value = sum(level(at + (bit + 1.5) * step) << bit for bit in range(8))
+        received.append(value)
+        at += 9.5 * step
+        if value == level(at) == 0:
+            at = float(next((bit for bit in range(int(at), len(levels)) if levels[bit]), len(levels)))
+    return bytes(received)
+
+
 class Module(ABC):
     """A device on a line.
 
@@ -60,6 +91,7 @@ class Module(ABC):
         latched: whether it receives independently of the module before it.
         yields_to_host: whether its transmission ends as soon as the host sends.
         next_event_s: when `advance` must be called next; `NEVER_S` when the module only waits for the host.
+        remark: called with what the module makes of the host's bytes where no reply shows it; set by the chain.
     """
 
     baud: float = 19_200.0
@@ -67,6 +99,7 @@ class Module(ABC):
     latched: bool = False
     yields_to_host: bool = True
     next_event_s: float = NEVER_S
+    remark: Callable[[str], None] = staticmethod(lambda _: None)
 
     @abstractmethod
     def hear(self, value: int | None, at_s: float) -> None:
@@ -152,6 +185,7 @@ class Chain:
         baud: the host's rate.
         wire_busy_s: for how long bytes have been on either line so far.
         on_loss: called with the reason when the adapter disappears; set by the open line.
+        on_remark: called with what a module remarks, behind its number in the chain; set by an observer.
     """
 
     def __init__(
@@ -166,6 +200,9 @@ class Chain:
         self.baud = 19_200
         self.wire_busy_s = 0.0
         self.on_loss: Callable[[str], None] | None = None
+        self.on_remark: Callable[[str], None] | None = None
+        for number, module in enumerate(self.modules, 1):
+            module.remark = partial(self._remark, number)
         self._baud_check = baud_check
         self._delivery = delivery
         self._injector = FaultInjector(faults or FaultPlan())
@@ -227,6 +264,10 @@ class Chain:
     def schedule(self, at_s: float, action: Callable[[float], None]) -> None:
         """Schedule an action on the modules at an instant of the line's clock; it gets the instant."""
         heapq.heappush(self._agenda, (at_s, next(self._agenda_numbers), action))
+
+    def _remark(self, number: int, text: str) -> None:
+        if self.on_remark:
+            self.on_remark(f"module {number}: {text}")
 
     # -- the adapter -------------------------------------------------------------------------------------------------
 
@@ -323,14 +364,17 @@ class Chain:
     def _begin(self, reply: Reply, module: Module) -> None:
         self.wire_busy_s += len(reply.data) * reply.byte_s
         slowest, fastest = self._understood_bauds()
-        understood = slowest <= module.baud <= fastest
-        data = reply.data if understood else bytes(value ^ 0xF0 | 0x80 for value in reply.data)
+        data, byte_s = reply.data, reply.byte_s
+        if not slowest <= module.baud <= fastest:
+            data, byte_s = received_at(data, self.baud * byte_s / BITS_PER_BYTE), BITS_PER_BYTE / self.baud
+            if not data:
+                return
         faulty = self._injector.reply(data, reply.starts_at_s)
         held_back = faulty.delay_s > 0.0
         transmission = _Transmission(
             faulty.data,
             reply.starts_at_s + faulty.delay_s,
-            reply.byte_s,
+            byte_s,
             on_wire=not held_back,
             yields=module.yields_to_host and not held_back,
         )
@@ -338,10 +382,8 @@ class Chain:
             self._collide(transmission)
         self._transmissions.append(transmission)
         for copy in range(1, faulty.copies):
-            repeated_at_s = transmission.starts_at_s + copy * len(faulty.data) * reply.byte_s
-            self._transmissions.append(
-                _Transmission(faulty.data, repeated_at_s, reply.byte_s, on_wire=False, yields=False)
-            )
+            repeated_at_s = transmission.starts_at_s + copy * len(faulty.data) * byte_s
+            self._transmissions.append(_Transmission(faulty.data, repeated_at_s, byte_s, on_wire=False, yields=False))
         self._sweep()
 
     def _collide(self, late: _Transmission) -> None:

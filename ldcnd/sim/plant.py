@@ -80,6 +80,7 @@ class Shaft:
         position_counts: where the shaft is, with fraction.
         velocity_counts: counts per step.
         stalled: something holds it.
+        limits_actuated: both limit switches are, whatever their places.
         current_limited: the motor would have drawn more current in the last step than the amplifier gives.
         slack_counts: how far the motor has turned forward within the backlash, 0 to all of it.
         delay_steps: largest number of steps for which the motor goes on with the previous output.
@@ -90,6 +91,7 @@ class Shaft:
         self.position_counts = 0.0
         self.velocity_counts = 0.0
         self.stalled = False
+        self.limits_actuated = False
         self.current_limited = False
         self.slack_counts = 0.0
         self.delay_steps = math.ceil(plant.delay_s / step_s)
@@ -190,12 +192,12 @@ class Shaft:
     @property
     def on_reverse_limit(self) -> bool:
         """Whether the reverse limit switch is actuated."""
-        return self.position_counts <= self.plant.reverse_limit_counts
+        return self.limits_actuated or self.position_counts <= self.plant.reverse_limit_counts
 
     @property
     def on_forward_limit(self) -> bool:
         """Whether the forward limit switch is actuated."""
-        return self.position_counts >= self.plant.forward_limit_counts
+        return self.limits_actuated or self.position_counts >= self.plant.forward_limit_counts
 
     @property
     def on_index(self) -> bool:

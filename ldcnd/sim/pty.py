@@ -38,6 +38,9 @@ class LineObserver(Protocol):
     def received(self, at_s: float, data: bytes) -> None:
         """Take bytes that were delivered to the host."""
 
+    def remarked(self, text: str) -> None:
+        """Take what a module makes of the host's bytes where no reply shows it."""
+
 
 class PtyLine:
     """A chain and the pseudo-terminal in front of it; a context manager that removes what it made.
@@ -69,6 +72,7 @@ class PtyLine:
         self._baud_check = baud_check
         self._link = link
         self._observer = observer
+        chain.on_remark = observer.remarked if observer else None
         self._modules = itertools.cycle(chain.modules)
         self._started_s = time.perf_counter()
         self._master, self._slave = os.openpty()

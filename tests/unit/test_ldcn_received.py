@@ -41,12 +41,23 @@ def test_surplus_data_bytes_are_ignored_and_reported():
     assert interpretation.oddities == ("2 data bytes, START_MOTION takes 0: the surplus is ignored",)
 
 
-def test_missing_data_bytes_count_as_zero_and_are_reported():
-    interpretation = taken(V4, Command.LOAD_TRAJECTORY, "37 25 06 01 00 58 01 00 00")
+@pytest.mark.parametrize(("buffered", "acceleration"), [("", 0), ("ff " * 9 + "64 00 00 00 05 06", 100)])
+def test_missing_data_bytes_are_those_of_the_receive_buffer_and_are_reported(buffered, acceleration):
+    packet = Packet(1, Command.LOAD_TRAJECTORY, bytes.fromhex("37 25 06 01 00 58 01 00 00"))
 
-    trajectory = Trajectory(position=67_109, velocity=344, acceleration=0, mode=ProfileMode.VELOCITY)
+    interpretation = interpret(V4, packet, bytes.fromhex(buffered))
+
+    trajectory = Trajectory(position=67_109, velocity=344, acceleration=acceleration, mode=ProfileMode.VELOCITY)
     assert interpretation.command == LoadTrajectory(trajectory)
-    assert interpretation.oddities == ("9 data bytes, control byte 37 implies 13: 4 count as 0",)
+    (oddity,) = interpretation.oddities
+    assert oddity.startswith("9 data bytes, control byte 37 implies 13: ")
+    assert "receive buffer" in oddity
+
+
+def test_a_control_byte_out_of_the_receive_buffer_says_how_many_more_come_from_there():
+    interpretation = interpret(V4, Packet(1, Command.LOAD_TRAJECTORY, b""), bytes.fromhex("91 05 00 00 00 07 08"))
+
+    assert interpretation.command == LoadTrajectory(Trajectory(position=5, start_now=True))
 
 
 def test_a_half_present_field_keeps_its_low_bytes():
@@ -56,10 +67,10 @@ def test_a_half_present_field_keeps_its_low_bytes():
 
 
 def test_version_4_takes_thirteen_gain_bytes_without_deadband_compensation():
-    interpretation = interpret(V4, Packet(1, Command.SET_GAIN, THIRTEEN))
+    interpretation = interpret(V4, Packet(1, Command.SET_GAIN, THIRTEEN), bytes([9] * 15))
 
     assert interpretation.command == SetGain(Gains(100, 1024, 0, 0, 255, 0, 2048, 1, deadband=0))
-    assert interpretation.oddities
+    assert not interpretation.oddities
 
 
 def test_version_3_ignores_the_fourteenth_gain_byte():
@@ -128,7 +139,7 @@ def test_bytes_without_a_packet_cannot_be_explained(data):
     ("profile", "packet", "reason"),
     [
         (V4, Packet(1, Command.START_MOTION, b"\x00"), "surplus"),
-        (V4, Packet(1, Command.SET_GAIN, THIRTEEN), "1 count as 0"),
+        (LS_182AP, Packet(1, Command.SET_GAIN, THIRTEEN), "13 data bytes, SET_GAIN takes 14: .* receive buffer"),
         (LS_182AP, Packet(1, Command.IO_CONTROL, b"\x00"), "does not define command 8"),
         (SC, Packet(1, Command.ADD_PATH_POINTS, b"\x00"), "surplus"),
     ],

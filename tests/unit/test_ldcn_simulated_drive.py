@@ -1,14 +1,17 @@
 """Registers, sticky bits and modes of a simulated servo drive, as a host sees them."""
 
+from dataclasses import replace
+
 import pytest
 
 from ldcnd.drivers.ldcn.controls import LimitPins, StopControl
 from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drivers.ldcn.registers import encode_gains
 from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.plant import MotorPlant
-from tests.support.simulated_axis import ON, ONE, SimulatedAxis
+from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS, SimulatedAxis
 from tests.support.simulated_host import little
 
 
@@ -216,6 +219,79 @@ def test_loss_of_motor_power_opens_the_loop_of_pic_servo_for_good():
     assert not back.aux & AuxFlag.SERVO_ON
 
 
+@pytest.mark.parametrize(("name", "off"), [("picservo-v4", 0), ("picservo-sc", 0), ("picservo-sc", 255)])
+def test_current_limiting_that_is_switched_off_gives_the_output_back(name, off):
+    gains = replace(UTILITY_GAINS, ol=200, cl=21)
+    axis = SimulatedAxis(name, gains=gains)
+    axis.suffer(Condition.STALLED)
+    axis.stop(ON | StopControl.HERE, *little(1000, 4))
+    axis.wait(0.5)
+    limited = axis.pwm()
+
+    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, replace(gains, cl=off)))
+    axis.wait(0.5)
+
+    assert limited < 100
+    assert axis.pwm() == 200
+
+
+def test_an_output_that_was_limited_is_given_back_while_the_loop_is_open():
+    axis = SimulatedAxis("picservo-v4", gains=replace(UTILITY_GAINS, ol=200, cl=21))
+    axis.suffer(Condition.STALLED)
+    axis.stop(ON | StopControl.HERE, *little(1000, 4))
+    axis.wait(0.5)
+
+    axis.stop(ON | StopControl.MOTOR_OFF)
+    axis.wait(0.5)
+    axis.recover(Condition.STALLED)
+    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, replace(UTILITY_GAINS, ol=200)))
+    axis.suffer(Condition.STALLED)
+    axis.stop(ON | StopControl.HERE, *little(1000, 4))
+
+    assert axis.pwm() == 200
+
+
+@pytest.mark.parametrize("name", ["ls182ap", "picservo-v4", "picservo-sc"])
+@pytest.mark.parametrize("event", ["motor_off", "amplifier_off", "position_error", "power"])
+def test_the_pwm_value_is_reset_by_whatever_disables_the_servo(name, event):
+    axis = SimulatedAxis(name)
+    axis.load(Trajectory(pwm_or_target=120, servo=False, reverse=False))
+    if name == "picservo-sc":  # its loads replace each other, so the value has to be in use
+        axis.drive_pwm(120)
+        axis.stop(ON | StopControl.ABRUPT)
+    match event:
+        case "motor_off":
+            axis.stop(ON | StopControl.MOTOR_OFF)
+        case "amplifier_off":
+            axis.stop(StopControl.MOTOR_OFF)
+        case "position_error":
+            axis.stop(ON | StopControl.HERE, *little(20_000, 4))
+        case _:
+            lost = Condition.STOP_INPUT if name == "ls182ap" else Condition.MOTOR_POWER_OFF
+            axis.suffer(lost)
+            axis.wait(0.01)
+            axis.recover(lost)
+    axis.stop(StopControl.MOTOR_OFF)
+    axis.clear()
+    axis.stop(ON)
+
+    axis.load(Trajectory(servo=False, start_now=True))
+
+    assert axis.pwm() == 0
+
+
+def test_both_limit_switches_may_be_actuated_at_once_wherever_the_shaft_is():
+    axis = SimulatedAxis()
+    both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
+    before = axis.status().flags & both
+
+    axis.suffer(Condition.LIMITS_ACTUATED)
+    actuated = axis.status().flags & both
+    axis.recover(Condition.LIMITS_ACTUATED)
+
+    assert (before, actuated, axis.status().flags & both) == (0, both, 0)
+
+
 def test_shaft_stays_where_it_is_when_the_drive_is_switched_off_and_on():
     axis = SimulatedAxis()
     axis.move(1000)
@@ -225,6 +301,7 @@ def test_shaft_stays_where_it_is_when_the_drive_is_switched_off_and_on():
     axis.drive.power(on=False, at_s=axis.now_s)
     axis.wait(1.0)
     axis.drive.power(on=True, at_s=axis.now_s)
+    axis.wait(0.002)
     axis.address_all()
 
     assert axis.status().position == 0

@@ -93,6 +93,18 @@ def test_a_line_follows_the_output_that_is_wired_to_it_and_else_its_own_level():
     assert host.look(1).levels == ALL & ~0x102
 
 
+def test_an_output_moves_a_cylinder_with_a_sensor_at_either_end():
+    host = IoHost(IoWiring(wires={1: 9}, inverted_wires={2: 9}))
+    host.do(SetDirection(ALL & ~0x100))
+
+    seen = []
+    for output in (0, 0x100, 0):
+        host.do(SetOutput(output))
+        seen.append(host.look(1).levels & 0b11)
+
+    assert seen == [0b10, 0b01, 0b10]
+
+
 def test_levels_and_voltages_change_when_the_schedule_says():
     events = [
         TimedEvent(0.5, 1, Line(3), present=False),

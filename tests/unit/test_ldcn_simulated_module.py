@@ -9,7 +9,7 @@ from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V1, PIC_SERVO_V4
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.errors import ValueOutOfRange
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.quirks import ModuleSettings
+from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings
 from tests.support.simulated_host import SimulatedHost, little
 
 IDENTITY = StatusItem.IDENTITY
@@ -100,14 +100,37 @@ def test_wrong_checksum_is_answered_and_not_executed():
     assert not host.send(1, Command.NO_OPERATION)[0] & StatusFlag.CHECKSUM_ERROR
 
 
-def test_surplus_data_bytes_are_ignored_and_missing_ones_are_zero():
+def test_surplus_data_bytes_are_ignored():
     host = host_on("ls182ap")
 
-    surplus = host.send(1, Command.DEFINE_STATUS, StatusItem.POSITION, 0xFF, 0xFF)
-    missing = host.send(1, Command.DEFINE_STATUS)
+    assert len(host.send(1, Command.DEFINE_STATUS, StatusItem.POSITION, 0xFF, 0xFF)) == 6
 
-    assert len(surplus) == 6
-    assert len(missing) == 2
+
+@pytest.mark.parametrize(
+    ("buffer", "earlier", "length"),
+    [
+        (CommandBuffer.OVERWRITTEN, (1, Command.READ_STATUS, StatusItem.IDENTITY), 4),
+        (CommandBuffer.OVERWRITTEN, (2, Command.READ_STATUS, StatusItem.IDENTITY), 4),
+        (CommandBuffer.OVERWRITTEN, (1, Command.NO_OPERATION), 3),
+        (CommandBuffer.KEPT, (2, Command.READ_STATUS, StatusItem.IDENTITY), 3),
+    ],
+)
+def test_missing_data_bytes_are_those_of_an_earlier_packet_in_the_receive_buffer(buffer, earlier, length):
+    host = host_on("ls182ap", "ls182ap", settings=ModuleSettings(version=20, command_buffer=buffer))
+    host.send(1, Command.READ_STATUS, StatusItem.AUX)
+
+    host.send(*earlier)
+
+    assert len(host.send(1, Command.DEFINE_STATUS)) == length
+
+
+def test_after_a_reset_the_receive_buffer_holds_zeros():
+    host = host_on("ls182ap")
+    host.send(1, Command.READ_STATUS, StatusItem.AUX)
+
+    host.send(1, Command.HARD_RESET)
+
+    assert len(host.send(0, Command.DEFINE_STATUS)) == 2
 
 
 def test_unknown_commands_are_answered_like_no_operation():
@@ -166,7 +189,7 @@ def test_burst_of_packets_to_different_modules_is_executed_by_each():
 def test_reply_starts_at_the_end_of_the_modules_servo_cycle():
     settings = ModuleSettings(version=20, phase_s=0.0001, drift_ppm=40.0)
     host = host_on("ls182ap", settings=settings)
-    reply_s = 20 / 19_531.25
+    reply_s = 20 / 19_531.25 * (1 + 40e-6)
     cycle_s = SERVO_CYCLE_S * (1 + 40e-6)
 
     for _ in range(20):
@@ -265,8 +288,8 @@ def test_hard_reset_is_silent_and_restores_the_power_up_state():
     assert len(host.send(1, Command.NO_OPERATION)) == 2
 
 
-def test_host_may_address_a_tenth_of_a_millisecond_after_the_reset():
-    host = host_on("ls182ap", "picservo-v4")
+def test_host_may_address_a_tenth_of_a_millisecond_after_the_reset_where_that_takes_no_time():
+    host = host_on("ls182ap", "picservo-v4", settings=ModuleSettings(version=20, reset_dead_s=0.0))
 
     host.chain.write(host.now_s, encode_packet(Packet(0xFF, Command.HARD_RESET)))
     host.wait(40 / 19_200 + 0.0001)
@@ -277,10 +300,24 @@ def test_host_may_address_a_tenth_of_a_millisecond_after_the_reset():
 def test_reset_dead_time_swallows_what_comes_too_early():
     host = host_on("ls182ap", settings=ModuleSettings(version=20, reset_dead_s=0.05))
     host.wait(0.1)
+    remarks = []
+    host.chain.on_remark = remarks.append
     host.send(0xFF, Command.HARD_RESET)
 
     too_early = host.send(0, Command.SET_ADDRESS, 1, 0xFF)
     host.wait(0.05)
+
+    assert too_early == b""
+    assert remarks == ["module 1: lost: the module is still resetting"]
+    host.address_all()
+
+
+def test_a_reset_takes_a_millisecond_unless_something_else_is_said():
+    host = host_on("ls182ap")
+    host.chain.write(host.now_s, encode_packet(Packet(0xFF, Command.HARD_RESET)))
+    host.wait(40 / 19_200 + 0.0001)
+
+    too_early = host.send(0, Command.SET_ADDRESS, 1, 0xFF)
 
     assert too_early == b""
     host.address_all()
@@ -408,6 +445,16 @@ def test_set_baud_to_one_group_splits_the_line():
     assert (at_19200, at_115200) == ([2, 3], [1])
 
 
+@pytest.mark.parametrize(("drift_ppm", "follows"), [(0.0, True), (-20_000.0, False), (20_000.0, True)])
+def test_a_drive_whose_clock_is_fast_does_not_follow_a_rate_that_its_divisor_misses(drift_ppm, follows):
+    host = host_on("ls182ap", settings=ModuleSettings(version=20, drift_ppm=drift_ppm))
+    host.send(0xFF, Command.SET_BAUD_RATE, 0x14)  # 59,524
+
+    host.chain.baud = 57_600
+
+    assert (len(host.send(1, Command.NO_OPERATION)) == 2) is follows
+
+
 def test_a_reset_at_the_working_rate_leaves_behind_who_is_in_another_group():
     host = host_on("ls-182ap", "pic-servo-v4")
     host.send(2, Command.SET_ADDRESS, 2, 0x81)
@@ -419,6 +466,6 @@ def test_a_reset_at_the_working_rate_leaves_behind_who_is_in_another_group():
     host.chain.baud = 19_200
 
     assert [module.address for module in host.chain.modules] == [0, 2]
-    assert host.chain.modules[1].baud == pytest.approx(113_636, abs=1)
+    assert host.chain.modules[1].baud == pytest.approx(113_636, rel=1e-4)
     assert len(host.send(0, Command.SET_ADDRESS, 1, 0xFF)) == 2
     assert host.send(0, Command.SET_ADDRESS, 2, 0xFF) == b""  # at the rate of a reset module 2 hears noise

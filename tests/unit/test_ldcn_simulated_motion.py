@@ -161,6 +161,18 @@ def test_output_limit_bounds_the_pwm_but_not_in_pwm_mode():
     assert axis.pwm() == 120
 
 
+@pytest.mark.parametrize(("name", "pwm"), [("ls182ap", 20), ("picservo-v4", 25), ("picservo-sc", 20)])
+def test_deadband_compensation_lifts_the_output_above_its_limit_on_version_4_only(name, pwm):
+    gains = Gains(kp=256, kd=0, ki=0, il=0, ol=20, cl=0, el=16_000, sr=1, deadband=5)
+    axis = SimulatedAxis(name, gains=gains)
+    axis.suffer(Condition.STALLED)
+
+    axis.stop(ON | StopControl.HERE, *little(1000, 4))
+    axis.wait(0.1)
+
+    assert axis.pwm() == pwm
+
+
 def test_deadband_is_added_to_the_output():
     axis = SimulatedAxis(gains=Gains(kp=256, kd=0, ki=0, il=0, ol=250, cl=0, el=16_000, sr=1, deadband=5))
 

@@ -58,7 +58,7 @@ def test_sc_looks_the_rate_up_and_the_others_divide(name, code, baud):
 
     host.send(0xFF, Command.SET_BAUD_RATE, code)
 
-    assert host.chain.modules[0].baud == pytest.approx(baud, abs=1)
+    assert host.chain.modules[0].baud == pytest.approx(baud, rel=1e-4)
 
 
 def test_a_host_talks_to_sc_at_230400():
@@ -461,6 +461,7 @@ def power_cycle(axis):
     axis.drive.power(on=False, at_s=axis.now_s)
     axis.wait(0.1)
     axis.drive.power(on=True, at_s=axis.now_s)
+    axis.wait(0.002)
 
 
 def test_hard_reset_with_data_saves_and_only_a_power_cycle_restores():
@@ -516,6 +517,7 @@ def test_saved_addresses_answer_at_once_and_let_the_next_module_hear():
     first = host.chain.modules[0]
     first.power(on=False, at_s=host.now_s)
     first.power(on=True, at_s=host.now_s)
+    host.wait(0.002)
 
     assert len(host.send(5, Command.NO_OPERATION)) == 2
     assert len(host.send(2, Command.NO_OPERATION)) == 2

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, Reply
+from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, Reply, received_at
 
 HOST_BYTE_S = 10 / 19_200
 
@@ -155,17 +155,35 @@ def test_wrong_rate_is_a_framing_error_for_each_module_on_its_own():
     assert [value for _, value in fast.heard] == [ord("a")]
 
 
-def test_reply_at_another_rate_is_garbage():
-    module = Parrot(b"xyz", delay_s=0.01)
-    chain = Chain([module])
+@pytest.mark.parametrize(
+    ("answer", "baud", "heard"),
+    [
+        (b"\x39\x39", 115_200, "e00000e00000"),  # six of its bits to one of the module's: 1 and 0 run together
+        (b"\x39\x39", 38_400, "8698f8f8"),
+        (b"\x39\x39", 9600, "ad"),  # half of its bits; the second byte is over before the stop bit of the first
+        (b"\xff\xff", 1200, ""),  # both start bits are over too soon
+    ],
+)
+def test_reply_at_another_rate_is_what_a_port_samples(answer, baud, heard):
+    chain = Chain([Parrot(answer, delay_s=0.01)])
     chain.write(0.0, b"a")
     chain.advance(2 * HOST_BYTE_S)
 
-    chain.baud = 115_200
-    received = b"".join(data for _, data in chain.advance(1.0))
+    chain.baud = baud
 
-    assert received
-    assert received != b"xyz"
+    assert b"".join(data for _, data in chain.advance(1.0)).hex() == heard
+
+
+def test_a_rate_that_is_a_little_off_is_received_and_one_that_is_off_by_a_bit_in_a_byte_is_not():
+    text = bytes(range(256))
+
+    assert [received_at(text, ratio) == text for ratio in (0.93, 0.96, 1.0, 1.04, 1.08)] == [
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_without_baud_check_any_rate_is_understood():

@@ -202,7 +202,7 @@ class Field:
         return value.to_bytes(self.width, "little", signed=self.least < 0)
 
     def decode(self, data: bytes) -> int:
-        """Return the value of up to `width` bytes, in range or not; missing ones count as 0, as in the firmware."""
+        """Return the value of up to `width` bytes, in range or not; missing ones count as 0."""
         return int.from_bytes(data[: self.width].ljust(self.width, b"\0"), "little", signed=self.least < 0)
 
 

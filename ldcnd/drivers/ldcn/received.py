@@ -1,11 +1,13 @@
 """LDCN/NMC commands as a module takes them: from a packet to a value.
 
 For the simulator, the wire log and tests. A module believes the count in the command byte: surplus data bytes are
-ignored, missing ones count as 0. `interpret` does the same and says what was odd; `decode_command` refuses the odd.
+ignored, and missing ones are those that an earlier packet has left in its receive buffer (seen on real hardware: Define
+Status without its byte takes the first one of the Set Address before). `interpret` does the same and says what was odd;
+`decode_command` refuses the odd.
 Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.commands import COMMON_COMMANDS
@@ -194,18 +196,34 @@ class Interpretation:
     checksum_ok: bool = True
 
 
-def interpret(profile: Profile, packet: Packet) -> Interpretation:
-    """Take an intact packet as this device would."""
-    command, expected = _decode(profile, packet)
+def interpret(profile: Profile, packet: Packet, buffered: bytes = b"") -> Interpretation:
+    """Take an intact packet as this device would; `buffered` as in `received_command`."""
+    command, expected = _complete(profile, packet, buffered)
     return Interpretation(packet.address, command, _oddities(profile, packet, command, expected))
 
 
-def received_command(profile: Profile, packet: Packet) -> ReceivedCommand:
-    """Return what an intact packet commands this device to do."""
-    return _decode(profile, packet)[0]
+def received_command(profile: Profile, packet: Packet, buffered: bytes = b"") -> ReceivedCommand:
+    """Return what an intact packet commands this device to do.
+
+    Args:
+        profile: the dialect.
+        packet: what came.
+        buffered: data bytes in the receive buffer; those behind the packet's own are left from earlier packets. Bytes
+            that are not given count as 0.
+    """
+    return _complete(profile, packet, buffered)[0]
 
 
-def interpret_bytes(profile: Profile, data: bytes) -> Interpretation:
+def _complete(profile: Profile, packet: Packet, buffered: bytes) -> tuple[ReceivedCommand, int]:
+    """Return the command with what the buffer adds, and how many data bytes it should have had."""
+    command, expected = _decode(profile, packet)
+    while len(packet.data) < min(expected, len(buffered)):  # the first byte may tell that there are more
+        packet = replace(packet, data=packet.data + buffered[len(packet.data) : expected])
+        command, expected = _decode(profile, packet)
+    return command, expected
+
+
+def interpret_bytes(profile: Profile, data: bytes, buffered: bytes = b"") -> Interpretation:
     """Take the first packet in the bytes of a line as this device would, wrong checksum included.
 
     Raises:
@@ -215,7 +233,7 @@ def interpret_bytes(profile: Profile, data: bytes) -> Interpretation:
     for at, byte in enumerate(data):
         received = reader.feed(byte)
         if received:
-            return _with_frame(profile, received, checksum=byte, left=len(data) - at - 1)
+            return _with_frame(profile, received, buffered, checksum=byte, left=len(data) - at - 1)
     raise BadReply(f"no complete packet in {len(data)} bytes")
 
 
@@ -231,9 +249,11 @@ def decode_command(profile: Profile, data: bytes) -> Interpretation:
     return interpretation
 
 
-def _with_frame(profile: Profile, received: ReceivedPacket, *, checksum: int, left: int) -> Interpretation:
+def _with_frame(
+    profile: Profile, received: ReceivedPacket, buffered: bytes, *, checksum: int, left: int
+) -> Interpretation:
     packet = received.packet
-    plain = interpret(profile, packet)
+    plain = interpret(profile, packet, buffered)
     oddities = plain.oddities
     if not received.checksum_ok:
         computed = (packet.address + (len(packet.data) << 4 | packet.command) + sum(packet.data)) & 0xFF
@@ -254,7 +274,9 @@ def _oddities(profile: Profile, packet: Packet, command: ReceivedCommand, expect
     what = f"{count} data bytes, {packet.command.name} takes {expected}"
     if packet.command is Command.LOAD_TRAJECTORY and packet.data:
         what = f"{count} data bytes, control byte {packet.data[0]:02X} implies {expected}"
-    return (f"{what}: {f'{expected - count} count as 0' if count < expected else 'the surplus is ignored'}",)
+    if count > expected:
+        return (f"{what}: the surplus is ignored",)
+    return (f"{what}: the rest is what an earlier packet has left in the receive buffer",)
 
 
 def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
@@ -287,9 +309,13 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
 
 
 def _gain_bytes(profile: Profile, count: int) -> int:
-    """Return how many bytes Set Gain should have had: PIC-SERVO SC takes those of every older version."""
+    """Return how many bytes Set Gain should have had: PIC-SERVO takes those of every older version.
+
+    "If the command 0xD6 is used (and only 13 data bytes are sent, version 4 will use a default value of zero for the
+    deadband compensation" (PIC-SERVO manual, 5.2); the manual of LS-182AP has 14 bytes only.
+    """
     accepted = range(OLDEST_GAIN_BYTES, profile.gain_bytes)
-    return count if profile.sc_extensions and count in accepted else profile.gain_bytes
+    return count if not profile.pic_ae_diagnostics and count in accepted else profile.gain_bytes
 
 
 def _decode_network(packet: Packet, first: int) -> tuple[ReceivedCommand, int]:

@@ -3,7 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import fields
 
-from ldcnd.drivers.ldcn.packet import STATUS_BYTE_ONLY, Status, StatusFlag, StatusItem, decode_status
+from ldcnd.drivers.ldcn.packet import (
+    FRAME_BYTES,
+    HEADER,
+    MOST_DATA_BYTES,
+    STATUS_BYTE_ONLY,
+    Status,
+    StatusFlag,
+    StatusItem,
+    decode_status,
+)
 from ldcnd.drivers.ldcn.pic_io import IoItem, IoStatus, decode_io_status
 from ldcnd.drivers.ldcn.profiles import LS_182AP, DeviceKind, Profile, identify
 from ldcnd.drivers.ldcn.received import DefineStatus, HardReset, PlainCommand, ReadStatus, interpret_bytes
@@ -27,6 +36,9 @@ class LdcnTranscript:
         self._defined: dict[int, StatusItem] = {}
         self._asked: tuple[int, Profile, StatusItem] = (0, LS_182AP, STATUS_BYTE_ONLY)
         self._parts = Parts()
+        self._buffered = bytearray(
+            MOST_DATA_BYTES
+        )  # data bytes of earlier packets, which modules fill short ones up with
 
     def describe(self, record: WireRecord) -> str:
         """Return the record's packet in words; empty when there is none."""
@@ -45,7 +57,10 @@ class LdcnTranscript:
     def _request(self, data: bytes) -> str:
         address = interpret_bytes(LS_182AP, data).address
         profile = self._learned.get(address) or self._profiles.get(address, LS_182AP)
-        meaning = interpret_bytes(profile, data)
+        meaning = interpret_bytes(profile, data, bytes(self._buffered))
+        start = data.index(HEADER) + FRAME_BYTES - 1
+        own = data[start : start + (data[start - 1] >> 4)]
+        self._buffered[: len(own)] = own
         command = meaning.command
         items = self._defined.get(address, STATUS_BYTE_ONLY)
         match command:

@@ -35,6 +35,8 @@ from ldcnd.sim.ldcn.quirks import (
 )
 from ldcnd.sim.plant import MotorPlant
 
+MOST_DRIFT_PPM = 30_000.0
+"""Beyond any crystal: with the 3.3 % by which the printed divisor misses 57600, a drive no longer follows that rate."""
 ENDLESS_TRAVEL_COUNTS = (-(1 << 30), 1 << 30)
 
 
@@ -112,12 +114,13 @@ class Quirks(Frozen):
     """Its clock, PIC-SERVO up to version 5; servo cycle and rates follow it. 20 MHz when left out."""
     phase_s: float | None = Field(default=None, ge=0, lt=SERVO_CYCLE_S)
     """Where its servo cycles lie; drawn from the seed when left out."""
-    drift_ppm: float | None = Field(default=None, ge=-10_000, le=10_000)
-    """How much longer its servo cycles are than nominal; drawn from the seed when left out."""
+    drift_ppm: float | None = Field(default=None, ge=-MOST_DRIFT_PPM, le=MOST_DRIFT_PPM)
+    """How much longer its servo cycles and its bits are than nominal; drawn from the seed when left out."""
     reply_latency_s: float | None = Field(default=None, ge=0, le=10)
     """Added between the end of the servo cycle and the reply."""
     reset_dead_s: float | None = Field(default=None, ge=0, le=10)
-    """How long it is deaf after Hard Reset and power-up."""
+    """How long it is deaf after Hard Reset and power-up; 0.001. A host that takes a port for drained as soon as it has
+written needs 0: a terminal does not wait for the line."""
     always_obeys_global_reset: bool | None = None
     """Whether Hard Reset to FF is obeyed in any group, or only in group FF."""
     yields_to_host: bool | None = None
@@ -215,6 +218,8 @@ class IoConfig(Frozen):
     """Lines held low from outside; the others are pulled up."""
     wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
     """Pairs of a line and the line that it drives while it is an output."""
+    inverted_wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
+    """The same, driven to the opposite level: of the two sensors of a cylinder one sees what the other does not."""
     adc: tuple[Byte, Byte, Byte] = (0, 0, 0)
     """Values of the three A/D inputs, 0 to 255 for 0 to 5 V."""
     pulses_hz: float = Field(default=0.0, ge=0, le=4_000_000)
@@ -223,7 +228,16 @@ class IoConfig(Frozen):
     def wiring(self) -> IoWiring:
         """Return what the simulator builds."""
         wires = {driven: driver for driver, driven in self.wires}
-        return IoWiring(frozenset(self.low), wires, self.adc, self.pulses_hz)
+        inverted = {driven: driver for driver, driven in self.inverted_wires}
+        return IoWiring(frozenset(self.low), wires, self.adc, self.pulses_hz, inverted)
+
+    @model_validator(mode="after")
+    def _one_driver(self) -> Self:
+        driven = [line for _, line in (*self.wires, *self.inverted_wires)]
+        for line in driven:
+            if driven.count(line) > 1:
+                raise ValueError(f"wires, inverted_wires: line {line} is driven by more than one line")
+        return self
 
 
 class SimulatedModuleConfig(Frozen):

@@ -115,6 +115,7 @@ class SimulatedDrive(SimulatedModule):
         else:
             self._conditions.discard(condition)
         self.shaft.stalled = Condition.STALLED in self._conditions
+        self.shaft.limits_actuated = Condition.LIMITS_ACTUATED in self._conditions
         if Condition.SLOW_PROCESSOR in self._conditions:
             self._overrun = True
         self.stage.check()
@@ -141,7 +142,6 @@ class SimulatedDrive(SimulatedModule):
         self._new_goal = False
         self._speed = 0
         self._acceleration = 0
-        self._pwm_or_target = 0
         self._pins = _ALL_INPUTS
         self._overrun = False
         self._locked = False
@@ -358,7 +358,7 @@ class SimulatedDrive(SimulatedModule):
         if trajectory.acceleration is not None:
             self._acceleration = trajectory.acceleration
         if trajectory.pwm_or_target is not None:
-            self._pwm_or_target = trajectory.pwm_or_target
+            self.loop.pwm_register = trajectory.pwm_or_target
 
     def _from_command_position(self, counts: int) -> int:
         return self.loop.trajectory.position // FRACTION + counts
@@ -402,18 +402,17 @@ class SimulatedDrive(SimulatedModule):
 
     def _run_pwm(self, trajectory: Trajectory) -> None:
         loop = self.loop
-        pwm = -self._pwm_or_target if trajectory.reverse else self._pwm_or_target
+        register = loop.pwm_register
+        pwm = -register if trajectory.reverse else register
         if self.profile.sc_extensions and trajectory.pwm_or_target is None:
             pwm = loop.pwm
         self._end_path()
-        loop.open()
-        if loop.may_run(pwm):
-            loop.pwm = pwm
+        loop.put_out(pwm if loop.may_run(pwm) else 0, register)
 
     def _run_at_velocity(self, trajectory: Trajectory) -> None:
         loop = self.loop
         if self.profile.analog_target and trajectory.pwm_or_target is not None:
-            loop.run_to_analog_target(self._pwm_or_target, self._speed, self._acceleration)
+            loop.run_to_analog_target(trajectory.pwm_or_target, self._speed, self._acceleration)
             return
         loop.analog_target = None
         loop.trajectory.run_at(-self._speed if trajectory.reverse else self._speed, self._acceleration)
@@ -474,8 +473,8 @@ class SimulatedDrive(SimulatedModule):
     def _obey_stage(self) -> None:
         if self.loop.servo_on and not self.stage.allows_servo:
             self.loop.open()
-        elif not self.stage.drives:
-            self.loop.pwm = 0 if not self.loop.servo_on else self.loop.pwm
+        elif not self.stage.drives and not self.loop.servo_on:
+            self.loop.pwm = self.loop.pwm_register = 0
 
 
 def _short(value: int) -> int:

@@ -1,7 +1,8 @@
 """Simulated modules without a servo loop: PIC-I/O with what is connected to it, and modules that are only identified.
 
 A line of a PIC-I/O that is an output has the level of its latch. An input has the level of the output that is wired to
-it, or the one that it is driven to from outside, or is pulled up. Where the data sheet leaves room:
+it, or the opposite one, as a sensor at the other end of a cylinder has, or the one that it is driven to from outside,
+or is pulled up. Where the data sheet leaves room:
 
 * Output latches, stored outputs and PWM values are 0 after a reset; a line that becomes an output shows its latch.
 * Counter and timer are 0 and off after a reset, and keep their count while they are off.
@@ -52,12 +53,14 @@ class IoWiring:
         wires: lines that another line drives while that is an output, each by the number of its driver.
         adc: the values of the three A/D inputs, 0 to 255.
         pulses_hz: of a square wave at the counter's line, for the counter only; 0 for none.
+        inverted_wires: as `wires`, driven to the opposite of the driver's level.
     """
 
     low: frozenset[int] = frozenset()
     wires: Mapping[int, int] = field(default_factory=dict)
     adc: tuple[int, int, int] = (0, 0, 0)
     pulses_hz: float = 0.0
+    inverted_wires: Mapping[int, int] = field(default_factory=dict)
 
 
 class SimulatedIo(SimulatedModule):
@@ -71,7 +74,8 @@ class SimulatedIo(SimulatedModule):
 
     def __init__(self, profile: Profile, settings: ModuleSettings, wiring: IoWiring | None = None) -> None:
         wiring = wiring or IoWiring()
-        self._wires = dict(wiring.wires)
+        self._wires = [(line, driver, 0) for line, driver in wiring.wires.items()]
+        self._wires += [(line, driver, 1) for line, driver in wiring.inverted_wires.items()]
         self._low = sum(1 << line - 1 for line in wiring.low)
         self._adc = list(wiring.adc)
         self._pulses_per_cycle = wiring.pulses_hz * SERVO_CYCLE_S
@@ -83,9 +87,9 @@ class SimulatedIo(SimulatedModule):
     def levels(self) -> int:
         """The levels of the twelve pins."""
         levels = ~self._low & ALL_LINES
-        for line, driver in self._wires.items():
+        for line, driver, inverted in self._wires:
             if self.outputs & 1 << driver - 1:
-                levels = levels & ~(1 << line - 1) | (self.latch >> driver - 1 & 1) << line - 1
+                levels = levels & ~(1 << line - 1) | ((self.latch >> driver - 1 & 1) ^ inverted) << line - 1
         return levels & ~self.outputs | self.latch & self.outputs
 
     def drive_line(self, line: int, *, high: bool, at_s: float) -> None:

@@ -5,6 +5,9 @@ every module has its own phase and drift of that grid. Decisions where the manua
 
 * A byte of the host that arrives before the status packet has been sent makes a module drop that packet. The command
   itself waits in the buffer into which the next packet is received, and is overwritten by the address byte of any.
+* Data bytes that a packet lacks are those that the receive buffer holds from earlier packets, for this module or
+  another; after a reset it holds zeros.
+* Before a module has restarted after a reset it receives nothing.
 * A framing error in the middle of a packet counts as a wrong checksum; outside of packets it is nothing.
 * Nothing is received while the address input is high. It is a level, not a latch, unless a switch says otherwise: a
   module behind one that was reset is deaf until that one has an address again.
@@ -15,7 +18,15 @@ Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface"
 import math
 from abc import abstractmethod
 
-from ldcnd.drivers.ldcn.packet import FRAME_BYTES, HEADER, Command, Packet, PacketReader, StatusItem
+from ldcnd.drivers.ldcn.packet import (
+    FRAME_BYTES,
+    HEADER,
+    MOST_DATA_BYTES,
+    Command,
+    Packet,
+    PacketReader,
+    StatusItem,
+)
 from ldcnd.drivers.ldcn.profiles import Profile, at_clock
 from ldcnd.drivers.ldcn.received import (
     DefineStatus,
@@ -27,7 +38,7 @@ from ldcnd.drivers.ldcn.received import (
     SetBaudRate,
     received_command,
 )
-from ldcnd.drivers.ldcn.registers import RESET_BAUD_CODE, actual_baud, module_baud
+from ldcnd.drivers.ldcn.registers import RESET_BAUD, RESET_BAUD_CODE, actual_baud, module_baud
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings, UnknownBaud
 
@@ -51,6 +62,8 @@ class SimulatedModule(Module):
         self.profile = at_clock(profile, settings.clock_hz)
         self.settings = settings
         self._reader = PacketReader()
+        self._missed = PacketReader()  # what comes while it restarts
+        self._buffer = bytearray(MOST_DATA_BYTES)
         self._cycle_s = self.profile.servo_cycle_s * (1.0 + settings.drift_ppm * 1e-6)
         self._cycles_done = 0
         self.address = 0
@@ -73,7 +86,13 @@ class SimulatedModule(Module):
 
     def hear(self, value: int | None, at_s: float) -> None:
         """Take a byte of the host; a complete packet for this module waits for the end of the servo cycle."""
-        if not self._powered or at_s < self._deaf_until_s:
+        if not self._powered:
+            return
+        if at_s < self._deaf_until_s:
+            began = self._missed.in_packet
+            self._missed.feed(value or 0)
+            if self._missed.in_packet and not began:
+                self.remark("lost: the module is still resetting")
             return
         self._fall_silent()
         if self._reader.in_packet:
@@ -88,7 +107,10 @@ class SimulatedModule(Module):
         intact = received.checksum_ok and not self._damaged
         self._damaged = False
         packet = received.packet
-        if not self._is_for_me(packet.address, packet.command):
+        mine = self._is_for_me(packet.address, packet.command)
+        if mine or self._loses_commands:
+            self._buffer[: len(packet.data)] = packet.data
+        if not mine:
             return
         self._answers = packet.address == self.address or (packet.address == self.group and self.leader)
         self._packet, self._intact = packet, intact
@@ -109,6 +131,8 @@ class SimulatedModule(Module):
         else:
             self._fall_silent()
             self._overwrite()
+            if self._loses_commands:
+                self._buffer[: len(data) - FRAME_BYTES] = data[FRAME_BYTES - 1 : -1]
 
     def advance(self, to_s: float) -> Reply | None:
         """Execute the packet that waits, at the end of the servo cycle, and begin the reply."""
@@ -204,7 +228,8 @@ class SimulatedModule(Module):
         if not self._intact:
             return self.status(self.items, checksum_error=True) if self._answers else None
         items = self.items
-        match received_command(self.dialect, packet):
+        # seen on the line of an SK-2310g2: Define Status without its byte after Set Address 06 FF takes 06 for the mask
+        match received_command(self.dialect, packet, bytes(self._buffer)):
             case SetAddress() as addresses:
                 self.address, self.group, self.leader = addresses.address, addresses.group, addresses.leader
                 self.address_out = True
@@ -219,9 +244,9 @@ class SimulatedModule(Module):
                 if baud is None:
                     self.unknown_bauds += 1
                     if self.settings.unknown_baud is UnknownBaud.DIVIDED:
-                        self.baud = actual_baud(code, self.profile.clock_hz)
+                        self._set_rate(actual_baud(code, self.profile.clock_hz))
                 else:
-                    self.baud = baud
+                    self._set_rate(baud)
             case HardReset(start_up):
                 if start_up is not None:
                     self.save(start_up)
@@ -233,6 +258,11 @@ class SimulatedModule(Module):
                 self.execute(command)
         return self.status(items, checksum_error=False) if self._answers else None
 
+    def _set_rate(self, nominal: float) -> None:
+        # servo cycle and rate come from one clock: "any clock between 10 MHz and 20 MHz may be used, with the timing
+        # specifications adjusted proportionally" (PIC-SERVO manual, 3.0)
+        self.baud = nominal / (1.0 + self.settings.drift_ppm * 1e-6)
+
     def _reset(self, at_s: float) -> None:
         self._deaf_until_s = at_s + self.settings.reset_dead_s
         self._start_afresh()
@@ -242,10 +272,12 @@ class SimulatedModule(Module):
         self.group = EVERYBODY
         self.leader = False
         self.items = StatusItem(0)
-        self.baud = module_baud(self.profile, RESET_BAUD_CODE) or self.baud
+        self._set_rate(module_baud(self.profile, RESET_BAUD_CODE) or RESET_BAUD)
         self.address_out = self.latched = False
         self.next_event_s = NEVER_S
         self._reader.reset()
+        self._missed.reset()
+        self._buffer = bytearray(MOST_DATA_BYTES)
         self._packet = None
         self._reply = None
         self._damaged = False

@@ -25,6 +25,8 @@ class Condition(StrEnum):
     """The counter stands still, and the drive does not notice."""
     SENSOR_LOST = "sensor_lost"
     """The potentiometer is disconnected: the A/D converter reads 0."""
+    LIMITS_ACTUATED = "limits_actuated"
+    """Both limit switches are actuated, wherever the shaft is: the wire that they share is broken."""
     STALLED = "stalled"
     """Something holds the shaft."""
     SLOW_PROCESSOR = "slow_processor"

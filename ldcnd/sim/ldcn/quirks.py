@@ -120,9 +120,9 @@ class ModuleSettings:
         version: second byte of its identity.
         phase_s: where its servo cycles lie, 0 to 0.000512.
         clock_hz: of the module.
-        drift_ppm: how much longer its servo cycles are than nominal.
+        drift_ppm: how much longer its servo cycles and its bits are than nominal.
         reply_latency_s: added between the end of the cycle and the reply.
-        reset_dead_s: how long it is deaf after Hard Reset and power-up.
+        reset_dead_s: how long it is deaf after Hard Reset and power-up; no manual says it.
         always_obeys_global_reset: obeys Hard Reset to FF in any group; PIC-SERVO up to version 5 and PIC-I/O do so only
             in group FF.
         yields_to_host: drops its reply as soon as the host sends, also one that is due.
@@ -175,7 +175,7 @@ class ModuleSettings:
     phase_s: float = 0.0
     drift_ppm: float = 0.0
     reply_latency_s: float = 0.0
-    reset_dead_s: float = 0.0
+    reset_dead_s: float = 0.001
     always_obeys_global_reset: bool = False
     yields_to_host: bool = True
     command_buffer: CommandBuffer = CommandBuffer.OVERWRITTEN

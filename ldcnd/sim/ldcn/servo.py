@@ -5,7 +5,8 @@ One call of `run` lets servo cycles of 0.512 ms pass. Where nothing changes any 
 The filter is that of both manuals (PIC-SERVO manual, 4.3), with one correction: the derivative term is printed with a
 minus sign, which would drive the motor away from its target; it damps, as the text around it says. The integral error
 is the running sum of the position error divided by 256, rounded down; the sum is bounded by 256 times IL, also on
-PIC-SERVO SC, whose data sheet is silent about the factor. Deadband compensation is added to any output that is not 0.
+PIC-SERVO SC, whose data sheet is silent about the factor. Deadband compensation is added to any output that is not 0;
+PIC-SERVO version 4 and CMC add it to what the output limit has left, the others bound the sum.
 
 Where the manuals leave room:
 
@@ -91,6 +92,7 @@ class ServoLoop:
         trajectory: the command position.
         servo_on: the position loop is closed.
         pwm: signed output to the power stage, -255 to 255.
+        pwm_register: what PWM mode puts out when it is entered, 0 to 255.
         analog_target: the A/D value that an absolute positioning motion goes to; the mode lasts beyond the arrival,
             and with it the check of the sensor.
         protection: limit protection as selected by I/O Control.
@@ -112,7 +114,7 @@ class ServoLoop:
         self.gains = _NO_GAINS
         self.trajectory = ProfileGenerator(PathBuffer(profile.path_points, quirks))
         self.servo_on = False
-        self.pwm = 0
+        self.pwm = self.pwm_register = 0
         self.analog_target: int | None = None
         self.protection = IoOption(0)
         self.step_mode = False
@@ -129,6 +131,11 @@ class ServoLoop:
         self._divisor = 1
         self._tick_cycles = 1
         self._path_every_cycle = quirks.path_ignores_divisor and profile.divisor_slows_profile
+        # "OL limits the maximal PWM output value" (LS-182AP manual, "Set Gain"), "PWM = min(|out / 256| + DB, OL)" less
+        # the adjustment (PIC-SERVO SC data sheet, 4.3); elsewhere deadband compensation "will be added to the magnitude
+        # of the PWM output", which is "min(abs(output/256), output_limit) - current_limit_adjustment" (PIC-SERVO
+        # manual, 5.2 "Set Gain", 4.3)
+        self._deadband_within_limit = profile.pic_ae_diagnostics or profile.sc_extensions
         rate = profile.encoder_counts_per_s if quirks.encoder_counts_per_s is None else quirks.encoder_counts_per_s
         self._most_counts = round(rate * profile.servo_cycle_s) if rate else COUNTER_SPAN
         self._overload_cycles = round(quirks.overload_s / profile.servo_cycle_s)
@@ -215,13 +222,20 @@ class ServoLoop:
     def open(self) -> None:
         """Open the position loop; the PWM value falls to 0 and pos_error is set."""
         self.servo_on = False
-        self.pwm = 0
+        # "The PWM value is reset to 0 internally on any condition which automatically disables the position servo"
+        # (PIC-SERVO manual, 5.2 "Load Trajectory"), and by Stop Motor (4.5; LS-182AP manual, "Stop Motor")
+        self.pwm = self.pwm_register = 0
         self.position_error = True
         self.analog_target = None
         path = self.trajectory.path
         if path.running:
             path.end(clear=self._quirks.path_cleared_by_fault)
         self.trajectory.follow(self.position, self.velocity)
+
+    def put_out(self, pwm: int, register: int) -> None:
+        """Open the loop on request and enter PWM mode, with a signed output and what the register holds."""
+        self.open()
+        self.pwm, self.pwm_register = pwm, register
 
     def run(self, cycles: int) -> None:
         """Let servo cycles pass."""
@@ -317,7 +331,7 @@ class ServoLoop:
     def _cycle(self) -> bool:
         """Let one servo cycle pass; tell whether it left everything as it was."""
         shaft, stage = self.shaft, self.stage
-        pwm, error_sum, before = self.pwm, self._error_sum, self.position
+        pwm, error_sum, before, limited = self.pwm, self._error_sum, self.position, self._limited
         shaft.step(pwm / FULL_PWM if stage.drives else None)
         if not stage.conditions or Condition.ENCODER_STUCK not in stage.conditions:
             position = math.floor(shaft.position_counts) - self._zero
@@ -334,7 +348,7 @@ class ServoLoop:
         if self._cycles_left <= 0:
             self._cycles_left = self._tick_cycles
             self._tick()
-        if self.gains.cl:
+        if self.gains.cl or self._limited:
             self._limit_current()
         if self.search:
             self._look_for_home(self.search)
@@ -347,6 +361,7 @@ class ServoLoop:
             and self.position == before
             and self.pwm == pwm
             and self._error_sum == error_sum
+            and self._limited == limited
             and self.trajectory.at_rest
             and not self._overloaded
             and not (self.step_mode and self._quirks.steps_hz)
@@ -410,12 +425,15 @@ class ServoLoop:
         self._error_sum = total
         output = gains.kp * error + gains.kd * self._derivative + gains.ki * (total >> 8)
         magnitude = (output if output >= 0 else -output) >> 8
+        deadband = gains.deadband if output or self._quirks.deadband_at_zero else 0
+        if self._deadband_within_limit:
+            magnitude += deadband
         if magnitude > gains.ol:  # noqa: PLR1730 - min() costs twice as much, in every servo cycle
             magnitude = gains.ol
         if self._limited:
             magnitude -= min(magnitude, self._limited)
-        if gains.deadband and (output or self._quirks.deadband_at_zero):
-            magnitude = min(magnitude + gains.deadband, FULL_PWM)
+        if not self._deadband_within_limit and deadband:
+            magnitude = min(magnitude + deadband, FULL_PWM)
         self.pwm = magnitude if output >= 0 else -magnitude
 
     def _give_up(self, cause: Trip) -> None:
@@ -457,15 +475,14 @@ class ServoLoop:
 
     def _limit_current(self) -> None:
         """Take PWM units away per cycle of too much current, and give as many back per cycle without."""
+        limit, on_sc = self.gains.cl, self._profile.sc_extensions
+        threshold, step = (limit, 2) if on_sc else (limit & 0xFE, 1)
         value = self.adc()
-        if self._profile.live_aux:  # PIC-SERVO SC
-            threshold, step = self.gains.cl, 2
-            if threshold == MOST_CURRENT_LIMIT:
-                return
-        else:
-            threshold, step = self.gains.cl & 0xFE, 1
-        over = value > threshold if self.gains.cl & 1 else value < threshold
-        if not over:
+        over = value > threshold if limit & 1 else value < threshold
+        # "Setting CL to 0 effectively disables current limiting" (PIC-SERVO manual, 5.2 "Set Gain"), on PIC-SERVO SC
+        # 255, too (data sheet, 5.2): then no current is above the limit, and "if the motor current is below the
+        # specified limit, current_limit_adjustment is decremented [...] down to a minimum value of zero" (manual, 4.3)
+        if not over or not limit or (on_sc and limit == MOST_CURRENT_LIMIT):
             self._limited = max(0, self._limited - step)
             return
         self.overcurrent = True
