@@ -32,8 +32,8 @@ class GainsConfig(Frozen):
     """Output limit, of 255."""
     cl: int = Field(default=0, ge=0, le=0xFF)
     """Current limit: odd values for a sense voltage that rises with the current, 0 for none; PIC-SERVO only."""
-    el: int = Field(gt=0, le=0x3FFF)
-    """Position error, in counts, beyond which the drive opens its loop."""
+    el: int = Field(gt=0, le=0x7FFF)
+    """Position error, in counts, beyond which the drive opens its loop; at most 16383, PIC-SERVO SC 32767."""
     sr: int = Field(default=1, ge=1, le=0xFF)
     """Servo rate divisor: the servo cycle is this number times 0.512 ms."""
     deadband: int = Field(default=0, ge=0, le=0xFF)

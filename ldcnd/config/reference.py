@@ -1,8 +1,9 @@
 """The configuration file as a page for people, written from the models that read it."""
 
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
@@ -13,6 +14,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.config.toml import Variants
 from ldcnd.model.frozen import attribute_docstrings
 
+PLAIN = {str: "string", int: "integer", float: "number", bool: "true or false", Path: "path"}
 PREFACE = """# Configuration
 
 A rig is one TOML file. `ldcnd check-config FILE` validates it whole, without opening anything, and names file, key,
@@ -102,20 +104,37 @@ def _value(value: Any) -> str:  # noqa: ANN401 - a default can be anything
 def _type(annotation: Any) -> str:  # noqa: ANN401 - an annotation can be anything
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        return _type(arguments[0])
+        marks = [each for mark in arguments[1:] for each in getattr(mark, "metadata", (mark,))]
+        ends = [end for name in ("ge", "le") for mark in marks if (end := getattr(mark, name, None)) is not None]
+        return f"{_type(arguments[0])} {ends[0]:g} to {ends[1]:g}" if len(ends) == 2 else _type(arguments[0])  # noqa: PLR2004
     if origin in (Union, types.UnionType):
         return " or ".join(_type(part) for part in arguments if part is not type(None))
     if origin is Literal:
         return " or ".join(f'`"{choice}"`' for choice in arguments)
     if origin is tuple:
-        return f"array of {_type(arguments[0])}"
+        rest = [each for each in arguments if each is not Ellipsis]
+        count = f"{len(rest)} " if Ellipsis not in arguments else ""
+        kinds = list(dict.fromkeys(map(_plural, rest)))
+        return f"array of {count}{' and '.join(kinds)}"
+    if origin is Mapping:
+        return f"table of {_plural(arguments[1])}, by {_key(arguments[0])}"
     if isinstance(annotation, type) and issubclass(annotation, StrEnum):
         return " or ".join(f'`"{choice}"`' for choice in annotation)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "table"
-    return {"str": "string", "int": "integer", "float": "number", "bool": "true or false", "Path": "path"}.get(
-        getattr(annotation, "__name__", ""), str(annotation)
-    )
+    return PLAIN[annotation]
+
+
+def _plural(annotation: Any) -> str:  # noqa: ANN401 - an annotation can be anything
+    """Return what several of a kind are called."""
+    kind, _, rest = _type(annotation).partition(" ")
+    return f"{kind}s {rest}".rstrip() if kind in {"array", "table", *PLAIN.values()} else f"{kind} {rest}".rstrip()
+
+
+def _key(annotation: Any) -> str:  # noqa: ANN401 - an annotation can be anything
+    """Return what the keys of a table are: the title of their kind, or the names themselves."""
+    titles = (each.title for each in getattr(annotation, "__metadata__", ()) if isinstance(each, FieldInfo))
+    return next((title for title in titles if title), None) or _type(annotation)
 
 
 def _table(annotation: Any) -> tuple[type[BaseModel] | None, bool]:  # noqa: ANN401 - an annotation can be anything

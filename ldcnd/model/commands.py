@@ -533,8 +533,8 @@ class SetGains(AxisCommand[CommandReply]):
     """Output limit."""
     cl: int | None = Field(default=None, ge=0, le=0xFF)
     """Current limit: 0 is off; odd where the sense voltage rises with the current, even where it falls."""
-    el: int | None = Field(default=None, ge=0, le=0x3FFF)
-    """Position error limit."""
+    el: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Position error limit, in counts; at most 16383, PIC-SERVO SC 32767."""
     deadband: int | None = Field(default=None, ge=0, le=0xFF)
     """Amplifier deadband compensation."""
     sr: int | None = Field(default=None, ge=1, le=0xFF)

@@ -66,7 +66,7 @@ def test_the_divisor_is_the_one_that_makes_the_rate():
         (V4, {"baud": 119_000}, "no divisor of a 20 MHz clock makes 119000 baud"),
         (V4, {"baud": 115_200, "clock_mhz": 10.0}, "reaches 62500 at most"),
         (LS_182AP, {"clock_mhz": 16.0, "baud": 19_200}, "has a clock of its own"),
-        (SC, {"baud": 125_000}, "has 9600, 19200"),
+        (SC, {"baud": 125_000}, "only 9600, 19200, 57600, 115200, 230400 are known"),
     ],
 )
 async def test_what_no_drive_of_the_line_can_do_is_refused_in_the_configuration(dialect, line, message):

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 from ldcnd.config.reference import config_reference
@@ -14,3 +15,12 @@ def test_every_key_says_what_it_means():
 
     silent = [line for line in page.splitlines() if line.startswith("| `") and line.endswith("|  |")]
     assert silent == []
+
+
+def test_types_are_words_of_toml():
+    page = config_reference()
+    rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
+
+    foreign = [row for row in rows if re.search(r"[\[\](){}]|[a-z]\.[a-z]", row[1])]
+    assert foreign == []
+    assert ["| `stored`", "table of integers 0 to 65535, by parameter number"] in [row[:2] for row in rows]

@@ -202,7 +202,7 @@ def group_quiet_s(cycle_s: float = SERVO_CYCLE_S) -> float:
 RESET_SETTLE_S = 0.1
 """Time for a module to restart after Hard Reset, seconds; the manuals name no time."""
 COMMON_TOP_BAUD = 125_000
-"""The rate that every dialect reaches."""
+"""The highest rate of any model but PIC-SERVO SC; which rates a model has is checked with the configuration."""
 EEPROM_SETTLE_S = 0.3
 """Time for PIC-SERVO SC to write its EEPROM and to restart, seconds; the data sheet names no time."""
 COMMON_COMMANDS = frozenset(

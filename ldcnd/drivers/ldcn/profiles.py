@@ -67,6 +67,9 @@ class Profile:
         current_limit: Set Gain's CL byte works.
         top_baud: the highest rate of Set Baud Rate.
         baud_keys: Set Baud Rate finds its byte in a table of rates; elsewhere the byte divides the clock.
+        any_divisor: every rate that a divisor of the clock makes is known to work; elsewhere only those that the
+            manuals print, and what byte makes another rate is not known: LS-231 takes 27 for 125000, which is 9
+            elsewhere (`FW`).
         encoder_counts_per_s: the highest rate of encoder transitions that is counted without loss.
         most_velocity: the largest programmed velocity, 16.16 counts per tick.
         most_error_limit: the largest EL of Set Gain, counts.
@@ -114,6 +117,7 @@ class Profile:
     current_limit: bool = True
     top_baud: int = 125_000
     baud_keys: bool = False
+    any_divisor: bool = True
     encoder_counts_per_s: int = 500_000
     most_velocity: int = 0x7FFF_FFFF
     most_error_limit: int = 0x3FFF
@@ -188,6 +192,7 @@ PIC_SERVO_SC = Profile(
     divisor_slows_profile=False,
     top_baud=230_400,
     baud_keys=True,
+    any_divisor=False,
     encoder_counts_per_s=2_500_000,
     most_velocity=1280 << 16,
     most_error_limit=0x7FFF,
@@ -235,11 +240,26 @@ LS_182AP = replace(
     homing_sources=HomingSource.LIMIT1 | HomingSource.LIMIT2 | HomingSource.INDEX | HomingSource.POSITION_ERROR,
     motion_lock_from=22,
 )
-LS_231 = Profile("ls-231", "Logosol LS-231/LS-132 family", 0, range(20, 40), Support.IDENTIFY)
-LS_173 = Profile("ls-173", "Logosol LS-173/LS-174 family", 0, range(60, 80), Support.IDENTIFY)
 PIC_IO = Profile("pic-io", "PIC-I/O", 2, range(1, 2), Support.IDENTIFY, DeviceKind.IO)
-SK_2310G2 = Profile("sk-2310g2", "Logosol SK-2310g2", 2, range(2, 256), Support.IDENTIFY, DeviceKind.SUPERVISOR)
-PIC_STEP = Profile("pic-step", "PIC-STEP", 3, range(256), Support.IDENTIFY, DeviceKind.STEPPER)
+LS_231 = Profile(
+    "ls-231",
+    "Logosol LS-231/LS-132 family",
+    0,
+    range(20, 40),
+    Support.IDENTIFY,
+    top_baud=115_200,
+    any_divisor=False,
+)
+LS_173 = replace(LS_231, name="ls-173", title="Logosol LS-173/LS-174 family", versions=range(60, 80))
+SK_2310G2 = replace(
+    LS_231,
+    name="sk-2310g2",
+    title="Logosol SK-2310g2",
+    device_id=2,
+    versions=range(2, 256),
+    kind=DeviceKind.SUPERVISOR,
+)
+PIC_STEP = replace(LS_231, name="pic-step", title="PIC-STEP", device_id=3, versions=range(256), kind=DeviceKind.STEPPER)
 
 PROFILES: dict[str, Profile] = {
     profile.name: profile

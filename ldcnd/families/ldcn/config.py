@@ -10,9 +10,9 @@ from ldcnd.config.bus import BAUDS, BusConfig
 from ldcnd.config.toml import DeviceIdentity, Name
 from ldcnd.drivers.driver import AxisSpec, Gains
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
-from ldcnd.drivers.ldcn.registers import baud_divisor
+from ldcnd.drivers.ldcn.registers import baud_divisor, encode_gains
 from ldcnd.drivers.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.model.frozen import Frozen
 
 
@@ -36,6 +36,16 @@ class LdcnAxisConfig(MovedAxisConfig):
     """The drive model."""
     address: int = Field(ge=1, le=127)
     """Node address: its place in the daisy chain, from 1."""
+
+    @model_validator(mode="after")
+    def _gains_fit_the_drive(self) -> Self:
+        """Refuse gains that the registers of this model do not take."""
+        if self.gains:
+            try:
+                encode_gains(PROFILES[self.model], Gains(**self.gains.model_dump()))
+            except (ValueOutOfRange, NotSupported) as error:
+                raise ValueError(f"gains of {self.model}: {error.message}") from None
+        return self
 
     @model_validator(mode="after")
     def _has_limit_switches(self) -> Self:
@@ -147,10 +157,12 @@ a time take less processor time. 0 for one at a time."""
             if self.clock_hz != CLOCK_HZ and not profile.any_clock:
                 raise ValueError(f"clock_mhz {self.clock_mhz:g}: {model} at address {address} has a clock of its own")
             top = at_clock(profile, self.clock_hz).top_baud
+            known = [baud for baud in BAUDS if baud <= top]
+            if not profile.any_divisor and self.baud not in known:
+                rates = ", ".join(map(str, known))
+                raise ValueError(f"baud {self.baud}: of {model} at address {address} only {rates} are known")
             if self.baud > top:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {top} at most")
-            if profile.baud_keys and self.baud not in BAUDS:
-                raise ValueError(f"baud {self.baud}: {model} at address {address} has {', '.join(map(str, BAUDS))}")
         if self.baud not in BAUDS:
             try:
                 baud_divisor(self.baud, clock_hz=self.clock_hz)

@@ -158,7 +158,7 @@ class SmartStepUnitConfig(Frozen):
     """/ALM is 1 in alarm."""
     trace: SmartStepTraceConfig = SmartStepTraceConfig()
     """How its recorder is taken to work."""
-    verified: Mapping[str, Verification] = {}
+    verified: Mapping[Annotated[str, Field(title="assumption")], Verification] = {}
     """Results of tests on the drive for the assumptions of its profile, by their keys."""
 
     @model_validator(mode="before")
@@ -237,7 +237,7 @@ class SimulatedUnitConfig(Frozen):
     """RUN is on."""
     pulse_rate: float = 0.0
     """Command units a second that come in from the start."""
-    stored: Mapping[str, Annotated[int, Field(ge=0, le=WORD)]] = {}
+    stored: Mapping[Annotated[str, Field(title="parameter number")], Annotated[int, Field(ge=0, le=WORD)]] = {}
     """Parameters in EEPROM, by number such as Pn102; the others have factory values."""
     worn: int = Field(default=0, ge=0, le=10_000)
     """Writes that its EEPROM has taken already; after 10,000 in all nothing is stored any more."""
