@@ -88,6 +88,7 @@ class MotorDirection(Step):
                 "an encoder that does not count: the loop opens, too, within"
                 f" {lead.distance / lead.velocity:.2g} s, and you are asked whether the axis moved: watch it"
             ),
+            "watch also that it is this axis that moves: equal drives whose addresses are exchanged look alike",
             *HOW_IT_ENDS,
         )
 
@@ -104,6 +105,10 @@ class MotorDirection(Step):
                 nothing = f"the encoder counted nothing with {output} of 255 PWM steps"
                 if abs(moved) < COUNTING and await site.person.confirm(f"{nothing}: did the axis move"):
                     return _blind(nothing, el, points)
+        if abs(moved) >= COUNTING and len(await site.rig.describe()) > 1:
+            name = site.info.axis
+            if not await site.person.confirm(f"the encoder counted {moved}: was it axis {name} that moved"):
+                return _mistaken(name, el, points)
         return _judged(el, points)
 
     async def _try(self, site: Site, axis: Axis, output: int, el: int) -> int:
@@ -183,6 +188,14 @@ async def _refuse_what_cannot_be(site: Site, lead: _Lead) -> None:
 
 def _blind(nothing: str, el: int, points: list[tuple[float, float]]) -> Result:
     text = f"{nothing}, and the axis moved: switch the drive off and check the wires of the encoder"
+    return _result(StepState.FAILED, text, el, points)
+
+
+def _mistaken(name: str, el: int, points: list[tuple[float, float]]) -> Result:
+    text = (
+        f"what moved is not axis {name}: exchange the addresses of the two axes in the configuration (`ldcnd scan PORT`"
+        " says from which end the chain is numbered), start the daemon again, and run this step again"
+    )
     return _result(StepState.FAILED, text, el, points)
 
 

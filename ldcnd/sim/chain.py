@@ -178,7 +178,7 @@ class _Transmission:
 
 
 class Chain:
-    """Modules in daisy-chain order, the first one next to the host.
+    """Modules in daisy-chain order: the address input of the first one is low.
 
     Attributes:
         modules: for inspection; fixed.

@@ -148,6 +148,27 @@ async def test_a_fresh_line_gets_addresses_when_asked():
     assert {Command(packet.command) for packet in packets(sent)} == HARMLESS | ADDRESSING
 
 
+@pytest.mark.parametrize(
+    ("names", "said", "verdict"),
+    [
+        (("ls-182ap", "ls-173ap"), {"next to the host"}, Verdict.FINE),
+        (("ls-182ap", "ls-182ap"), {"next to the host"}, Verdict.LOOK),
+        (("pic-servo-v4", "pic-io"), {"furthest from the host"}, Verdict.FINE),
+        (("pic-servo-sc", "pic-servo-sc"), {"furthest from the host"}, Verdict.LOOK),
+        (("ls-182ap", "pic-step"), {"next to the host", "furthest from the host"}, Verdict.FINE),
+    ],
+)
+async def test_a_scan_says_from_which_end_the_chain_is_numbered(names, said, verdict):
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in names)))
+
+    _, findings, _ = await scanned(chain, give_addresses=True)
+
+    (order,) = (finding for finding in findings if finding.what == "order")
+    ends = {"next to the host", "furthest from the host"}
+    assert {end for end in ends if end in order.text} == said
+    assert order.verdict is verdict
+
+
 @pytest.mark.parametrize("addressed", [1, 2])
 async def test_nothing_is_reset_while_a_drive_moves_or_may(addressed):
     chain = build_chain(ChainSpec((ModuleSpec("ls-182ap"), ModuleSpec("ls-182ap", plant=LONG))))

@@ -118,6 +118,22 @@ def is_seen_to_move(rig):
     return "y" if rig.drive.shaft.plant.encoder_disconnected and abs(rig.drive.shaft.position_counts) > 20 else "n"
 
 
+@pytest.mark.parametrize("wired", [("x", "y"), ("y", "x")])
+async def test_a_chain_that_is_numbered_from_the_other_end_is_noticed_when_the_first_axis_moves(wired, tmp_path):
+    x = rig_text().partition("[[bus.axis]]")[2].partition("[[sim]]")[0]
+    y = x.replace('"x" # the slide', '"y"').replace("address = 1", "address = 2")
+    text = rig_text().replace("[[sim]]", f"[[bus.axis]]{y}[[sim]]")
+    chain = build_chain(ChainSpec((ModuleSpec("picservo-sc", PLANT),) * 2))
+    slide = chain.modules[wired.index("x")]  # what the person sees move
+    async with commissioning_rig(tmp_path, STANDS, text=text, chain=chain) as rig:
+        rig.person.script["was it axis x"] = lambda: "y" if abs(slide.shaft.position_counts) > 10 else "n"
+        kept = await (await rig.checklist()).run("motor")
+
+        right = wired == ("x", "y")
+        assert kept.result.state is (StepState.DONE if right else StepState.FAILED)
+        assert ("exchange the addresses" in kept.result.text) is not right
+
+
 async def test_a_motor_with_friction_is_driven_with_little_more_than_that(tmp_path):
     async with commissioning_rig(tmp_path, STANDS, friction_nm=0.05) as rig:
         kept = await (await rig.checklist()).run("motor")

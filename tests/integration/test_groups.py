@@ -317,7 +317,10 @@ async def test_the_stop_of_a_rig_closes_no_open_loop():
         ('group = [{ name = "g", axes = ["x", "y"], leader = "z" }]', "leader 'z' is not one of x, y"),
         ('group = [{ name = "g", axes = ["x", "y"] }, { name = "h", axes = ["y", "z"] }]', "'y' is given more than"),
         ("baud = 230400", "ls-182ap at address 1 reaches 125000 at most"),
-        ('baud = 125000\nmodule = [{ address = 5, model = "ls-231" }]', "of ls-231 at .* only 9600, 19200, 57600, 115200"),
+        (
+            'baud = 125000\nmodule = [{ address = 5, model = "ls-231" }]',
+            "of ls-231 at .* only 9600, 19200, 57600, 115200",
+        ),
         ('module = [{ address = 4, model = "pic-io" }]', "address 4 of a module is given twice"),
         ('module = [{ address = 5, model = "toaster" }]', "no such module"),
     ],

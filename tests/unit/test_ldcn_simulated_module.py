@@ -46,7 +46,20 @@ def test_modules_tell_their_identity():
         assert len(reply) == 4
         identities.append((reply[1], reply[2]))
 
-    assert identities == [(90, 20), (90, 1), (0, 1), (0, 2), (0, 3), (0, 4), (0, 5), (0, 10), (2, 1), (3, 1)]
+    assert identities == [
+        (90, 20),
+        (90, 1),
+        (0, 1),
+        (0, 2),
+        (0, 3),
+        (0, 4),
+        (0, 5),
+        (0, 10),
+        (2, 1),
+        (3, 1),
+        (0, 20),
+        (2, 52),
+    ]
 
 
 def test_second_set_address_renames_a_module():

@@ -81,6 +81,8 @@ class Profile:
             goal, velocity and acceleration that may be changed during a trapezoidal move.
         advanced_stop: Stop Motor bit 5 turns on what the device has beyond version 4.
         path_points: how many points the path buffer holds; 0 without path mode.
+        numbered_from_host: the first module that waits for an address is the one next to the host (LS-182AP manual,
+            "Initializing procedure"); elsewhere it is customarily the one furthest from it (PIC-SERVO manual, 4.1).
         any_clock: "any clock between 10 MHz and 20 MHz may be used, with the timing specifications adjusted
             proportionally" (PIC-SERVO manual, 3.0).
         clock_hz: the clock; servo cycle, baud rates and the encoder rate scale with it.
@@ -127,6 +129,7 @@ class Profile:
     sc_extensions: bool = False
     advanced_stop: bool = False
     path_points: int = 0
+    numbered_from_host: bool = False
     any_clock: bool = False
     clock_hz: int = CLOCK_HZ
     motion_lock_from: int | None = None
@@ -224,6 +227,7 @@ LS_173AP = Profile(
     position_error_bytes=2,
     homing_sources=HomingSource.INDEX | HomingSource.POSITION_ERROR,
     pic_ae_diagnostics=True,
+    numbered_from_host=True,
     analog_target=True,
     offset_on_the_fly=True,
     current_limit=False,
@@ -249,6 +253,7 @@ LS_231 = Profile(
     Support.IDENTIFY,
     top_baud=115_200,
     any_divisor=False,
+    numbered_from_host=True,
 )
 LS_173 = replace(LS_231, name="ls-173", title="Logosol LS-173/LS-174 family", versions=range(60, 80))
 SK_2310G2 = replace(
@@ -259,7 +264,15 @@ SK_2310G2 = replace(
     versions=range(2, 256),
     kind=DeviceKind.SUPERVISOR,
 )
-PIC_STEP = replace(LS_231, name="pic-step", title="PIC-STEP", device_id=3, versions=range(256), kind=DeviceKind.STEPPER)
+PIC_STEP = replace(
+    LS_231,
+    name="pic-step",
+    title="PIC-STEP",
+    device_id=3,
+    versions=range(256),
+    kind=DeviceKind.STEPPER,
+    numbered_from_host=False,
+)
 
 PROFILES: dict[str, Profile] = {
     profile.name: profile

@@ -28,7 +28,7 @@ from ldcnd.drivers.ldcn.commands import Node
 from ldcnd.drivers.ldcn.costs import price_list
 from ldcnd.drivers.ldcn.faults import Knowledge, diagnose
 from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
-from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Support
+from ldcnd.drivers.ldcn.profiles import PIC_IO, PROFILES, Profile, Support
 from ldcnd.drivers.ldcn.registers import RESET_BAUD, BaudCodes
 from ldcnd.errors import BusDown, BusError
 from ldcnd.families.family import ScannedDrive
@@ -213,9 +213,35 @@ class LineScan:
             )
             for baud in self._waiting
         ]
+        known = [profile for each in found.values() if (profile := each.identity.profile)]
+        if len(known) > 1:
+            findings.append(self._order(known))
         if not found and not self._waiting:
             findings.append(self._no_answer())
         return findings
+
+    def _order(self, known: list[Profile]) -> Finding:
+        """Say from which end the chain is numbered: equal drives are told apart by nothing else."""
+        ends = {
+            "next to the host": dict.fromkeys(each.title for each in known if each.numbered_from_host),
+            "furthest from the host, as those chains are customarily wired": dict.fromkeys(
+                each.title for each in known if not each.numbered_from_host
+            ),
+        }
+        said = [
+            f"where the chain begins with {' or '.join(models)}, address 1 is {end}"
+            for end, models in ends.items()
+            if models
+        ]
+        alike = any(known.count(each) > 1 for each in known)
+        return self._finding(
+            "order",
+            Verdict.LOOK if alike else Verdict.FINE,
+            "; ".join(said),
+            "equal drives look alike: `ldcnd commission AXIS --step motor` moves one and asks which it was"
+            if alike
+            else None,
+        )
 
     def _no_answer(self) -> Finding:
         received = self._bus.statistics.bytes_in

@@ -314,7 +314,7 @@ class SimulatedEventConfig(Frozen):
     at_s: float = Field(ge=0)
     """Seconds after the line was opened first."""
     module: int = Field(ge=1, le=31)
-    """Its place in the chain; 1 is next to the host."""
+    """Its place in the chain, from 1 on, in the order of addresses."""
     begins: Condition | None = None
     """A condition that begins,"""
     ends: Condition | None = None
@@ -357,7 +357,7 @@ class SimulatedEventConfig(Frozen):
 
 
 class SimulatedChainConfig(Frozen):
-    """A simulated line, the first module next to the host."""
+    """A simulated line, in the order in which modules are given addresses."""
 
     seed: int = 1
     """Seed of all random values."""

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from ldcnd.drivers.ldcn.profiles import (
     LS_173AP,
     LS_182AP,
+    LS_231,
     PIC_IO,
     PIC_SERVO_CMC,
     PIC_SERVO_SC,
@@ -16,6 +17,7 @@ from ldcnd.drivers.ldcn.profiles import (
     PIC_SERVO_V3,
     PIC_SERVO_V4,
     PIC_STEP,
+    SK_2310G2,
     Profile,
     Support,
 )
@@ -47,6 +49,8 @@ MODELS = MappingProxyType(
             (PIC_SERVO_SC, ModuleSettings(version=10, always_obeys_global_reset=True, stop_clears_velocity=False)),
             (PIC_IO, ModuleSettings(version=1)),
             (PIC_STEP, ModuleSettings(version=1)),
+            (LS_231, ModuleSettings(version=20)),
+            (SK_2310G2, ModuleSettings(version=52)),
         )
     }
 )
@@ -131,7 +135,7 @@ class TimedEvent:
 
     Attributes:
         at_s: the instant on the line's clock.
-        place: of the module in the chain; 1 is next to the host.
+        place: of the module in the chain, from 1 on.
         what: a condition that begins or ends around a drive, something at the terminals of a PIC-I/O; None for the
             module's own supply.
         present: whether the condition begins, the line goes high, or the supply is switched on.
@@ -145,7 +149,10 @@ class TimedEvent:
 
 @dataclass(frozen=True, slots=True)
 class ChainSpec:
-    """A chain, the first module next to the host.
+    """A chain, in the order in which its modules are given addresses.
+
+    The first one is next to the host with Logosol drives (LS-182AP manual, "Initializing procedure"), and customarily
+    furthest from it with PIC-SERVO (manual, 4.1). Nothing on the line shows which: all hear the host at once.
 
     Attributes:
         baud_check: bytes at another rate than a module's are garbage to it. Without it every module understands the

@@ -12,12 +12,14 @@ Source: PIC-I/O data sheet, 2.2, 3.1.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from ldcnd.drivers.ldcn.packet import StatusItem
 from ldcnd.drivers.ldcn.pic_io import (
     ALL_LINES,
     CHECKSUM_ERROR,
     COUNTER_LINE,
+    ITEM_BYTES,
     LINES,
     TIMER_HZ,
     IoItem,
@@ -31,7 +33,7 @@ from ldcnd.drivers.ldcn.pic_io import (
     SynchOutput,
     encode_io_status,
 )
-from ldcnd.drivers.ldcn.profiles import PIC_STEP, Profile
+from ldcnd.drivers.ldcn.profiles import PIC_STEP, SK_2310G2, Profile
 from ldcnd.drivers.ldcn.received import ReceivedCommand
 from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.sim.ldcn.module import SimulatedModule
@@ -42,6 +44,10 @@ _TICKS_PER_CYCLE = round(TIMER_HZ * SERVO_CYCLE_S)
 STEP_ITEM_BYTES = (4, 1, 2, 1, 4, 2, 1, 0)
 """Position, A/D, step time, inputs, home, identity, outputs of a PIC-STEP, as hosts of it expect them."""
 IDENTITY_ONLY_ITEM_BYTES = (0, 0, 0, 0, 0, 2, 0, 0)
+"""Of modules whose other items are not known."""
+ITEM_BYTES_BY_PROFILE = MappingProxyType({PIC_STEP.name: STEP_ITEM_BYTES, SK_2310G2.name: ITEM_BYTES})
+"""An SK-2310g2 answers with the items of a PIC-I/O, as seen on real hardware; further items of a second mask byte are
+not simulated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +200,7 @@ class SimulatedOther(SimulatedModule):
     """A module that keeps its place in the chain and answers with zeros in the widths of its kind."""
 
     def __init__(self, profile: Profile, settings: ModuleSettings) -> None:
-        self._item_bytes = STEP_ITEM_BYTES if profile is PIC_STEP else IDENTITY_ONLY_ITEM_BYTES
+        self._item_bytes = ITEM_BYTES_BY_PROFILE.get(profile.name, IDENTITY_ONLY_ITEM_BYTES)
         super().__init__(profile, settings)
 
     def restart(self) -> None:

@@ -1,0 +1,109 @@
+"""Requests and replies of real hardware: what simulated modules make of the requests, and decoders of the replies."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ldcnd.drivers.ldcn.packet import Command, StatusItem, check_status, decode_status
+from ldcnd.drivers.ldcn.pic_io import IoItem, decode_io_status
+from ldcnd.drivers.ldcn.profiles import LS_231, PIC_IO, PIC_SERVO_V4, SK_2310G2, identify
+from ldcnd.drivers.ldcn.received import decode_command
+from ldcnd.exchange import ReplyVerdict
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.simulated_host import SimulatedHost
+
+EXCHANGES = json.loads((Path(__file__).parents[1] / "vectors" / "real-exchanges.json").read_text())
+PROFILES = {"VSpin PIC-SERVO": PIC_SERVO_V4, "VSpin PIC-I/O": PIC_IO, "LS-231SE": LS_231, "SK-2310g2": SK_2310G2}
+DIFFERENT = {
+    "VSpin PIC-SERVO": "position, home, A/D value, limit switches, phases of an earlier move: those of a real rotor",
+    "VSpin PIC-I/O": "levels and A/D value: those of a real cabinet",
+    "LS-231SE": "status byte: its flags are not described, and only its identity is simulated",
+    "SK-2310g2": "inputs and A/D values: those of a real machine",
+}
+"""Bytes of a reply that a simulated module cannot know. It does know the length, the checksum and the identity."""
+ONLY_WHAT_IT_KNOWS = {("SK-2310g2", mask) for mask in (0, 8, 32)}
+"""Exchanges whose replies hold nothing else."""
+TWO_MASK_BYTES = 0x100
+"""Define Status of an SK-2310g2 takes a second byte, whose first bit adds items that only it has."""
+
+
+def simulated(device):
+    """Return a host with one module of this kind."""
+    return SimulatedHost(build_chain(ChainSpec((ModuleSpec(PROFILES[device].name),))))
+
+
+def ordered(device):
+    return [each for each in EXCHANGES if each["device"] == device]
+
+
+@pytest.mark.parametrize("device", PROFILES)
+def test_a_simulated_module_answers_the_requests_of_real_ones_in_order_as_far_as_it_can_know(device):
+    assert device in DIFFERENT
+    host = simulated(device)
+    (module,) = host.chain.modules
+    for exchange in ordered(device):
+        request, reply, mask = bytes.fromhex(exchange["request"]), bytes.fromhex(exchange["reply"]), exchange["mask"]
+        if request[1] == 0:
+            host.send(module.address, Command.HARD_RESET)
+        elif module.address != request[1]:
+            host.send(module.address, Command.SET_ADDRESS, request[1], 0xFF)
+        if mask >= TWO_MASK_BYTES:
+            host.send(module.address, Command.DEFINE_STATUS, mask & 0xFF, mask >> 8)
+            continue
+        if "WITHOUT a data byte" in exchange["note"]:
+            host.send(module.address, Command.DEFINE_STATUS)
+        elif mask:
+            host.send(module.address, Command.DEFINE_STATUS, mask)
+
+        host.chain.write(host.now_s, request)
+        answer = host.wait(0.03)
+
+        assert len(answer) == len(reply), exchange["note"]
+        assert check_status(answer) is ReplyVerdict.INTACT, exchange["note"]
+        if mask & StatusItem.IDENTITY:
+            identity = bytes((module.profile.device_id, module.settings.version))
+            assert reply.index(identity) == answer.index(identity)
+        if (device, mask) in ONLY_WHAT_IT_KNOWS:
+            assert answer == reply, exchange["note"]
+
+
+@pytest.mark.parametrize("exchange", EXCHANGES, ids=lambda each: f"{each['device']} {each['reply']}")
+def test_every_reply_of_real_modules_is_taken(exchange):
+    reply, mask, profile = bytes.fromhex(exchange["reply"]), exchange["mask"], PROFILES[exchange["device"]]
+
+    assert check_status(reply) is ReplyVerdict.INTACT
+    if profile is PIC_IO or (profile is SK_2310G2 and 0 < mask < TWO_MASK_BYTES and mask != StatusItem.IDENTITY):
+        decode_io_status(IoItem(mask), reply)  # an SK-2310g2 has the items of a PIC-I/O in their widths
+    elif mask < TWO_MASK_BYTES:
+        decode_status(PIC_SERVO_V4, StatusItem(mask), reply)
+
+
+@pytest.mark.parametrize("exchange", EXCHANGES, ids=lambda each: f"{each['device']} {each['request']}")
+def test_every_request_to_real_modules_has_all_its_bytes(exchange):
+    assert not decode_command(PROFILES[exchange["device"]], bytes.fromhex(exchange["request"])).oddities
+
+
+def test_the_real_replies_say_what_their_devices_showed():
+    servo = decode_status(PIC_SERVO_V4, StatusItem(0x1F), bytes.fromhex("11222500004f000018e0050000a4"))
+    io = [decode_io_status(IoItem(3), bytes.fromhex(reply)) for reply in ("00080d0015", "00c80f00d7")]
+    supervisor = decode_status(PIC_SERVO_V4, StatusItem.IDENTITY, bytes.fromhex("00023436"))
+
+    assert (servo.position, servo.home, servo.velocity, servo.adc) == (0x2522, 0x5E0, 0, 0x4F)
+    assert servo.position - servo.home == 8002
+    assert [status.levels for status in io] == [0xD08, 0xFC8]
+    assert identify(supervisor.device_id, supervisor.version) is SK_2310G2
+
+
+def test_define_status_without_its_byte_takes_what_set_address_left_in_the_receive_buffer():
+    host = simulated("SK-2310g2")
+    (module,) = host.chain.modules
+    host.send(0, Command.SET_ADDRESS, 6, 0xFF)
+    host.send(6, Command.NO_OPERATION)
+
+    host.send(6, Command.DEFINE_STATUS)
+    short = module.items
+    host.send(6, Command.DEFINE_STATUS, 0xFF, 0xFF)
+    host.send(6, Command.DEFINE_STATUS)
+
+    assert (short, module.items) == (StatusItem(0x06), StatusItem(0xFF))
