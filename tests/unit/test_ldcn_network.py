@@ -95,6 +95,29 @@ async def test_a_module_that_does_not_follow_takes_everybody_back_by_reset():
     assert follower.baud == actual_baud(0x3F)
 
 
+@pytest.mark.parametrize("alternate", [False, True])
+async def test_a_drive_whose_clock_is_fast_follows_57600_with_the_divisor_that_makes_it_slower(alternate):
+    fast = ModuleSpec("picservo-v4", settings=ModuleSettings(4, drift_ppm=-20_000.0))
+    chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), fast)))
+    async with bare_network(chain, PAIR, 57_600, LineSpec(alternate_divisors=alternate)) as line:
+        report = await line.network.bring_up()
+        packets = [(packet.address, packet.command, packet.data) for packet in line.sent()]
+
+    changes = [data for _, command, data in packets if command is Command.SET_BAUD_RATE]
+    last = max(at for at, packet in enumerate(packets) if packet[1] is Command.SET_BAUD_RATE)
+    after = {command for _, command, _ in packets[last + 1 :]}
+    if alternate:  # 56,818 of a clock that is 2 % fast
+        assert (report.baud, report.remarks) == (57_600, ())
+        assert changes[-1] == b"\x15"
+        assert after == {Command.READ_STATUS}
+    else:  # 59,524 of it are 60,739
+        assert (report.baud, len(report.remarks)) == (19_200, 1)
+        assert "address 2 does not answer at 57600 baud; the line stays at 19200" in report.remarks[0]
+        assert changes.count(b"\x14") >= 2  # it may have been noise the first time
+        assert {Command.HARD_RESET, Command.SET_ADDRESS} <= after
+        assert [module.address for module in chain.modules] == [1, 2]
+
+
 async def test_a_lost_change_of_the_rate_is_tried_once_more():
     chain = Chain([DeafOnce(PIC_SERVO_V4, ModuleSettings(4), MotorPlant()) for _ in PAIR])
     async with bare_network(chain, specs("pic-servo-v4", "pic-servo-v4")) as line:
@@ -430,7 +453,7 @@ async def test_where_drives_stand_is_asked_only_for_axes_that_use_it():
     assert 0.08 < proven_s - took_s < 0.13
 
 
-@pytest.mark.parametrize("restart_s", [0.02, 0.099, 0.25])
+@pytest.mark.parametrize("restart_s", [0.0, 0.02, 0.099, 0.25, 1.0])
 async def test_drives_that_take_long_to_restart_are_addressed_when_they_have(restart_s):
     chain = build_chain(ChainSpec(tuple(ModuleSpec("ls182ap") for _ in FOUR)))
     for module in chain.modules:

@@ -29,6 +29,18 @@ def test_packets_are_records_however_the_host_cuts_them(tmp_path):
     assert capture.header.family == "ldcn"
 
 
+def test_a_packet_that_a_restarting_module_loses_is_remarked_behind_it(tmp_path):
+    path = tmp_path / "host.capture"
+    deeds = [
+        ("sent", 0.1, bytes.fromhex("aa 00 21 01 ff 21"), None),
+        ("remarked", "module 1: lost: the module is still resetting"),
+    ]
+    capture = written(path, deeds)
+
+    assert len(capture.records) == 1
+    assert path.read_text().endswith("#   module 1: lost: the module is still resetting\n")
+
+
 def test_packets_of_a_smartstep_line_are_records_however_the_host_cuts_them(tmp_path):
     path = tmp_path / "host.capture"
     packet = b"W1001020000ED\r"

@@ -18,7 +18,7 @@ from ldcnd.drivers.ldcn import commands
 from ldcnd.drivers.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drivers.ldcn.packet import Status, StatusItem, decode_status
 from ldcnd.drivers.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
-from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset
+from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drivers.network import GroupSpec
 from ldcnd.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.exchange import Effect, Exchange
@@ -202,6 +202,10 @@ RESET_S = 2.0
 """Longest time that a module takes to restart, seconds. No manual has it; 2 s are recommended for one model."""
 
 
+LARGE_DEVIATION = 0.02
+"""Share of a rate from which a divisor takes most of what a receiver bears: 57600 with the manual's."""
+
+
 class LineRate:
     """Who is at which rate.
 
@@ -209,6 +213,8 @@ class LineRate:
         working: where all modules should be.
         groups: the group addresses in use.
         at_reset: the rate after power-up and Hard Reset.
+        missed_by: rates that divisors really make where these miss the working rate by much: a drive whose clock is off
+            in the same direction does not receive the host at the working rate, but there.
         cycle_s: the servo cycle of the modules.
         reset_s: the longest time that a module takes to restart, seconds.
     """
@@ -228,6 +234,9 @@ class LineRate:
         self.reset_s = reset_s
         self.at_reset = baud_at_reset(clock_hz)
         self.cycle_s = CYCLE_CLOCKS / clock_hz
+        made = round(actual_baud(baud_divisor(working, codes, clock_hz), clock_hz))
+        table = working == FASTEST_BAUD  # of PIC-SERVO SC, which sets exactly this rate
+        self.missed_by = (made,) if not table and abs(made - working) > LARGE_DEVIATION * working else ()
         usual = clock_hz == CLOCK_HZ
         common = COMMON_BAUDS if usual else tuple(round(actual_baud(code, clock_hz)) for code in COMMON_CODES)
         top = (FASTEST_BAUD,) if fastest or working == FASTEST_BAUD else ()
@@ -345,7 +354,7 @@ class Addressing:
         all are called to one rate first, which leaves their address outputs as they are. PIC-SERVO version 4 obeys only
         a reset of the group it is in, so every known group address is reset.
         """
-        for baud in self.rate.candidates:
+        for baud in (*self.rate.missed_by, *self.rate.candidates):
             if baud != self.rate.at_reset and await self.rate.host_to(baud):
                 await self.without_leaders()
                 await self.rate.everybody_to(self.rate.at_reset)
