@@ -305,7 +305,7 @@ class AxisVerbs(ABC):
             il: Integration limit.
             ol: Output limit.
             cl: Current limit: 0 is off; odd where the sense voltage rises with the current, even where it falls.
-            el: Position error limit.
+            el: Position error limit, in counts; at most 16383, PIC-SERVO SC 32767.
             deadband: Amplifier deadband compensation.
             sr: Servo rate divisor; it changes the unit of velocities in the drive, so only an axis at standstill
                 accepts it.

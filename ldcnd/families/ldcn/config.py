@@ -35,7 +35,7 @@ class LdcnAxisConfig(MovedAxisConfig):
     model: Annotated[str, AfterValidator(_known_model)]
     """The drive model."""
     address: int = Field(ge=1, le=127)
-    """Node address: its place in the daisy chain, from 1."""
+    """Node address: its place in the daisy chain, from 1; `ldcnd scan` says from which end the chain is numbered."""
 
     @model_validator(mode="after")
     def _gains_fit_the_drive(self) -> Self:
