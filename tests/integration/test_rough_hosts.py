@@ -1,5 +1,7 @@
 """What single habits of hosts in the field do to a simulated chain, and what misprinted frames of the manual do."""
 
+from dataclasses import replace
+
 import pytest
 
 from ldcnd.drivers.ldcn.packet import Command
