@@ -1,6 +1,7 @@
 """How commands find a running daemon: Zenoh's usual flags, a session, a rig."""
 
 import asyncio
+import json
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -8,14 +9,14 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial, wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
 from ldcnd.cli.output import show_lines
-from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.client.rig_client import RigClient, find_rigs, on_each_rig
 from ldcnd.errors import LdcndError, SessionError, UnknownAxis
 from ldcnd.messaging.session import Session
 from ldcnd.messaging.zenoh_session import open_zenoh_session
@@ -107,6 +108,29 @@ class Target:
 
         return asyncio.run(within())
 
+    def run_on_each(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> dict[str, ResultT | LdcndError]:
+        """Do the same with the rig that is named, unsearched, or with every one that can be reached.
+
+        For what takes energy out: it asks no question first.
+
+        Raises:
+            SessionError: no rig can be reached.
+        """
+        named = self.rig
+
+        async def within(session: Session) -> dict[str, ResultT | LdcndError]:
+            if named is None:
+                return await on_each_rig(session, work)
+            try:
+                return {named: await work(RigClient(session, named))}
+            except LdcndError as error:
+                return {named: error}
+
+        return self.run_session(within) or self._unreached()
+
+    def _unreached(self) -> NoReturn:
+        raise no_rig_answers(self._settings())
+
     def run_session(self, work: Callable[[Session], Awaitable[ResultT]]) -> ResultT:
         """Open a session, do the work with it, and close; no rig needs to be there."""
 
@@ -116,9 +140,11 @@ class Target:
 
         return asyncio.run(within())
 
-    def show(self, model: Frozen, *lines: str) -> None:
-        """Print one result: as a line of JSON, or as these lines."""
-        show_lines(*((model.model_dump_json(ensure_ascii=True),) if self.as_json else lines))
+    def show(self, model: Frozen, *lines: str, **about: str) -> None:
+        """Print one result: as a line of JSON, with what it is about in front, or as these lines."""
+        if self.as_json:
+            lines = (json.dumps({**about, **json.loads(model.model_dump_json())}, separators=(",", ":")),)
+        show_lines(*lines)
 
     def _settings(self) -> ZenohSettings:
         named = tuple(each if "/" in each else f"tcp/{each}" for each in self.connect)
@@ -164,6 +190,15 @@ def with_target(work: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def no_rig_answers(settings: ZenohSettings) -> SessionError:
+    """Return the error for a network without a rig."""
+    return SessionError(
+        f"no daemon answers at {', '.join(settings.connect) or 'the configured endpoints'}",
+        remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role sees none"
+        " either",
+    )
+
+
 @asynccontextmanager
 async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIterator[RigClient]:
     """Join the network and use one rig for as long as the context lasts.
@@ -180,11 +215,7 @@ async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIter
         rigs = sorted({daemon.rig for daemon in await find_rigs(session)})
         if rig not in rigs:
             if not rigs:
-                raise SessionError(
-                    f"no daemon answers at {', '.join(settings.connect) or 'the configured endpoints'}",
-                    remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role"
-                    " sees none either",
-                )
+                raise no_rig_answers(settings)
             there = f"there are: {', '.join(rigs)}"
             if rig is not None:
                 near = next(iter(get_close_matches(rig, rigs, 1)), None)

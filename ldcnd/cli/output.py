@@ -88,10 +88,15 @@ def exit_code(error: BaseException) -> int:
             show_lines(*error.message.splitlines(), *_remedy(error), err=True)
             return WRONG_CONFIG
         case LdcndError():
-            page = [f"  more: ldcnd fault {error.page.rpartition('/')[2]}"] if error.page else []
-            show_lines(f"{error.message} [{error.code}]", *_remedy(error), *page, err=True)
+            show_error(error)
             return UNREACHABLE if isinstance(error, SessionError) else FAILED
     raise error
+
+
+def show_error(error: LdcndError, whose: str = "") -> None:
+    """Print an error as every command does: what, to whom, what to do, and where more is said."""
+    page = [f"  more: ldcnd fault {error.page.rpartition('/')[2]}"] if error.page else []
+    show_lines(f"{whose}{error.message} [{error.code}]", *_remedy(error), *page, err=True)
 
 
 def _remedy(error: LdcndError) -> list[str]:

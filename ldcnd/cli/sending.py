@@ -11,12 +11,12 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.output import FAILED, show_lines, show_passing
+from ldcnd.cli.output import FAILED, UNREACHABLE, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, values_of
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import AxisCommand, CommandReply, Halt, Verb
+from ldcnd.errors import LdcndError, SessionError, UnknownAxis
+from ldcnd.model.commands import AxisCommand, CommandReply, Effect, Halt, Power, Verb
 from ldcnd.model.events import ReadOutcome
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
@@ -59,6 +59,9 @@ class Sender:
         """
         if wait:
             end_as_interrupted()
+        elif takes_energy_out(command):
+            self.send_to_all((axis,), command, "accepted")
+            return
 
         async def work(client: RigClient) -> tuple[StateSample, str] | None:
             info = await axis_of(client, axis)
@@ -79,8 +82,11 @@ class Sender:
         if state.last_error is not None:
             sys.exit(FAILED)
 
-    def send_to_all(self, axes: Sequence[str], command: Sent) -> None:
-        """Send one command to several axes, all that take it when none is named; tell how it went with each."""
+    def send_to_all(self, axes: Sequence[str], command: Sent, said: str = "done") -> None:
+        """Send one command to several axes, all that take it when none is named; tell how it went with each.
+
+        What takes energy out goes to every rig that can be reached unless one is named: it asks no question first.
+        """
 
         async def work(client: RigClient) -> list[CommandReply | LdcndError]:
             known = [info for info in await client.axes() if Verb(command.verb) in info.capabilities]
@@ -91,14 +97,24 @@ class Sender:
                 tasks = [group.create_task(self._outcome(client, axis, command), name=axis) for axis in wanted]
             return [task.result() for task in tasks]
 
-        outcomes = self.target.run(work)
-        for each in outcomes:
-            if isinstance(each, LdcndError):
-                show_lines(f"{each.message} [{each.code}]", err=True)
-            else:
-                self.target.show(each, f"{each.axis}: {each.verb.replace('_', ' ')} done")
-        if any(isinstance(each, LdcndError) for each in outcomes):
-            sys.exit(FAILED)
+        if not takes_energy_out(command):
+            reached = {"": self.target.run(work)}
+        else:
+            on_each = self.target.run_on_each(work)
+            there = {rig: made for rig, made in on_each.items() if not isinstance(made, UnknownAxis)} or on_each
+            reached = {
+                f"{rig}: " if len(on_each) > 1 else "": [made] if isinstance(made, LdcndError) else made
+                for rig, made in there.items()
+            }
+        for whose, outcomes in reached.items():
+            for each in outcomes:
+                if isinstance(each, LdcndError):
+                    show_error(each, whose)
+                else:
+                    self.target.show(each, f"{whose}{each.axis}: {each.verb.replace('_', ' ')} {said}")
+        failures = [each for outcomes in reached.values() for each in outcomes if isinstance(each, LdcndError)]
+        if failures:
+            sys.exit(UNREACHABLE if all(isinstance(each, SessionError) for each in failures) else FAILED)
 
     async def command(self, client: RigClient, axis: str, command: Sent) -> CommandReply:
         """Send one command, under the lease if there is one."""
@@ -110,6 +126,11 @@ class Sender:
             return await self.command(client, axis, command)
         except LdcndError as error:
             return error
+
+
+def takes_energy_out(command: Sent) -> bool:
+    """Tell whether a command only ever brings an axis to rest, or switches it off."""
+    return command.effect is Effect.REST or (isinstance(command, Power) and not command.on)
 
 
 @asynccontextmanager

@@ -20,7 +20,7 @@ ENOUGH_S = 2.5
 @click.command()
 @with_target
 def command(target: Target) -> None:
-    """Show every axis and line of a rig, what is wrong first; S stops all axes, Q quits.
+    """Show every axis and line of a rig, what is wrong first; S or Esc stops its axes, Q quits.
 
     Without a terminal, or with --json, the rig is printed once. The stop is no emergency stop.
     """

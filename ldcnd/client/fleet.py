@@ -2,9 +2,8 @@
 
 import asyncio
 
-from ldcnd.client import presence
 from ldcnd.client.health import last_bus_health, last_health
-from ldcnd.client.rig_client import RigClient, find_rigs
+from ldcnd.client.rig_client import RigClient, daemons, find_rigs
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.messaging.session import Session
 from ldcnd.model.frozen import Frozen
@@ -62,18 +61,18 @@ async def survey(session: Session, rig: str | None = None) -> tuple[RigReport, .
     """
     alive: set[tuple[str, str]] = set()
 
-    def on_daemon(name: str, instance: str, there: bool) -> None:  # noqa: FBT001 - as `presence.daemons` calls it
+    def on_daemon(name: str, instance: str, there: bool) -> None:  # noqa: FBT001 - as `daemons` calls it
         (alive.add if there else alive.discard)((name, instance))
 
-    async with presence.daemons(session, on_daemon):
-        daemons = await _daemons(session)
-    runs = [daemon.rig for daemon in daemons]
-    silent = alive - {(daemon.rig, daemon.instance) for daemon in daemons}
+    async with daemons(session, on_daemon):
+        answering = await _daemons(session)
+    runs = [daemon.rig for daemon in answering]
+    silent = alive - {(daemon.rig, daemon.instance) for daemon in answering}
     slots = asyncio.Semaphore(ASKED_AT_ONCE)
     async with asyncio.TaskGroup() as group:
         looks = [
             group.create_task(_look(session, daemon, slots, rival=runs.count(daemon.rig) > 1), name=f"ask {daemon.rig}")
-            for daemon in daemons
+            for daemon in answering
             if rig in (None, daemon.rig)
         ]
     views = [look.result() for look in looks]

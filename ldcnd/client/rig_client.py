@@ -2,14 +2,14 @@
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TypeVar
 
 from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.hand_over import Answer
-from ldcnd.messaging.keys import ALL_DAEMONS, RIG_ITSELF, Keys
+from ldcnd.messaging.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
 from ldcnd.messaging.session import Declaration, Sample, SampleKind, Session
 from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
@@ -28,6 +28,9 @@ from ldcnd.model.samples import Sample as Measurement
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
+ResultT = TypeVar("ResultT")
+OnDaemon = Callable[[str, str, bool], None]
+"""Learns that of a rig a run of the daemon has appeared (True) or vanished (False)."""
 
 TAKING_CONTROL = "acquire"
 """The verb after which commands are meant for the daemon that runs then."""
@@ -328,3 +331,53 @@ async def find_rigs(session: Session) -> list[DaemonInfo]:
     """Return the daemons that can be reached."""
     answers = await session.query(ALL_DAEMONS)
     return [decode_received(DaemonInfo, answer.payload, answer.encoding) for answer in answers if not answer.is_error]
+
+
+@asynccontextmanager
+async def daemons(session: Session, on_daemon: OnDaemon) -> AsyncIterator[None]:
+    """Tell of every daemon that can be reached, first of those that are there, for the time of the context."""
+
+    def changed(key: str, alive: bool) -> None:  # noqa: FBT001 - a callback of the session
+        keys = Keys.of(key)
+        on_daemon(keys.rig, keys.parse_alive(key).instance, alive)
+
+    declaration = await session.watch_tokens(ALL_RUNS, changed)
+    try:
+        yield
+    finally:
+        await declaration.close()
+
+
+async def on_each_rig(
+    session: Session, work: Callable[[RigClient], Awaitable[ResultT]]
+) -> dict[str, ResultT | LdcndError]:
+    """Do the same with every rig that can be reached, as soon as it shows itself: none waits for another.
+
+    It shows itself by its liveliness token, which a frozen daemon has too, or by its answer.
+
+    Args:
+        session: where the rigs are.
+        work: what is done; bounded in time.
+
+    Returns:
+        What came of it, or why it failed, by rig; empty when no rig can be reached.
+    """
+
+    async def outcome(rig: str) -> ResultT | LdcndError:
+        try:
+            return await work(RigClient(session, rig))
+        except LdcndError as error:
+            return error
+
+    at_work: dict[str, asyncio.Task[ResultT | LdcndError]] = {}
+    async with asyncio.TaskGroup() as group:
+
+        def begin(rig: str) -> None:
+            if rig not in at_work:
+                at_work[rig] = group.create_task(outcome(rig), name=f"on {rig}")
+
+        async with daemons(session, lambda rig, _, alive: begin(rig) if alive else None):
+            with suppress(LdcndError):  # those that do not answer have shown their tokens
+                for daemon in await find_rigs(session):
+                    begin(daemon.rig)
+    return {rig: at_work[rig].result() for rig in sorted(at_work)}

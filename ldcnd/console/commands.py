@@ -109,10 +109,7 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         return json_reply(await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client))
 
     async def stop_all(request: Request) -> Response:
-        who = request.state.visitor.client
-        async with asyncio.TaskGroup() as group:
-            stops = {rig: group.create_task(_stopped(rigs.client(rig), who), name=f"stop {rig}") for rig in rigs.names}
-        return json_reply(StopsReply(rigs={rig: task.result() for rig, task in stops.items()}))
+        return json_reply(StopsReply(rigs=await _all_stopped(rigs, request.state.visitor.client)))
 
     routes = {
         "/api/stop": stop_all,
@@ -121,6 +118,16 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         "/api/rigs/{rig}/axes/{axis}/{verb}": axis_command,
     }
     return [Route(path, answering_errors(answer), methods=["POST"]) for path, answer in routes.items()]
+
+
+async def _all_stopped(rigs: Rigs, who: str) -> dict[str, StopReply | ErrorReply]:
+    """Stop every rig, also those that come while the others are stopped."""
+    stopped: dict[str, StopReply | ErrorReply] = {}
+    while came := [rig for rig in rigs.names if rig not in stopped]:
+        async with asyncio.TaskGroup() as group:
+            stops = {rig: group.create_task(_stopped(rigs.client(rig), who), name=f"stop {rig}") for rig in came}
+        stopped |= {rig: task.result() for rig, task in stops.items()}
+    return stopped
 
 
 async def _stopped(client: RigClient, who: str) -> StopReply | ErrorReply:

@@ -4,8 +4,7 @@ import asyncio
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from ldcnd.client.presence import daemons
-from ldcnd.client.rig_client import RigClient
+from ldcnd.client.rig_client import RigClient, daemons
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import EndpointReply, RigReply
 from ldcnd.console.rig_watch import RigWatch

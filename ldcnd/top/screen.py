@@ -35,7 +35,7 @@ class TopScreen(App[None]):
     TITLE = "ldcnd"
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[Binding | tuple[str, str] | tuple[str, str, str]]] = [
-        Binding("s", "stop_all", "STOP all (no emergency stop)", priority=True),
+        Binding("s,escape", "stop_all", "STOP all (no emergency stop)", priority=True),
         Binding("h", "halt_axis", "Halt axis"),
         Binding("r", "reset_axis", "Reset axis"),
         Binding("q", "quit", "Quit"),

@@ -45,6 +45,7 @@ async def running_rig(
     config: RigConfig | None = None,
     chains: Mapping[str, Chain] = MappingProxyType({}),
     *,
+    broker: MemoryBroker | None = None,
     clock_off_s: Callable[[], float] = lambda: 0.0,
 ) -> AsyncIterator[RunningRig]:
     """Run a daemon until the context ends; its lines are up when the context begins.
@@ -52,11 +53,12 @@ async def running_rig(
     Args:
         config: the rig; the simulated one if missing.
         chains: simulated lines that exist already, by name.
+        broker: the network; one of its own if missing.
         clock_off_s: returns by how much the machine's clock is wrong; time itself goes on.
     """
     config = config or load_config(SIMULATED)
     loop = asyncio.get_running_loop()
-    broker = MemoryBroker()
+    broker = broker or MemoryBroker()
 
     def now_ns() -> int:
         return EPOCH_NS + round((loop.time() + clock_off_s()) * 1e9)

@@ -1,0 +1,101 @@
+"""What takes energy out asks no question where several rigs can be reached, on the jumping clock."""
+
+import json
+
+import pytest
+
+from ldcnd.config.rig import load_config
+from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.model.samples import LinkState
+from tests.support.command_line import virtual_rig
+from tests.support.rig import SIMULATED, running_rig
+
+
+@pytest.fixture
+def two_rigs(monkeypatch):
+    """Two rigs on one network, on both of which x moves; yields what runs commands, and both clients."""
+    config = load_config(SIMULATED)
+    with virtual_rig(monkeypatch) as first:
+        second = running_rig(config.model_copy(update={"rig": "mill"}), broker=first.rig.broker)
+        mill = first.wait(second.__aenter__())
+        for rig in (first.rig, mill):
+            first.wait(moving(rig))
+        yield first, mill
+        first.wait(second.__aexit__(None, None, None))
+
+
+async def moving(rig):
+    await rig.until("x", lambda state: state.link is LinkState.UP)
+    await rig.client.command("x", Power(on=True))
+    await rig.client.command("x", MoveAbsolute(position=40.0, velocity=1.0))
+
+
+def said(ran):
+    """Return what a command printed, without the logs of the daemons in the same process."""
+    return [line for line in ran.printed.splitlines() if not line.startswith("20")]
+
+
+def states(here, mill):
+    return [here.wait(rig.client.state("x")) for rig in (here.rig, mill)]
+
+
+@pytest.mark.parametrize("line", ["stop", "stop x", "axis stop x"])
+def test_a_stop_without_a_rig_stops_every_rig_and_says_which_axes_confirmed(two_rigs, line):
+    here, mill = two_rigs
+
+    ran = here.run(line)
+
+    axes = "x" if "x" in line.split() else "x, y, z, c"
+    assert said(ran) == [f"mill: stopped and latched: {axes}", f"sim: stopped and latched: {axes}"]
+    assert (ran.code, ran.errors) == (0, "")
+    assert [state.stop_latched for state in states(here, mill)] == [True, True]
+
+
+def test_the_rigs_of_a_stop_are_named_in_json(two_rigs):
+    here, _ = two_rigs
+
+    ran = here.run("stop --json")
+
+    assert [json.loads(line)["rig"] for line in said(ran)] == ["mill", "sim"]
+
+
+def test_a_rig_that_is_named_is_stopped_alone(two_rigs):
+    here, mill = two_rigs
+
+    ran = here.run("stop --rig mill")
+
+    assert (ran.code, said(ran)) == (0, ["stopped and latched: x, y, z, c"])
+    assert [state.stop_latched for state in states(here, mill)] == [False, True]
+
+
+def test_a_rig_without_the_axis_is_no_failure_and_an_axis_that_no_rig_has_is_one(two_rigs):
+    here, _ = two_rigs
+
+    ran = here.run("stop nowhere")
+
+    assert ran.code == 1
+    assert ran.errors.count("[unknown_axis]") == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "enabled"), [("axis halt x", True), ("power off x", False), ("axis power x off", False)]
+)
+def test_halt_and_power_off_ask_for_no_rig_either(two_rigs, line, enabled):
+    here, mill = two_rigs
+
+    ran = here.run(line)
+
+    assert (ran.code, ran.errors) == (0, "")
+    assert [line.partition(":")[0] for line in said(ran)] == ["mill", "sim"]
+    now = states(here, mill)
+    assert [state.enabled for state in now] == [enabled, enabled]
+    assert all(state.command is None or state.command.verb != "move_absolute" for state in now)
+
+
+def test_what_puts_energy_in_still_needs_the_name_of_its_rig(two_rigs):
+    here, _ = two_rigs
+
+    ran = here.run("power on x")
+
+    assert ran.code == 1
+    assert "several rigs answer" in ran.errors
