@@ -14,10 +14,11 @@ from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, UNREACHABLE, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, values_of
 from ldcnd.cli.typed import axis_of
+from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import LdcndError, SessionError, UnknownAxis
 from ldcnd.model.commands import AxisCommand, CommandReply, Effect, Halt, Power, Verb
-from ldcnd.model.events import ReadOutcome
+from ldcnd.model.events import CommandStatus, ReadOutcome
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
 
@@ -68,11 +69,15 @@ class Sender:
             async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
                 reply = await self.command(client, axis, command)
                 words = command.verb.replace("_", " ")
-                self.target.show(reply, f"{axis}: {words} accepted{values_of(reply, info)}")
+                waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
+                self.target.show(reply, f"{axis}: {words} accepted{values_of(reply, info)}{waits}")
                 if not wait:
                     return None
                 state = await _follow(client, info, reply)
-                return state, outcome(info, await client.ask(ReadOutcome(command_id=reply.command_id)), state)
+                ended = await client.ask(ReadOutcome(command_id=reply.command_id))
+                if reply.waits_for and ended.status is not CommandStatus.DONE:
+                    raise failure(ended)
+                return state, outcome(info, ended, state)
 
         ended = self.target.run(work)
         if ended is None:

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field, replace
 
+from ldcnd.client.rig_client import CHECK_PERIOD_S
 from ldcnd.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
 from ldcnd.model.commands import CommandReply
 from ldcnd.model.events import FINAL, CommandOutcome, CommandStatus
@@ -12,8 +13,6 @@ from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Qu
 
 SILENT_S = 10.0
 """Time without samples after which the outcome of a motion is unknown, seconds."""
-CHECK_PERIOD_S = 0.2
-"""Longest time between two queries for the outcome of a command that its axis does not name any more, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +188,7 @@ class Motion:
             await self._axis.halt_now()
             raise
         if outcome.status is not CommandStatus.DONE:
-            raise _error(outcome)
+            raise failure(outcome)
         await self._arrival()
         self.ended = replace(
             self._axis.state,
@@ -227,6 +226,8 @@ class Motion:
             if outcome.status in FINAL:
                 return outcome
             await self._axis.news(CHECK_PERIOD_S)  # the state that names the command is still on its way
+            if outcome.status is CommandStatus.ACCEPTED:
+                await asyncio.sleep(CHECK_PERIOD_S)  # it waits for another command, perhaps for long
 
     async def _arrival(self) -> None:
         """Wait, but not for long, for a position that is as new as the state after the end."""
@@ -246,7 +247,8 @@ class Motion:
         return f"<{self.reply.verb} of {self.reply.axis}{target}: {'ended' if self.ended else 'accepted'}>"
 
 
-def _error(outcome: CommandOutcome) -> LdcndError:
+def failure(outcome: CommandOutcome) -> LdcndError:
+    """Return the error for a command that did not end as requested."""
     text = f"axis {outcome.axis}: {outcome.verb} ended as {outcome.status}: {outcome.reason or 'no reason is known'}"
     match outcome.status:
         case CommandStatus.UNKNOWN:

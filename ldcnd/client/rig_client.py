@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TypeVar
 
-from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError
+from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownCommand
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.hand_over import Answer
 from ldcnd.messaging.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
@@ -34,6 +34,8 @@ OnDaemon = Callable[[str, str, bool], None]
 
 TAKING_CONTROL = "acquire"
 """The verb after which commands are meant for the daemon that runs then."""
+CHECK_PERIOD_S = 0.2
+"""Longest time between two queries for the outcome of a command that its axis does not name, seconds."""
 KEPT_SAMPLES = 256
 """Maximum number of samples kept for a slow watcher; the oldest are dropped."""
 
@@ -275,7 +277,7 @@ class RigClient:
         ]
 
     async def wait_for_end(self, axis: str, command_id: str) -> StateSample:
-        """Wait until a command is not the axis's current one any more, and return the state after it.
+        """Wait until a command has begun and is not the axis's current one any more, and return the state after it.
 
         Raises:
             OutcomeUnknown: the drive stopped answering.
@@ -283,12 +285,26 @@ class RigClient:
         async with self.samples(axis, TelemetryItem.STATE) as states:
             sample: Measurement | None = await self.state(axis)
             while True:
+                waits = False
                 if isinstance(sample, StateSample):
                     if sample.link is LinkState.DOWN:
                         raise OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
                     if sample.command is None or sample.command.command_id != command_id:
-                        return sample
-                _, sample = await anext(states)
+                        waits = await self._waits(command_id)
+                        if not waits:
+                            return sample
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(CHECK_PERIOD_S if waits else None):
+                        _, sample = await anext(states)
+
+    async def _waits(self, command_id: str) -> bool:
+        """Tell whether a command waits for another one: no state names it yet."""
+        from ldcnd.model.events import CommandStatus, ReadOutcome  # noqa: PLC0415 - clients that only read need none
+
+        try:
+            return (await self.ask(ReadOutcome(command_id=command_id))).status is CommandStatus.ACCEPTED
+        except UnknownCommand:  # the daemon was restarted, or it is long ago
+            return False
 
     async def _unanswered(self, what: str) -> LdcndError:
         """Return the error for a command without an answer: absence, access control, or an answer that was lost.

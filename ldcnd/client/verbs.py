@@ -105,7 +105,7 @@ class AxisVerbs(ABC):
         """Move to a position on a trapezoidal profile.
 
         Args:
-            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
+            buffer_mode: Effect if the axis moves already.
             position: Target in axis units; on an axis with a modulo any turn of it is meant.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
@@ -132,7 +132,7 @@ class AxisVerbs(ABC):
         """Move by a distance from the commanded position; becomes absolute when it is admitted.
 
         Args:
-            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
+            buffer_mode: Effect if the axis moves already.
             distance: Distance in axis units, signed.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
@@ -149,7 +149,7 @@ class AxisVerbs(ABC):
         """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
 
         Args:
-            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
+            buffer_mode: Effect if the axis moves already.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
         """
@@ -169,7 +169,7 @@ class AxisVerbs(ABC):
         """Run at a velocity for as long as the client renews the hold; ends by itself when no renewal arrives.
 
         Args:
-            buffer_mode: Effect if the axis moves already; the reply comes when the drive has acknowledged the new move.
+            buffer_mode: Effect if the axis moves already.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
             hold_s: Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog.

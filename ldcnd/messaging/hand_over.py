@@ -93,6 +93,11 @@ class Query:
         """
         return self._login()
 
+    @property
+    def answered(self) -> bool:
+        """Whether it has its answer."""
+        return self._answered
+
     def reply(self, payload: bytes, encoding: str, key: str | None = None, measured_at_ns: int | None = None) -> None:
         """Answer; finally without a key, with one value of several when a key is given.
 

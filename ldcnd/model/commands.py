@@ -203,12 +203,18 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
 
 
 class CommandReply(Frozen):
-    """The drive acknowledged the command. Values are those requested, as rounded by the drive's registers."""
+    """The drive acknowledged the command, or it waits for another one to end.
+
+    Values are those requested, as rounded by the drive's registers.
+    """
 
     command_id: str
     """Names the command in `state`, in events and in the log."""
     status: Literal["accepted"] = "accepted"
-    """Accepted: acknowledged by the drive, not yet complete."""
+    """Accepted: acknowledged by the drive, or waiting as `waits_for` says; not yet complete."""
+    waits_for: str | None = None
+    """The command that must end before this one begins, by id; its planned values are not known before. An event says
+    when it begins, or why it does not. Null when the drive has acknowledged it."""
     axis: str
     """The axis."""
     verb: str
@@ -291,7 +297,8 @@ class BufferMode(StrEnum):
     """The command under way ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that
     drive goes on to the new goal within the new velocity and acceleration, without a halt."""
     BUFFERED = "buffered"
-    """The move waits until the command under way has ended."""
+    """The move waits until the command under way has ended. It is answered at once, with the command it waits for; a
+    halt or a stop withdraws it."""
 
 
 class Move(AxisCommand[CommandReply]):
@@ -301,7 +308,7 @@ class Move(AxisCommand[CommandReply]):
     ends = Ends.BY_READING
 
     buffer_mode: BufferMode = BufferMode.REFUSE
-    """Effect if the axis moves already; the reply comes when the drive has acknowledged the new move."""
+    """Effect if the axis moves already."""
 
 
 class Direction(StrEnum):

@@ -1,13 +1,17 @@
 """Moves that find the axis moving, on the jumping clock."""
 
 import asyncio
+import json
+from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.errors import StopLatched, WrongState
-from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
+from ldcnd.client.rig import Rig
+from ldcnd.errors import PositionLimit, WrongState
+from ldcnd.model.commands import BufferMode, CommandReply, Halt, MoveAbsolute, MoveVelocity, Power, SetPosition
 from ldcnd.model.events import CommandOutcome, CommandStatus, ReadOutcome
 from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
+from tests.support.command_line import virtual_rig
 from tests.support.rig import RunningRig, running_rig
 
 
@@ -75,17 +79,137 @@ async def test_buffered_moves_follow_one_another_in_order():
         assert await position_of(rig) == pytest.approx(8.0, abs=0.0011)
 
 
+@asynccontextmanager
+async def controlled():
+    """Yield a rig and its axis x, as a program controls it."""
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        async with Rig(rig.client, await rig.client.daemon()).control("x", client="tester") as x:
+            yield rig, x
+
+
+async def waiting_behind_a_long_move(rig: RunningRig) -> tuple[str, CommandReply]:
+    """Have x move for 30 s and another move wait behind that; return the first one's id and the second one's reply."""
+    first = await moving(rig, 0.0)
+    await rig.client.wait_for_end("x", first)
+    first = (await rig.client.command("x", MoveAbsolute(position=30.0, velocity=1.0))).command_id
+    await asyncio.sleep(0.5)
+    return first, await rig.client.command("x", MoveAbsolute(position=2.0, buffer_mode=BufferMode.BUFFERED))
+
+
+async def test_a_move_behind_a_long_one_is_answered_at_once_and_its_end_is_waited_for():
+    async with running_rig() as rig:
+        began_s = asyncio.get_running_loop().time()
+        first, waiting = await waiting_behind_a_long_move(rig)
+        answered_s = asyncio.get_running_loop().time() - began_s
+
+        await rig.client.wait_for_end("x", waiting.command_id)
+
+        assert answered_s < 5.0
+        assert waiting.waits_for == first
+        assert [(await outcome(rig, each)).status for each in (first, waiting.command_id)] == [CommandStatus.DONE] * 2
+        assert await position_of(rig) == pytest.approx(2.0, abs=0.0011)
+
+
+async def test_a_bare_query_that_is_short_of_time_has_its_answer_before_anything_begins():
+    async with running_rig() as rig:
+        first, _ = await waiting_behind_a_long_move(rig)
+        payload = b'{"position": 4.0, "buffer_mode": "buffered", "command_id": "mine"}'
+
+        (answer,) = await rig.session.query(rig.client.keys.command("x", "move_absolute"), payload, timeout_s=0.2)
+        again = await rig.session.query(rig.client.keys.command("x", "move_absolute"), payload, timeout_s=0.2)
+
+        assert json.loads(answer.payload)["waits_for"] not in (None, first)  # the one that waits already
+        assert json.loads(again[0].payload)["command_id"] == "mine"
+        await rig.client.wait_for_end("x", "mine")
+        assert await position_of(rig) == pytest.approx(4.0, abs=0.0011)
+
+
+async def test_a_halt_withdraws_what_waits():
+    async with running_rig() as rig:
+        _, waiting = await waiting_behind_a_long_move(rig)
+
+        halt = await rig.client.command("x", Halt())
+        await rig.client.wait_for_end("x", halt.command_id)
+        halted_at = await position_of(rig)
+        await asyncio.sleep(60.0)
+
+        ended = await outcome(rig, waiting.command_id)
+        assert ended.status is CommandStatus.ABORTED
+        assert "before it began" in (ended.reason or "")
+        assert await position_of(rig) == pytest.approx(halted_at, abs=0.0011)
+
+
+async def test_a_program_that_gives_up_its_wait_leaves_nothing_that_begins_later():
+    async with controlled() as (rig, x):
+        await x.power(on=True)
+        await x.set_position(0.0)
+        await x.move_absolute(30.0, velocity=1.0)
+        waiting = await x.move_absolute(2.0, buffer_mode=BufferMode.BUFFERED)
+
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(8.0):
+                await waiting.done()
+        await rig.until("x", lambda state: state.command is None)
+        given_up_at = await position_of(rig)
+        await asyncio.sleep(60.0)
+
+        assert (await outcome(rig, waiting.command_id)).status is CommandStatus.ABORTED
+        assert await position_of(rig) == pytest.approx(given_up_at, abs=0.0011)
+
+
+async def test_a_program_waits_for_as_long_as_what_it_waits_behind_takes():
+    async with controlled() as (_, x):
+        await x.power(on=True)
+        await x.set_position(0.0)
+        await x.move_absolute(30.0, velocity=1.0)
+
+        state = await (await x.move_absolute(2.0, buffer_mode=BufferMode.BUFFERED)).done()
+
+        assert state.position == pytest.approx(2.0, abs=0.05)
+
+
+async def test_a_target_beyond_the_limits_is_refused_at_once_and_not_when_its_turn_comes():
+    async with running_rig() as rig:
+        await waiting_behind_a_long_move(rig)
+        await rig.client.command("x", Halt())
+        await rig.until("x", lambda state: state.command is None)
+        await rig.client.command("x", SetPosition(position=0.0))
+        await rig.client.command("x", MoveAbsolute(position=30.0, velocity=1.0))
+
+        with pytest.raises(PositionLimit):
+            await move(rig, 1e4, BufferMode.BUFFERED)
+
+
+async def test_an_aborting_move_on_an_axis_that_takes_long_to_come_to_rest_is_answered_meanwhile():
+    async with running_rig() as rig:
+        await moving(rig, 0.0)
+        await rig.until("x", lambda state: state.command is None)
+        slow = MoveVelocity(velocity=20.0, acceleration=2.0)
+        first = (await rig.client.command("x", slow)).command_id
+        await asyncio.sleep(12.0)
+
+        began_s = asyncio.get_running_loop().time()
+        reply = await rig.client.command("x", MoveAbsolute(position=-5.0, buffer_mode=BufferMode.ABORTING))
+        answered_s = asyncio.get_running_loop().time() - began_s
+        await rig.client.wait_for_end("x", reply.command_id)
+
+        assert answered_s < 4.0
+        assert (await outcome(rig, first)).status is CommandStatus.ABORTED
+        assert await position_of(rig) == pytest.approx(-5.0, abs=0.0011)
+
+
 async def test_a_stop_also_ends_what_waits():
     async with running_rig() as rig:
         await moving(rig)
 
         async with asyncio.TaskGroup() as group:
-            waiting = group.create_task(_refusal(move(rig, 5.0, BufferMode.BUFFERED)), name="waiting")
+            waiting = group.create_task(move(rig, 5.0, BufferMode.BUFFERED), name="waiting")
             await asyncio.sleep(0.1)
             await rig.client.stop("x")
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
 
-        assert isinstance(waiting.result(), StopLatched)
+        assert (await outcome(rig, waiting.result())).status is CommandStatus.REFUSED
         assert await position_of(rig) > 5.5
 
 
@@ -100,8 +224,37 @@ async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
         assert (await rig.client.state("x")).state is AxisState.CONTINUOUS_MOTION
 
 
-async def _refusal(work):
-    try:
-        return await work
-    except StopLatched as error:
-        return error
+def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkeypatch):
+    with virtual_rig(monkeypatch) as here:
+        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
+        here.run("axis power x on")
+        here.run("axis move x 30 --velocity 1")
+
+        ran = here.run("axis move x 2 --buffer-mode buffered --wait")
+
+        assert (ran.code, ran.errors) == (0, "")
+        assert "accepted, waits until" in ran.printed
+        assert "x: done, standstill at" in ran.printed.splitlines()[-1]
+        assert here.wait(position_of(here.rig)) == pytest.approx(2.0, abs=0.0011)
+
+
+def test_the_command_line_says_why_what_it_waited_for_did_not_begin(monkeypatch):
+    with virtual_rig(monkeypatch) as here:
+        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
+        here.run("axis power x on")
+        here.run("axis move x 30 --velocity 1")
+
+        async def halted_later():
+            await asyncio.sleep(8.0)
+            await here.rig.client.command("x", Halt())
+
+        halting = here.wait(_begun(halted_later()))
+        ran = here.run("axis move x 2 --buffer-mode buffered --wait")
+        here.wait(halting)
+
+        assert ran.code == 1
+        assert "withdrawn by a halt or a later move before it began" in ran.errors
+
+
+async def _begun(work):
+    return asyncio.create_task(work)

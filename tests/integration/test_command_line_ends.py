@@ -12,6 +12,7 @@ import pytest
 import pytest_asyncio
 
 from ldcnd.model.commands import Halt, Power, SetPosition
+from ldcnd.model.events import ReadEvents
 from tests.support.process import LDCND, ROOT, answering, client, daemon, free_port
 
 pytestmark = [
@@ -85,6 +86,24 @@ async def test_a_waited_move_that_is_interrupted_is_halted(served, ending):
     assert "Traceback" not in said.decode()
     assert position < 80
     assert not state.stop_latched
+
+
+async def test_a_move_that_waits_behind_another_is_withdrawn_by_the_end_of_its_command(served):
+    async with moving(served, "--leave-running"):
+        endpoint, rig = served
+        words = ("axis", "move", "x", "0", "--buffer-mode", "buffered", "--wait", "-e", endpoint)
+        behind = await asyncio.create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE)
+        async with asyncio.timeout(PATIENCE_S):
+            accepted = (await behind.stdout.readline()).decode()
+            behind.send_signal(signal.SIGINT)
+            await behind.communicate()
+        state = await until(rig, "x", lambda state: state.command is None)
+        events = (await rig.ask(ReadEvents(axis="x", count=100))).events
+
+    assert "waits until" in accepted
+    assert behind.returncode == 130
+    assert state.moving == "no"
+    assert [event.status for event in events if "before it began" in (event.reason or "")] == ["aborted"]
 
 
 async def test_a_waited_move_may_be_left_running(served):

@@ -13,10 +13,8 @@ from ldcnd.client.lease import Control, control
 from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.errors import (
-    CommandExpired,
     DuplicateDaemon,
     LeaseExpired,
-    LeaseHeld,
     PositionLimit,
     StopLatched,
     ValueOutOfRange,
@@ -25,6 +23,7 @@ from ldcnd.errors import (
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.commands import (
     BufferMode,
+    CommandReply,
     Halt,
     Home,
     Jog,
@@ -65,7 +64,7 @@ async def moving_to_first_target(rig: RunningRig, lease_s: float = 60.0):
         yield held
 
 
-def buffered(rig: RunningRig, held: Control, **fields: object) -> "asyncio.Task[object]":
+def buffered(rig: RunningRig, held: Control, **fields: object) -> "asyncio.Task[CommandReply]":
     """Send a move that waits for the one under way."""
     request = MoveAbsolute(position=60.0, buffer_mode=BufferMode.BUFFERED, **fields)
     return asyncio.create_task(held.command("x", request, 30.0), name="buffered")
@@ -80,8 +79,7 @@ async def stays_at_first_target(rig: RunningRig) -> None:
 async def test_a_buffered_move_that_has_become_too_late_is_refused():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         waiting = buffered(rig, held, not_after=now_ns() + 500_000_000)
-        with pytest.raises(CommandExpired, match="later than its sender allows"):
-            await waiting
+        assert await rig.refusal(await waiting) == "command_expired"
         await stays_at_first_target(rig)
 
 
@@ -92,8 +90,7 @@ async def test_a_buffered_move_of_a_lease_that_was_released_is_refused():
             waiting = buffered(rig, held)
             await asyncio.sleep(0.5)
         async with control(rig.client, "bob", "x", lease_s=60.0):
-            with pytest.raises(LeaseExpired):
-                await waiting
+            assert await rig.refusal(await waiting) == "lease_expired"
             await stays_at_first_target(rig)
 
 
@@ -103,8 +100,7 @@ async def test_a_buffered_move_of_a_lease_that_was_taken_by_force_is_refused():
             waiting = buffered(rig, held)
             await asyncio.sleep(0.5)
             async with control(rig.client, "bob", "x", lease_s=60.0, force=True):
-                with pytest.raises(LeaseExpired):
-                    await waiting
+                assert await rig.refusal(await waiting) == "lease_expired"
                 await stays_at_first_target(rig)
 
 
@@ -117,8 +113,7 @@ async def test_a_buffered_move_of_a_client_that_died_is_refused_although_its_axi
             waiting = buffered(rig, held)
             await asyncio.sleep(0.5)
             rig.daemon._dispatcher.authority.expire(float("inf"))  # nothing was renewed
-            with pytest.raises(LeaseExpired):
-                await waiting
+            assert await rig.refusal(await waiting) == "lease_expired"
         await stays_at_first_target(rig)
 
 
@@ -127,8 +122,7 @@ async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
         waiting = buffered(rig, held)
         await asyncio.sleep(0.5)
         rig.daemon._dispatcher.rivals.add("other")
-        with pytest.raises(DuplicateDaemon):
-            await waiting
+        assert await rig.refusal(await waiting) == "duplicate_daemon"
         rig.daemon._dispatcher.rivals.clear()
         await stays_at_first_target(rig)
 
@@ -142,8 +136,7 @@ async def test_a_buffered_move_without_a_lease_is_refused_once_its_axis_is_held(
         waiting = asyncio.create_task(rig.client.command("x", request, 30.0))
         await asyncio.sleep(0.5)
         async with control(rig.client, "bob", "x", lease_s=60.0):
-            with pytest.raises(LeaseHeld):
-                await waiting
+            assert await rig.refusal(await waiting) == "lease_held"
             await stays_at_first_target(rig)
 
 

@@ -36,7 +36,7 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
             await until(pilot, lambda: states().get("x") == "standstill")
             await rig.command("x", MoveAbsolute(position=90.0, velocity=5.0))
             await until(pilot, lambda: states()["x"] == "discrete_motion")
-            await pilot.press("s")
+            await pilot.press("escape")
             await until(pilot, lambda: "stopped and latched: x, y, z, c" in str(answer.content))
             await until(pilot, lambda: states()["x"] != "discrete_motion")
 

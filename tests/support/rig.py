@@ -12,6 +12,8 @@ from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
+from ldcnd.model.commands import CommandReply
+from ldcnd.model.events import CommandStatus, ReadEvents
 from ldcnd.model.samples import StateSample
 from ldcnd.sim.chain import Chain
 
@@ -38,6 +40,13 @@ class RunningRig:
                     assert isinstance(latest, StateSample)
                     sample = latest
                 return sample
+
+    async def refusal(self, waiting: CommandReply) -> str | None:
+        """Return the code for which a command that waited did not begin; None if it did."""
+        await self.client.wait_for_end(waiting.axis, waiting.command_id)
+        page = await self.client.ask(ReadEvents(axis=waiting.axis, count=100))
+        last = [event for event in page.events if event.command_id == waiting.command_id][-1]
+        return last.code if last.status in (CommandStatus.REFUSED, CommandStatus.ABORTED) else None
 
 
 @asynccontextmanager

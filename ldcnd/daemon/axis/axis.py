@@ -80,6 +80,8 @@ from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
 log = get_logger("axis")
 
 QUEUED_COMMANDS = 8
+HALTS_WITHIN_S = 1.0
+"""Longest time that an aborting move is left without an answer while the axis comes to rest, seconds."""
 STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
 
@@ -278,6 +280,7 @@ class AxisService:
         self._seen = False
         self._successors = asyncio.Lock()
         self._changed = asyncio.Event()
+        self._last_in_turn = ""  # the last move that came to wait for its turn
 
     def _tracer(self, driver: Drive) -> Tracer:
         """Return the drive's own recorder, or the host's."""
@@ -578,15 +581,31 @@ class AxisService:
             )
         return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
 
-    async def in_turn(self, move: Move, permit: Permit, execute: Callable[[], Awaitable[CommandReply]]) -> CommandReply:
+    async def in_turn(
+        self,
+        move: Move,
+        permit: Permit,
+        execute: Callable[[], Awaitable[CommandReply]],
+        waits: Callable[[str], None] = lambda _: None,
+    ) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
 
         An aborting move that would be refused halts nothing.
 
+        Args:
+            move: the move.
+            permit: of it.
+            execute: begins it.
+            waits: called with the id of the command that it waits for: at once for a buffered move, and for an aborting
+                one when the axis takes long to come to rest.
+
         Raises:
-            StopLatched: a stop, or a later aborting move, came first.
+            StopLatched: a stop came first.
+            CommandAborted: a halt, or a later aborting move, came first.
             LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
+        ahead = self._last_in_turn if self._successors.locked() else self._under_way
+        patience_s = math.inf
         if move.buffer_mode is BufferMode.ABORTING and self.tracker.command:
             permit.ask_to_move()
             self._commands.check(move)
@@ -594,12 +613,41 @@ class AxisService:
                 self._overtake(permit, permit.verb)
                 return await execute()
             await self.bring_to_rest(StopMode.SMOOTH, by=permit)
+            patience_s = HALTS_WITHIN_S
+        elif move.buffer_mode is BufferMode.BUFFERED and ahead is not None:
+            permit.ask()
+            if self.tracker.command and self.tracker.command.verb is not Verb.HOME and isinstance(move, MoveAbsolute):
+                self._commands.check(move)  # what can be told now is not kept for later
+            waits(ahead)
+        self._last_in_turn = permit.command_id
         async with self._successors:  # those who wait are served in the order in which they came
+            deadline_s = self._clock.now_s() + patience_s
             while self.tracker.command:
                 self._changed.clear()
-                await self._changed.wait()
-                permit.ask()
+                try:
+                    async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
+                        await self._changed.wait()
+                except TimeoutError:
+                    deadline_s = math.inf
+                    waits(self._under_way or permit.command_id)
+                self._ask_in_turn(permit)
+            self._ask_in_turn(permit)
             return await execute()
+
+    def _ask_in_turn(self, permit: Permit) -> None:
+        """Ask whether a move may still have its turn: also what overtakes it without a latch withdraws it."""
+        try:
+            permit.ask()
+        except StopLatched:
+            if self.tracker.stop_latched or self.tracker.stop_pending:
+                raise
+            name = self.config.name
+            text = f"axis {name}: {permit.verb} was withdrawn by a halt or a later move before it began"
+            raise CommandAborted(text, axis=name) from None
+
+    @property
+    def _under_way(self) -> str | None:
+        return self.tracker.command.command_id if self.tracker.command else None
 
     async def set_speed_share(self, share: float) -> tuple[bool, bool]:
         """Take another speed override, 0 to 1; return whether what moves goes on at another speed, or was halted.

@@ -8,6 +8,7 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from ldcnd.daemon.axis.axis import AxisService
 from ldcnd.daemon.axis.guards import UNCONDITIONAL, Permit, Right
@@ -54,6 +55,7 @@ from ldcnd.wirelog.recorder import WireEvent
 
 log = get_logger("requests")
 
+Accept = Callable[[CommandReply], None]
 STOP = "@stop"
 STOPS_AT_ONCE = 8
 """Maximum number of concurrent stops of the same axes; further ones join."""
@@ -186,6 +188,12 @@ class Requests:
             log.exception("bug while answering", key=query.key)
             self._refuse(query, InternalError("an error inside ldcnd; its log has the details"))
         else:
+            self._reply(query, reply)
+
+    @staticmethod
+    def _reply(query: Query, reply: Frozen) -> None:
+        """Answer unless it was answered when the command came to wait; events say how it went on."""
+        if not query.answered:
             query.reply(*encode(reply, reply_encoding(query.encoding)))
 
     async def _command(self, query: Query) -> Frozen:
@@ -196,7 +204,7 @@ class Requests:
             _ = self._rig.axes[address.axis]  # an unknown axis is refused before an unknown verb
         kind = _command_class(address)
         command = decode(kind, query.payload, query.encoding)
-        return await self._dispatcher.answer(address.axis, command, query.login)
+        return await self._dispatcher.answer(address.axis, command, query.login, partial(self._reply, query))
 
     async def _stop(self, query: Query) -> Frozen:
         """Stop even if the payload is nonsense: a stop is always accepted."""
@@ -255,6 +263,8 @@ class Requests:
         return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
 
     def _refuse(self, query: Query, error: LdcndError) -> None:
+        if query.answered:
+            return
         if (fields := self._refusals_logged.admit()) is not None:
             log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
         query.refuse(error)
@@ -311,13 +321,16 @@ class Dispatcher:
             rig, authority, self.leases, ledger, events, clock, self.carry_out, self._admit_lease
         )
 
-    async def answer(self, axis: str, command: Command[Frozen], login: str | None = None) -> Frozen:
+    async def answer(
+        self, axis: str, command: Command[Frozen], login: str | None = None, accept: Accept = lambda _: None
+    ) -> Frozen:
         """Carry out a command that has just arrived, and return its reply.
 
         Args:
             axis: which axis, or `RIG_ITSELF`.
             command: the request.
             login: whose link it came over, for the record.
+            accept: takes the reply of a command that waits for another one; no caller need wait as long.
 
         Raises:
             LdcndError: as it was refused.
@@ -328,7 +341,7 @@ class Dispatcher:
             self._journal.asked(axis, command)
         match command:
             case AxisCommand():
-                return await self.carry_out(axis, command, login)
+                return await self.carry_out(axis, command, login, accept)
             case Acquire():
                 lease = self.leases.acquire(command)
                 self._journal.asked(RIG_ITSELF, command, lease.token)
@@ -337,7 +350,11 @@ class Dispatcher:
                 return await self._rig_commands.answer(axis, command, login)
 
     async def carry_out(
-        self, axis_name: str, command: AxisCommand[CommandReply], login: str | None = None
+        self,
+        axis_name: str,
+        command: AxisCommand[CommandReply],
+        login: str | None = None,
+        accept: Accept = lambda _: None,
     ) -> CommandReply:
         """Carry out a command of an axis, or answer as the first time when its id is known.
 
@@ -365,7 +382,11 @@ class Dispatcher:
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
-                return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit))
+
+                def waits(ahead: str) -> None:
+                    accept(self._ledger.waits(command_id, ahead))
+
+                return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit), waits)
             return await self._start(axis, command, permit)
         except LdcndError as error:
             self._ledger.answered(command_id, error, _status(error))
@@ -410,7 +431,8 @@ class Dispatcher:
 
     async def _answer_again(self, entry: Entry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""
-        if under_way := self._under_way.get(entry.command_id):
+        under_way = self._under_way.get(entry.command_id)
+        if under_way and entry.answer is None:
             await under_way.wait()
             entry = self._ledger.get(entry.command_id)
         if isinstance(entry.answer, CommandReply):

@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 
 from ldcnd.daemon.axis.state import ActiveCommand
@@ -135,6 +135,13 @@ class Ledger:
         if len(self._of_senders) > SENDERS:
             self._forget_sender()
         self._changed(entry, None)
+
+    def waits(self, command_id: str, ahead: str) -> CommandReply:
+        """Record that a command waits for another one, and return the reply that says so."""
+        entry = self._entries[command_id]
+        reply = CommandReply(command_id=command_id, axis=entry.axis, verb=entry.verb, waits_for=ahead)
+        self._entries[command_id] = replace(entry, answer=reply)
+        return reply
 
     def answered(self, command_id: str, answer: CommandReply | LdcndError, status: CommandStatus) -> None:
         """Record the reply to the caller."""
