@@ -9,7 +9,7 @@ from typing import NoReturn
 import click
 
 from ldcnd.cli.lazy_group import LazyGroup
-from ldcnd.cli.output import DONE, EXIT_CODES, exit_code
+from ldcnd.cli.output import DONE, EXIT_CODES, exit_code, print_under_any_encoding
 from ldcnd.errors import LdcndError
 
 COMMANDS = {
@@ -101,6 +101,7 @@ def main() -> NoReturn:
     # looking for plugins of pydantic reads what every installed package says about itself
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     _pause_collector()
+    print_under_any_encoding()
     try:
         cli.main(standalone_mode=False)
         sys.stdout.flush()

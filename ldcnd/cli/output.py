@@ -1,5 +1,6 @@
 """Output and endings of commands: nothing from the network steers a terminal, no error shows a traceback."""
 
+import io
 import os
 import sys
 
@@ -57,6 +58,19 @@ EXIT_CODES = {
     INTERRUPTED: "interrupted by Ctrl-C; what was waited for was halted, or the message says how to halt it",
 }
 """All of them, with what they mean."""
+
+
+def print_under_any_encoding() -> None:
+    """Let nothing that is printed fail for its characters, or because a standard stream is closed.
+
+    A command may have sent a motion by then, so it must get to its end, which halts or names what goes on.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # also keeps a socket from becoming standard output
+            setattr(sys, name, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115, PTH123 - for as long as the process
+        elif isinstance(stream, io.TextIOWrapper) and name != "stdin":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def show_lines(*lines: str, err: bool = False) -> None:

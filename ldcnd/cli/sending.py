@@ -70,7 +70,13 @@ class Sender:
                 reply = await self.command(client, axis, command)
                 words = command.verb.replace("_", " ")
                 waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
-                self.target.show(reply, f"{axis}: {words} accepted{values_of(reply, info)}{waits}")
+                said = f"{axis}: {words} accepted{values_of(reply, info)}{waits}"
+                try:
+                    self.target.show(reply, said)
+                except OSError:
+                    if not wait:
+                        show_lines(f"{said}; it goes on, `ldcnd axis halt {axis}` halts it", err=True)
+                    raise
                 if not wait:
                     return None
                 state = await _follow(client, info, reply)
@@ -140,11 +146,16 @@ def takes_energy_out(command: Sent) -> bool:
 
 @asynccontextmanager
 async def halting(client: RigClient, info: AxisInfo, *, leave_running: bool = False) -> AsyncIterator[None]:
-    """Halt an axis, and say so, if the context is cut short by Ctrl-C; or say that it is left running."""
+    """Halt an axis, and say so, if anything but an answer of the daemon cuts the context short, such as Ctrl-C.
+
+    Or say that it is left running.
+    """
     axis = info.axis
     try:
         yield
-    except asyncio.CancelledError:
+    except LdcndError:
+        raise
+    except BaseException:
         said = f"{axis} is left running; `ldcnd axis halt {axis}` halts it" if leave_running else None
         said = said or await halted(client, info)
         with suppress(OSError):  # the terminal may be what has gone
