@@ -224,4 +224,5 @@ async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIter
             if len(rigs) > 1:
                 raise UnknownAxis(f"several rigs answer; {there}", remedy="choose one with --rig")
             rig = rigs[0]
-        yield RigClient(session, rig)
+        # what is sent under $LDCND_LEASE is so for every command, whatever it sends
+        yield RigClient(session, rig, os.environ.get("LDCND_LEASE") or None)

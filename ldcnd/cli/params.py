@@ -52,8 +52,8 @@ def list_parameters(target: Target, axis: str) -> None:
         limits = "-" if each.lowest is None else f"{each.lowest} to {each.highest}"
         hint = f" [{each.confidence}]" if each.confidence else ""
         cycle = ", from the next power-on" if each.power_cycle else ""
-        digits = "".join(f"\n         .{one.digit} {one.title} [{one.confidence}]" for one in each.digit_meanings)
-        target.show(each, f"{each.parameter}  {limits:>14} {each.unit or '':18}{hint:6} {each.name}{cycle}{digits}")
+        digits = [f"         .{one.digit} {one.title} [{one.confidence}]" for one in each.digit_meanings]
+        target.show(each, f"{each.parameter}  {limits:>14} {each.unit or '':18}{hint:6} {each.name}{cycle}", *digits)
 
 
 @command.command()
@@ -95,9 +95,15 @@ def set_parameter(
 @command.command()
 @click.argument("axis", type=AXIS)
 @click.argument("file", type=click.Path(path_type=Path), required=False)
+@click.option("--force", is_flag=True, help="Write over FILE if it is there.")
 @with_target
-def dump(target: Target, axis: str, file: Path | None) -> None:
-    """Write all parameters of AXIS as TOML to FILE or the terminal: both memories, type, version, switches, date."""
+def dump(target: Target, axis: str, file: Path | None, *, force: bool) -> None:
+    """Write all parameters of AXIS as TOML to FILE or the terminal: both memories, type, version, switches, date.
+
+    A FILE that is there already is kept: it may be the only copy of what another drive held.
+    """
+    if file and file.exists() and not force:
+        raise click.UsageError(f"{file} is there already; give another name, or --force to write over it")
     text = as_toml(axis, target.run(lambda client: read_dump(client, axis)), datetime.now(UTC))
     if file:
         file.write_text(text, encoding="utf-8")
@@ -208,7 +214,7 @@ def _transfer(
         return await plan_transfer(client, axis, values, driver_type, memory=memory, any_type=any_type)
 
     planned = target.run(plan)
-    target.show(planned, "\n".join(_plan_lines(axis, planned)))
+    target.show(planned, *_plan_lines(axis, planned))
     if planned.problems:
         sys.exit(UNFINISHED)
     if dry_run or not planned.writes:

@@ -92,10 +92,12 @@ class RigClient:
         rig: its name.
         session: the session.
         keys: the keys of the rig.
+        lease: under this one is sent what can be sent under a lease and names none; None without one.
     """
 
-    def __init__(self, session: Session, rig: str) -> None:
+    def __init__(self, session: Session, rig: str, lease: str | None = None) -> None:
         self.rig = rig
+        self.lease = lease
         self.session = session
         self.keys = Keys(rig)
         self._instance: str | None = None
@@ -198,6 +200,8 @@ class RigClient:
         return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, model) for answer in answers}
 
     async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
+        if self.lease and getattr(command, "lease", self.lease) is None:
+            command = command.model_copy(update={"lease": self.lease, "client": None})
         payload, encoding = encode(command, Encoding.MSGPACK)
         key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s

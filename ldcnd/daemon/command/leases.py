@@ -227,7 +227,7 @@ class Authority:
             )
         if self.required:
             raise LeaseRequired(
-                f"axis {axis} moves only under a lease",
+                f"axis {axis} takes commands only under a lease",
                 axis=axis,
                 remedy=Remedy("{}", step("acquire", "acquire one first")),
             )
