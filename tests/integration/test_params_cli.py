@@ -31,9 +31,16 @@ def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path, monkeypa
         without_type = rig.run(f"params restore feed {some} --yes")
         restored = rig.run(f"params restore feed {some} --yes --any-type")
         cloned = rig.run("params clone feed spool --dry-run")
+        listed = rig.run("params list feed")
+        kept = saved.read_text()
+        again = rig.run(f"params dump feed {saved}")
+        kept_still = saved.read_text() == kept
+        forced = rig.run(f"params dump feed {saved} --force")
 
+    assert "\\n" not in cloned.printed + listed.printed
+    assert (again.code, "already" in again.errors, kept_still, forced.code) == (2, True, True, 0)
     assert (written.code, dumped.code) == (0, 0)
-    assert load_parameters(saved).values["Pn102"] == 55
+    assert ("Pn102 = 55 " in kept, load_parameters(saved).values["Pn102"]) == (True, 56)
     assert (same.code, same.printed, same.errors) == (0, "", "")
     assert (without_type.code, "type" in without_type.printed) == (1, True)
     assert (cloned.code, "Pn102 EEPROM 40 (0028H) -> 56 (0038H)" in cloned.printed) == (0, True)
