@@ -24,8 +24,6 @@ from ldcnd.model.rig_commands import (
     WalkPath,
 )
 
-GROUP_TIME_S = 10.0
-
 
 @click.group()
 def command() -> None:
@@ -69,7 +67,7 @@ def group_move(
                 sender.target.show(state, outcome(info, ended, state))
             return failed
 
-        reply = await client.ask(request, timeout_s=GROUP_TIME_S)
+        reply = await client.ask(request)
         lines = [
             f"{each.axis}: accepted{values_of(each, info)}" for each, info in zip(reply.replies, infos, strict=True)
         ]
@@ -132,7 +130,7 @@ def group_path(
 
     async def work(client: RigClient) -> None:
         infos = [await axis_of(client, move.axis) for move in moves]
-        reply = await client.ask(request, timeout_s=GROUP_TIME_S)
+        reply = await client.ask(request)
         lines = [
             f"{each.axis}: accepted{values_of(each, info)}" for each, info in zip(reply.replies, infos, strict=True)
         ]

@@ -77,7 +77,7 @@ async def arm_trace(client: RigClient, axis: str, request: TakeTrace) -> TraceRe
 
 @asynccontextmanager
 async def armed_trace(client: RigClient, axis: str, request: TakeTrace) -> AsyncIterator[TraceReply]:
-    """Arm a trace that is ended when the context is cancelled; yields what it will be.
+    """Arm a trace that is ended when the context is cancelled or waits no longer; yields what it will be.
 
     Raises:
         LdcndError: the daemon refused it.
@@ -85,7 +85,7 @@ async def armed_trace(client: RigClient, axis: str, request: TakeTrace) -> Async
     reply = await arm_trace(client, axis, request)
     try:
         yield reply
-    except asyncio.CancelledError:
+    except (asyncio.CancelledError, OutcomeUnknown):
         with suppress(LdcndError):  # out of reach: it ends by itself
             await _end(client, axis, reply.trace_id)
         raise

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Generic
 
 from pydantic import Field
 
-from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Effect, Verb
+from ldcnd.model.commands import AxisCommand, Capability, Command, CommandReply, Effect, ReplyT_co, Verb
 from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 from ldcnd.model.samples import MonitorName
 
@@ -263,23 +263,27 @@ class MonitorReport(CommandReply):
     """In the order of the request; those that the drive does not have are left out."""
 
 
-class ListParameters(AxisCommand[ParameterList]):
+class ParameterCommand(AxisCommand[ReplyT_co], Generic[ReplyT_co]):
+    """The base of these commands: each waits its turn behind those that take long."""
+
+    capability = Capability.PARAMETERS
+    answer_s = SLOW_S
+
+
+class ListParameters(ParameterCommand[ParameterList]):
     """List what is known of the drive's parameters; sends nothing to the drive."""
 
     verb = Verb.LIST_PARAMETERS
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
 
 
-class ReadParameter(AxisCommand[ParameterReply]):
+class ReadParameter(ParameterCommand[ParameterReply]):
     """Read one parameter from both memories."""
 
     verb = Verb.READ_PARAMETER
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
     parameter: str
     """Its number, such as Pn100, or the manual's name in any case."""
@@ -287,24 +291,20 @@ class ReadParameter(AxisCommand[ParameterReply]):
     """Allow a number that the manual does not list."""
 
 
-class ReadAllParameters(AxisCommand[ParameterDump]):
+class ReadAllParameters(ParameterCommand[ParameterDump]):
     """Read every listed parameter from both memories; takes seconds on a slow line."""
 
     verb = Verb.READ_ALL_PARAMETERS
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
 
-class PlanParameters(AxisCommand[ParameterPlan]):
+class PlanParameters(ParameterCommand[ParameterPlan]):
     """List the writes after which a drive holds certain values, and what speaks against them; changes nothing."""
 
     verb = Verb.PLAN_PARAMETERS
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
     values: Mapping[str, Annotated[int, Field(ge=0, le=0xFFFF)]]
     """The wanted words, by number such as Pn100. The unit number in Pn000 is not taken from here."""
@@ -317,12 +317,10 @@ class PlanParameters(AxisCommand[ParameterPlan]):
     where that is possible."""
 
 
-class WriteParameter(AxisCommand[ParameterReply]):
+class WriteParameter(ParameterCommand[ParameterReply]):
     """Write one parameter, in RAM unless EEPROM is named; nothing is sent when it has the value already."""
 
     verb = Verb.WRITE_PARAMETER
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
     parameter: str
     """Its number, such as Pn100, or the manual's name in any case."""
@@ -336,54 +334,46 @@ class WriteParameter(AxisCommand[ParameterReply]):
     """The unit number that the drive will have after its next power-on, when this write changes it."""
 
 
-class ClearCounter(AxisCommand[CounterReply]):
+class ClearCounter(ParameterCommand[CounterReply]):
     """Set a pulse counter to 0; command pulses must be stopped, and for the feedback counter the motor must stand."""
 
     verb = Verb.CLEAR_COUNTER
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
     counter: CounterName
     """Which counter."""
 
 
-class RestartEepromCount(AxisCommand[EepromCount]):
+class RestartEepromCount(ParameterCommand[EepromCount]):
     """Restart the count of EEPROM writes, because the drive was replaced; nothing is sent to it."""
 
     verb = Verb.RESTART_EEPROM_COUNT
-    capability = Capability.PARAMETERS
 
     writes: int = Field(default=0, ge=0, le=10_000)
     """Writes that the drive which is there now has taken already; 0 for a new one."""
 
 
-class ReadAlarms(AxisCommand[AlarmReport]):
+class ReadAlarms(ParameterCommand[AlarmReport]):
     """Read the present alarm and the alarm history."""
 
     verb = Verb.READ_ALARMS
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
 
-class ReadProfile(AxisCommand[DriveProfile]):
+class ReadProfile(ParameterCommand[DriveProfile]):
     """Return the drive's assumed behaviour, with its assumptions; sends nothing to the drive."""
 
     verb = Verb.READ_PROFILE
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
 
 
-class ReadMonitors(AxisCommand[MonitorReport]):
+class ReadMonitors(ParameterCommand[MonitorReport]):
     """Read monitors once, published or not."""
 
     verb = Verb.READ_MONITORS
     effect = Effect.QUESTION
     needs_lease = False
-    capability = Capability.PARAMETERS
-    answer_s = SLOW_S
 
     monitors: tuple[MonitorName, ...] = Field(default=(), max_length=len(MonitorName))
     """Which; none stands for all."""

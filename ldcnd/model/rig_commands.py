@@ -10,6 +10,9 @@ from ldcnd.model.commands import About, Command, CommandReply, Effect, Ends, Mov
 from ldcnd.model.events import ReadEvents, ReadOutcome
 from ldcnd.model.frozen import LARGEST_INTEGER, Frozen
 
+TOGETHER_S = 10.0
+"""Longest wait for the start of several axes: each has its turn first, and proves that it started; seconds."""
+
 
 class AxisMove(MoveAbsolute):
     """The share of one axis; it can carry a command id of its own."""
@@ -58,6 +61,7 @@ class MoveTogether(GroupMoves, Command[MoveTogetherReply]):
     about = About.RIG
     needs_lease = True
     ends = Ends.BY_READING
+    answer_s = TOGETHER_S
 
 
 class AxisPath(AxisMove):
@@ -96,6 +100,7 @@ class WalkPath(Command[PathReply]):
     about = About.RIG
     needs_lease = True
     ends = Ends.BY_READING
+    answer_s = TOGETHER_S
 
     moves: tuple[AxisPath, ...] = Field(min_length=2, max_length=31)
     """Exactly the members of a group, each once."""

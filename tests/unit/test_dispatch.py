@@ -126,6 +126,30 @@ async def test_a_repeated_command_moves_once_and_is_answered_alike_also_while_it
             await rig.send(command, "y")
 
 
+async def test_what_gets_its_turn_after_its_sender_has_given_up_does_not_begin():
+    async with commanded() as rig:
+        released = asyncio.Event()
+        rig.x.drive.during["set_gains"] = released.wait
+        async with asyncio.TaskGroup() as group:
+            group.create_task(rig.send(SetGains(kp=100)), name="takes long")
+            await asyncio.sleep(0.1)
+            behind = [rig.send(each) for each in (MoveVelocity(velocity=1.0), THERE, Power(on=True))]
+            waiting = [group.create_task(refused(each), name="behind") for each in behind]
+            await asyncio.sleep(6.0)
+            released.set()
+
+        assert [type(each.result()) for each in waiting] == [CommandExpired] * 3
+        assert rig.x.drive.calls == ["set_gains"]
+
+
+async def refused(sent) -> LdcndError | None:
+    """Return the error that a command is answered with."""
+    try:
+        await sent
+    except LdcndError as error:
+        return error
+
+
 async def test_a_repeated_refusal_stays_a_refusal():
     command = THERE.model_copy(update={"command_id": "c1"})
     async with commanded() as rig:

@@ -59,6 +59,8 @@ Accept = Callable[[CommandReply], None]
 STOP = "@stop"
 STOPS_AT_ONCE = 8
 """Maximum number of concurrent stops of the same axes; further ones join."""
+REPLY_S = 1.0
+"""Time left for a drive's acknowledgement and the reply when a command begins; who gets none by then gives up."""
 PENDING_REQUESTS = 64
 """Maximum number of concurrent commands; stops are not counted."""
 
@@ -373,7 +375,8 @@ class Dispatcher:
                 return await self._answer_again(entry)
             command_id = self.events.next_command_id()
         client = self._admit(axis_name, command) or command.client
-        right = UNCONDITIONAL if command.effect is Effect.REST else self._right(axis_name, command)
+        accepted = asyncio.Event()
+        right = UNCONDITIONAL if command.effect is Effect.REST else self._right(axis_name, command, accepted)
         hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
@@ -384,6 +387,7 @@ class Dispatcher:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
 
                 def waits(ahead: str) -> None:
+                    accepted.set()
                     accept(self._ledger.waits(command_id, ahead))
 
                 return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit), waits)
@@ -463,16 +467,32 @@ class Dispatcher:
         self._refuse_rival(axis)
         self.authority.admit(axis, lease, None, self._clock.now_s())
 
-    def _right(self, axis: str, command: AxisCommand[CommandReply]) -> Right:
-        """Return what must still hold of the sender when a motion of its command begins."""
+    def _right(self, axis: str, command: AxisCommand[CommandReply], accepted: asyncio.Event) -> Right:
+        """Return what must still hold of the sender when a motion of its command begins.
+
+        Args:
+            axis: which axis.
+            command: the request.
+            accepted: set once its sender has the reply that it waits for its turn.
+        """
+        arrived_s = self._clock.now_s()
 
         def holds() -> None:
             self._refuse_rival(axis)
             self.authority.check_held(axis, command.lease, self._clock.now_s())
 
-        if command.not_after is None:
-            return Right(holds)
-        return Right(holds, lambda: self._refuse_late(axis, command))
+        def in_time() -> None:
+            self._refuse_late(axis, command)
+            if not accepted.is_set() and self._clock.now_s() - arrived_s > command.answer_s - REPLY_S:
+                raise CommandExpired(
+                    f"axis {axis}: the turn of {command.verb} came later than its sender waits for a reply",
+                    axis=axis,
+                    value=self._clock.now_s() - arrived_s,
+                    limit=command.answer_s - REPLY_S,
+                    remedy="send it again if it is still wanted",
+                )
+
+        return Right(holds, in_time)
 
     def _refuse_late(self, axis: str, command: AxisCommand[CommandReply]) -> None:
         if command.not_after is not None and self._clock.now_ns() > command.not_after:
