@@ -16,6 +16,7 @@ from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
 from ldcnd.cli.output import show_lines
+from ldcnd.client.lease import inherited_lease
 from ldcnd.client.rig_client import RigClient, find_rigs, on_each_rig
 from ldcnd.errors import LdcndError, SessionError, UnknownAxis
 from ldcnd.messaging.session import Session
@@ -225,4 +226,4 @@ async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIter
                 raise UnknownAxis(f"several rigs answer; {there}", remedy="choose one with --rig")
             rig = rigs[0]
         # what is sent under $LDCND_LEASE is so for every command, whatever it sends
-        yield RigClient(session, rig, os.environ.get("LDCND_LEASE") or None)
+        yield RigClient(session, rig, inherited_lease())

@@ -45,6 +45,12 @@ def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> N
     """Take control, jog, and disappear: how long until the axis reacts, and until it is at rest?"""
 
     async def work(client: RigClient) -> dict[str, float]:
+        if client.lease:
+            raise WrongState(
+                f"axis {axis}: `ldcnd lease hold`, which runs this, goes on renewing its lease: no client is lost",
+                axis=axis,
+                remedy="run it outside",
+            )
         request = Acquire(client="drill", axes=(axis,), lease_s=lease_s)
         lease = await client.ask(request)
         began_s = asyncio.get_running_loop().time()

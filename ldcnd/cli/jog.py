@@ -2,8 +2,6 @@
 
 import asyncio
 import sys
-from contextlib import AbstractAsyncContextManager, nullcontext
-from dataclasses import dataclass
 from functools import partial
 
 import click
@@ -18,8 +16,8 @@ from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError, LdcndError, LeaseExpired
-from ldcnd.model.commands import LONGEST_HOLD_S, CommandReply, Jog
+from ldcnd.errors import ConfigError, LeaseExpired
+from ldcnd.model.commands import LONGEST_HOLD_S, Jog
 from ldcnd.model.meta import AxisInfo
 
 LEASE_S = 1.0
@@ -51,7 +49,7 @@ def jog(
     async def work(client: RigClient) -> str:
         info = await axis_of(client, axis)
         async with (
-            _control(client, axis, force=force) as held,
+            control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force) as held,
             halting(client, info),
         ):
             if for_s is None:
@@ -64,25 +62,7 @@ def jog(
     show_lines(target.run(work))
 
 
-@dataclass(frozen=True, slots=True)
-class Inherited:
-    """Control that the program holds which has started this one: `ldcnd lease hold`."""
-
-    client: RigClient
-    lost: LdcndError | None = None
-
-    async def command(self, axis: str, command: Jog) -> CommandReply:
-        """Send one command under its lease."""
-        return await self.client.command(axis, command)
-
-
-def _control(client: RigClient, axis: str, *, force: bool) -> AbstractAsyncContextManager[Control | Inherited]:
-    if client.lease and not force:
-        return nullcontext(Inherited(client))
-    return control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force)
-
-
-async def _for_a_time(info: AxisInfo, held: Control | Inherited, command: Jog, for_s: float) -> None:
+async def _for_a_time(info: AxisInfo, held: Control, command: Jog, for_s: float) -> None:
     """Run the axis for a time, in seconds, or until its software limit."""
     jog = Jogging(partial(held.command, info.axis), command)
     reply = await jog.begin()
@@ -98,7 +78,7 @@ async def _for_a_time(info: AxisInfo, held: Control | Inherited, command: Jog, f
             raise
 
 
-async def _while_pressed(client: RigClient, info: AxisInfo, held: Control | Inherited, command: Jog) -> None:
+async def _while_pressed(client: RigClient, info: AxisInfo, held: Control, command: Jog) -> None:
     """Run the axis whenever the space bar is held, until another key is pressed."""
     first = command.model_copy(update={"hold_s": LONGEST_HOLD_S})
     with keys() as pressed:

@@ -86,7 +86,7 @@ class Axis(AxisVerbs, Watched):
         self._position: tuple[Sample | PositionSample, float] | None = None
         self._changed = asyncio.Event()
         self._readers: weakref.WeakSet[Positions] = weakref.WeakSet()
-        self._motions: weakref.WeakSet[Motion] = weakref.WeakSet()
+        self._last: Motion | None = None  # of those begun here: what came before it has ended when it has
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
@@ -220,14 +220,13 @@ class Axis(AxisVerbs, Watched):
 
     async def halt_unfinished(self) -> None:
         """Halt if a motion that was begun here may not have ended."""
-        if any(motion.ended is None for motion in self._motions):
+        if self._last and self._last.ended is None:
             await self.halt_now()
 
     def begun(self, reply: CommandReply) -> Motion:
         """Return the motion that a command has begun."""
-        motion = Motion(reply, self)
-        self._motions.add(motion)
-        return motion
+        self._last = Motion(reply, self)
+        return self._last
 
     async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
         command = _made(make)

@@ -1,4 +1,4 @@
-"""Control over axes for the time of a context: acquired, renewed by itself, released."""
+"""Control over axes for the time of a context: acquired or inherited, renewed by itself, released."""
 
 import asyncio
 import contextlib
@@ -18,8 +18,15 @@ RequestT = TypeVar("RequestT", bound=AxisCommand[CommandReply])
 
 RENEWALS_PER_LEASE = 4
 """Number of consecutive renewals that may be lost before a lease ends."""
+LEASE_VARIABLE = "LDCND_LEASE"
+"""Variable of the environment in which `ldcnd lease hold` gives its lease to the program that it runs."""
 LONGEST_NAME = 64
 """Longest name of a client, characters."""
+
+
+def inherited_lease() -> str | None:
+    """Return the lease that the program which has started this one shares with it; None without one."""
+    return os.environ.get(LEASE_VARIABLE) or None
 
 
 def program_name(name: str) -> str:
@@ -32,16 +39,18 @@ def program_name(name: str) -> str:
 
 
 class Control:
-    """A lease that this program holds.
+    """A lease that this program holds, or shares with the one that has started it.
 
     Attributes:
         lease: as acquired.
+        inherited: whether another program holds it as well: then it is not released here.
         lost: why it does not hold any more; None while it does.
         over: is set when it does not.
     """
 
-    def __init__(self, client: RigClient, lease: LeaseReply) -> None:
+    def __init__(self, client: RigClient, lease: LeaseReply, *, inherited: bool = False) -> None:
         self.lease = lease
+        self.inherited = inherited
         self.lost: LdcndError | None = None
         self.over = asyncio.Event()
         self._client = client
@@ -57,7 +66,7 @@ class Control:
         return await self._client.command(axis, self.stamped(command, axis), timeout_s)
 
     def stamped(self, request: RequestT, axis: str) -> RequestT:
-        """Return a request for an axis under the lease, with the next sequence number.
+        """Return a request for an axis under the lease, with the next sequence number unless others count as well.
 
         Raises:
             LeaseExpired: the lease was lost.
@@ -68,7 +77,8 @@ class Control:
                 axis=axis,
                 remedy=Remedy("{}", step("acquire", "acquire it again")),
             )
-        return request.model_copy(update={"lease": self.lease.lease, "sequence": next(self._sequence)})
+        sequence = None if self.inherited else next(self._sequence)
+        return request.model_copy(update={"lease": self.lease.lease, "sequence": sequence})
 
     async def keep(self) -> None:
         """Renew until cancelled or until the lease has ended: by the daemon's word, or unrenewed for its duration."""
@@ -91,10 +101,27 @@ class Control:
     async def release(self, *, leave_running: bool = False) -> None:
         """Give control back; it may have been taken away meanwhile, or end by itself when the daemon is out of reach.
 
-        An axis that moves then does what its `loss.client` says, unless it is left running on purpose.
+        An axis that moves then does what its `loss.client` says, unless it is left running on purpose. What is
+        inherited stays with its holder.
         """
+        if self.inherited:
+            return
         with contextlib.suppress(LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError):
             await self._client.ask(Release(lease=self.lease.lease, leave_running=leave_running))
+
+
+async def take_control(client: RigClient, name: str, axes: tuple[str, ...], lease_s: float, *, force: bool) -> Control:
+    """Take control over axes (all, when none is named), or share it with the program that has started this one.
+
+    Raises:
+        LeaseHeld: another client controls one of the axes.
+        LeaseExpired, LeaseUnknown: what was inherited does not hold any more.
+    """
+    if client.lease and not force:
+        lease = await client.ask(Renew(lease=client.lease))
+        if set(axes) <= set(lease.axes):
+            return Control(client, lease, inherited=True)
+    return Control(client, await client.ask(Acquire(client=name, axes=axes, lease_s=lease_s, force=force)))
 
 
 @contextlib.asynccontextmanager
@@ -106,7 +133,7 @@ async def control(
     force: bool = False,
     leave_running: bool = False,
 ) -> AsyncIterator[Control]:
-    """Hold control over axes (all, when none is named) until the context ends.
+    """Hold control over axes until the context ends; see `take_control`.
 
     Args:
         client: the rig.
@@ -120,8 +147,7 @@ async def control(
     Raises:
         LeaseHeld: another client controls one of the axes.
     """
-    request = Acquire(client=name, axes=axes, lease_s=lease_s, force=force)
-    held = Control(client, await client.ask(request))
+    held = await take_control(client, name, axes, lease_s, force=force)
     try:
         async with asyncio.TaskGroup() as group:
             keeper = group.create_task(held.keep(), name=f"lease of {name}")

@@ -151,7 +151,7 @@ class Watched(ABC):
         """Halt, in a bounded time and without raising; nothing is sent once control was lost."""
 
 
-@dataclass(slots=True, eq=False, weakref_slot=True)
+@dataclass(slots=True, eq=False)
 class Motion:
     """A command that the drive has acknowledged and that ends later.
 

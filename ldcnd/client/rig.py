@@ -10,7 +10,7 @@ from typing import Literal, overload
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.events import Events, follow_events
-from ldcnd.client.lease import Control
+from ldcnd.client.lease import Control, inherited_lease, take_control
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig_client import RigClient, Samples, find_rigs
 from ldcnd.errors import LeaseRequired, SessionError, UnknownAxis
@@ -18,7 +18,7 @@ from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.commands import StopReply
 from ldcnd.model.events import CommandOutcome, ReadOutcome
-from ldcnd.model.leases import Acquire, HolderList, ListHolders
+from ldcnd.model.leases import HolderList, ListHolders
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.model.rig_commands import (
     AxisMove,
@@ -74,7 +74,7 @@ async def connect(
                 else "no daemon answers",
                 remedy="start one with `ldcnd run`, or name its endpoint; a login without a role sees none either",
             )
-        yield Rig(RigClient(session, found.rig), found)
+        yield Rig(RigClient(session, found.rig, inherited_lease()), found)
 
 
 def _settings(endpoint: str | None, config: Path | str | None) -> ZenohSettings:
@@ -117,7 +117,8 @@ class Rig:
         """Control axes until the context ends: no other client moves them, and they halt when this program disappears.
 
         Yields the axis, or a tuple when several are named. When control is lost, `LeaseExpired` is raised where the
-        program waits. An exception that leaves the context halts the axes whose motions have not ended.
+        program waits. An exception that leaves the context halts the axes whose motions have not ended. Inside
+        `ldcnd lease hold -- PROGRAM` the program shares the control that is held for it.
 
         Args:
             axes: what to control; a group stands for its members.
@@ -363,13 +364,14 @@ class Rig:
         self, names: tuple[str, ...], who: str, lease_s: float, *, force: bool
     ) -> AsyncIterator[tuple[Axis, ...]]:
         """Control axes; always a tuple."""
-        lease = await self._client.ask(Acquire(client=who, axes=names, lease_s=lease_s, force=force))
-        control = Control(self._client, lease)
+        control = await take_control(self._client, who, names, lease_s, force=force)
+        lease = control.lease
+        wanted = names if control.inherited and names else lease.axes
         try:
-            async with self.watched(lease.axes) as covered, asyncio.TaskGroup() as group:
+            async with self.watched(wanted) as covered, asyncio.TaskGroup() as group:
                 axes = (
                     covered
-                    if set(names) != set(lease.axes)
+                    if set(names) != set(wanted)
                     else tuple(next(axis for axis in covered if axis.name == name) for name in names)
                 )
                 for axis in axes:
@@ -381,6 +383,9 @@ class Rig:
                 except BaseException:
                     await _halt_unfinished(axes)
                     raise
+                else:
+                    if control.inherited:  # the daemon does so when a lease is released
+                        await _halt_unfinished(axes)
                 finally:
                     keeper.cancel()
                     for axis in axes:
