@@ -12,6 +12,7 @@ from ldcnd.printable import printable
 TYPED = {
     "power": "axis power {axis} on",
     "set_position": "axis set-position {axis} POSITION",
+    "set_speed_override": "speed PERCENT",
     "set_gains": "axis gains {axis} --kp KP --el EL",
     "set_outputs": "axis outputs {axis} --limit1 input --limit2 input",
     "move_relative": "axis move {axis} DISTANCE --relative",

@@ -82,6 +82,8 @@ def require_command_line(words: list[str]) -> None:
     context = click.Context(cli)
     while isinstance(command, click.Group) and words and (found := command.get_command(context, words[0])):
         command, words = found, words[1:]
+    if isinstance(command, click.Group) and words and not words[0].startswith("-"):
+        raise click.UsageError(f"there is no command {words[0]!r}")
     try:
         command.make_context("ldcnd", list(words))
     except click.BadParameter as error:

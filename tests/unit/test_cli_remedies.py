@@ -22,6 +22,7 @@ PLACEHOLDERS = {
     "KP": "1",
     "EL": "1",
     "COUNTER": "feedback",
+    "PERCENT": "50",
     "COMMAND": "true",
 }
 
