@@ -1,10 +1,49 @@
-"""Files that survive a loss of power: as they were before, or as they are afterwards, never in between."""
+"""Files that survive a loss of power: as they were before, or as they are afterwards, never in between.
+
+What a program keeps for itself is read by `read`, whatever has become of the file: damage costs what the file held.
+"""
 
 import contextlib
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 from urllib.parse import quote
+
+KeptT = TypeVar("KeptT")
+
+
+class DamagedFile(ValueError):
+    """A kept file cannot be read, or holds something else; says which and why, in one line."""
+
+
+def read(path: Path, parse: Callable[[str], KeptT]) -> KeptT | None:
+    """Return what a kept file holds, or None when there is none.
+
+    Args:
+        path: the file.
+        parse: of its text; raises ValueError, TypeError, AttributeError or KeyError for a text of something else.
+
+    Raises:
+        DamagedFile: it cannot be read, or makes no sense, as one that is cut short or that a newer version has written.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise DamagedFile(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DamagedFile(f"{path}: is no text (at byte {error.start})") from error
+    if not text.strip("\0 \r\n\t"):
+        raise DamagedFile(f"{path}: is {'full of zeros' if text else 'empty'}")
+    try:
+        return parse(text)
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        details = getattr(error, "errors", None)  # of pydantic, whose text has several lines
+        reason = details(include_url=False)[0]["msg"] if callable(details) else str(error)
+        raise DamagedFile(f"{path}: {reason or 'is something else'}") from error
 
 
 def state_file(kind: str, rig: str, axis: str) -> Path:
@@ -47,7 +86,7 @@ def remove(path: Path) -> None:
     """
     try:
         path.unlink()
-    except FileNotFoundError:
+    except (FileNotFoundError, IsADirectoryError):  # a directory holds nothing that anybody would read
         return
     _sync(path.parent)
 

@@ -8,8 +8,6 @@ import asyncio
 from contextlib import suppress
 from pathlib import Path
 
-import pydantic
-
 from ldcnd import durable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
@@ -82,11 +80,11 @@ def kept_for(rig: str, axis: str) -> KeptGains | None:
     """
     path, by_hand = file_of(rig, axis), "set the gains by hand, and remove it"
     try:
-        kept = KeptGains.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
+        kept = durable.read(path, KeptGains.model_validate_json)
+    except durable.DamagedFile as error:
+        raise ConfigError(str(error), remedy=by_hand) from error
+    if kept is None:
         return None
-    except (OSError, pydantic.ValidationError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}", remedy=by_hand) from error
     if (kept.rig, kept.axis) != (rig, axis):
         raise ConfigError(f"{path} is about axis {kept.axis} of rig {kept.rig}", remedy=by_hand)
     return kept

@@ -4,7 +4,6 @@ import json
 from enum import StrEnum
 from pathlib import Path
 
-import pydantic
 from pydantic import Field, JsonValue
 
 from ldcnd import durable
@@ -131,11 +130,9 @@ def read(path: Path, rig: str, axis: str) -> Record:
         ConfigError: the file is no record of this axis.
     """
     try:
-        record = Record.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        return Record(rig=rig, axis=axis)
-    except (OSError, pydantic.ValidationError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}", remedy="move it away to begin anew") from error
+        record = durable.read(path, Record.model_validate_json) or Record(rig=rig, axis=axis)
+    except durable.DamagedFile as error:
+        raise ConfigError(str(error), remedy="move it away to begin anew") from error
     if (record.rig, record.axis) != (rig, axis):
         raise ConfigError(f"{path} is about axis {record.axis} of rig {record.rig}", remedy="move it away")
     return record

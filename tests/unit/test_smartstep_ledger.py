@@ -41,14 +41,22 @@ async def test_the_budget_refuses_before_anything_is_counted(tmp_path):
     "text",
     ["", "[]", '{"feed": 3}', '{"feed": {"Pn100": -1}}', '{"feed": {"Pn100": "2"}}', '{"feed": {"Pn100": true}}'],
 )
-def test_a_damaged_ledger_is_refused_and_not_replaced(tmp_path, text):
+async def test_what_a_damaged_ledger_has_counted_is_written_again_once_it_is_known(tmp_path, text):
     path = tmp_path / "ledger.json"
     path.write_text(text)
 
-    with pytest.raises(ConfigError, match="ledger"):
-        EepromLedger(path)
+    for ledger in (EepromLedger(path), EepromLedger(path)):
+        with pytest.raises(EepromBudgetSpent, match="not known"):
+            await ledger.enter("feed", "Pn100", budget=10)
+        assert path.read_text() == text
+    await ledger.restart("feed", 7)
+    again = EepromLedger(path)
+    await again.enter("feed", "Pn100", budget=10)
 
-    assert path.read_text() == text
+    assert again.total("feed") == 8
+    with pytest.raises(EepromBudgetSpent, match="not known"):
+        await again.enter("spool", "Pn100", budget=10)
+    assert (tmp_path / "ledger.json.damaged").read_text() == text
 
 
 async def test_a_ledger_that_cannot_be_written_stops_the_write(tmp_path):

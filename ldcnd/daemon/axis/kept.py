@@ -10,8 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
-import pydantic
-
 from ldcnd import durable
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import PastFault
@@ -70,7 +68,8 @@ class KeptFiles:
         """Return the reference that is kept of an axis; None without one.
 
         Raises:
-            OSError, ValueError: it cannot be read, or makes no sense.
+            TimeoutError: the disk takes too long.
+            DamagedFile: it cannot be read, or makes no sense.
         """
         return await self._in_thread(_read(self._path("references", axis), KeptReference))
 
@@ -96,7 +95,8 @@ class KeptFiles:
         """Return the faults that are kept of an axis, oldest first.
 
         Raises:
-            OSError, ValueError: they cannot be read, or make no sense.
+            TimeoutError: the disk takes too long.
+            DamagedFile: they cannot be read, or make no sense.
         """
         kept = await self._in_thread(_read(self._path("faults", axis), FaultFile))
         return kept.faults if kept else ()
@@ -123,14 +123,4 @@ ModelT = TypeVar("ModelT", bound=Frozen)
 
 
 def _read(path: Path, model: type[ModelT]) -> Callable[[], ModelT | None]:
-    def read() -> ModelT | None:
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            return None
-        try:
-            return model.model_validate_json(text)
-        except pydantic.ValidationError as error:
-            raise ValueError(f"{path}: {error.errors()[0]['msg']}") from error
-
-    return read
+    return lambda: durable.read(path, model.model_validate_json)

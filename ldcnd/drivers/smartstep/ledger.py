@@ -7,12 +7,16 @@ Source: manual 2.2, note on EEPROM.
 
 import asyncio
 import json
+import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ldcnd import durable
 from ldcnd.errors import ConfigError, EepromBudgetSpent, Remedy, step
+from ldcnd.log import get_logger
+
+log = get_logger("eeprom")
 
 EEPROM_LIFE = 10_000
 WARNING_WRITES = 1000
@@ -30,27 +34,48 @@ class EepromLedger:
     def __init__(self, path: Path) -> None:
         """Take up the ledger that is there, or begin an empty one.
 
-        Raises:
-            ConfigError: there is one and it cannot be read; it is not replaced, because counts would be lost.
+        Of one that is damaged nothing is known: what it counted is not written until somebody says how often it was.
         """
         self._path = path
+        self._damaged = path.with_name(f"{path.name}.damaged")
+        """Where a damaged one was put when the first count was restarted; it stands for those that were not."""
         self._worker = ThreadPoolExecutor(1, "eeprom ledger")  # one: the file is replaced in the order of the counts
-        self._counts = _load(path)
+        self._counts: dict[str, dict[str, int]] = {}
+        self._lost = f"a damaged one is kept as {self._damaged}" if os.path.lexists(self._damaged) else ""
+        try:
+            self._counts = durable.read(path, _parse) or {}
+        except durable.DamagedFile as error:
+            self._lost = str(error)
+            log.error("EEPROM writes are not known: EEPROM is not written", reason=self._lost)
 
     def writes(self, axis: str, parameter: str) -> int:
         """Return how often a parameter was written."""
         return self._counts.get(axis, {}).get(parameter, 0)
 
+    def is_known(self, axis: str) -> bool:
+        """Tell whether it is known how often the EEPROM of a drive was written."""
+        return not self._lost or axis in self._counts
+
     def total(self, axis: str) -> int:
-        """Return how many writes a drive has taken in all."""
+        """Return how many writes a drive has taken in all, as far as is known."""
         return sum(self._counts.get(axis, {}).values())
 
     async def enter(self, axis: str, parameter: str, budget: int) -> None:
         """Count a write that is about to be sent; it is on disk when this returns.
 
         Raises:
-            EepromBudgetSpent: the drive's EEPROM has taken as many writes as it may.
+            EepromBudgetSpent: the drive's EEPROM has taken as many writes as it may, or perhaps more.
         """
+        if not self.is_known(axis):
+            raise EepromBudgetSpent(
+                f"axis {axis}: it is not known how often its EEPROM was written: {self._lost}",
+                axis=axis,
+                limit=budget,
+                remedy=Remedy(
+                    "restore the file from a backup and start the daemon again, or {} with the writes that you know of",
+                    step("restart_eeprom_count"),
+                ),
+            )
         total = self.total(axis)
         if total >= budget:
             raise EepromBudgetSpent(
@@ -93,7 +118,7 @@ class EepromLedger:
         text = json.dumps(self._counts, indent=1, sort_keys=True)
         loop = asyncio.get_running_loop()
         try:
-            await loop.run_in_executor(self._worker, durable.replace, self._path, text)
+            await loop.run_in_executor(self._worker, self._write, text)
         except OSError as error:
             self._counts[axis] = before
             raise ConfigError(
@@ -102,17 +127,14 @@ class EepromLedger:
                 remedy="make state_dir writable",
             ) from error
 
+    def _write(self, text: str) -> None:
+        if self._lost and not os.path.lexists(self._damaged) and os.path.lexists(self._path):
+            self._path.rename(self._damaged)
+        durable.replace(self._path, text)
 
-def _load(path: Path) -> dict[str, dict[str, int]]:
-    if not path.exists():
-        return {}
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        return {str(axis): _counts(counts) for axis, counts in document.items()}
-    except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise ConfigError(
-            f"{path}: not an EEPROM ledger: {error}", remedy="restore it from a backup, or move it away"
-        ) from error
+
+def _parse(text: str) -> dict[str, dict[str, int]]:
+    return {str(axis): _counts(counts) for axis, counts in json.loads(text).items()}
 
 
 def _counts(document: Mapping[str, object]) -> dict[str, int]:

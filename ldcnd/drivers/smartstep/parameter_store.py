@@ -266,7 +266,8 @@ class UnitParameters(ParameterAccess):
     @property
     @override
     def eeprom_writes(self) -> int | None:
-        return self._rules.ledger.total(self._axis) if self._rules.ledger else None
+        ledger = self._rules.ledger
+        return ledger.total(self._axis) if ledger and ledger.is_known(self._axis) else None
 
     def _ledger(self) -> EepromLedger:
         if self._rules.ledger is None:
@@ -374,7 +375,7 @@ class UnitParameters(ParameterAccess):
             active=active,
             stored=stored,
             eeprom_writes=ledger.writes(self._axis, parameter.label) if ledger else None,
-            eeprom_total=ledger.total(self._axis) if ledger else None,
+            eeprom_total=self.eeprom_writes,
         )
 
     def _remarks(self, parameter: Parameter, value: ParameterValue, memory: Memory) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.drivers.driver import Gains
 from ldcnd.drivers.ldcn.profiles import PROFILES, Profile
 from ldcnd.errors import ConfigError, LdcndError, NotSupported, WrongState
+from ldcnd.log import get_logger
 from ldcnd.model.commands import ReportShadow
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo
@@ -22,6 +23,8 @@ from ldcnd.tuning.ldcn.effort import FEWEST_SAMPLES, Seen
 from ldcnd.tuning.ldcn.plant import Plant
 from ldcnd.tuning.ldcn.report import TuningReport
 from ldcnd.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Learnt, Memory, Shadow, Shown
+
+log = get_logger("shadow")
 
 LOOK_S = 10.0
 """The gains in force are read, and what was found is published, so often, seconds."""
@@ -202,13 +205,10 @@ class WatchedAxis:
     def _kept(self) -> KeptMemory | None:
         path = memory_file(self._rig, self.name)
         try:
-            return KeptMemory.model_validate_json(path.read_bytes())
-        except FileNotFoundError:
+            return durable.read(path, KeptMemory.model_validate_json)
+        except durable.DamagedFile as error:
+            log.warning("what was learnt is lost", axis=self.name, reason=str(error))
             return None
-        except (OSError, pydantic.ValidationError) as error:
-            raise ConfigError(
-                f"{path}: cannot be read: {error}", remedy="remove it; the axis is learnt anew"
-            ) from error
 
     def keep(self) -> None:
         """Write down what was learnt.
