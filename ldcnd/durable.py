@@ -61,7 +61,7 @@ def replace(path: Path, text: str) -> None:
     Raises:
         OSError: it cannot be written; the file is as it was.
     """
-    path = path.resolve()
+    path = Path(os.path.realpath(path))  # of a link to itself this is the link, which is replaced then
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f"{path.name}.new")
     try:

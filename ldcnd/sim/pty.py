@@ -22,6 +22,7 @@ from typing import Protocol, Self
 
 from ldcnd.sim.chain import Chain
 from ldcnd.transport.line_discipline import actual_baud
+from ldcnd.transport.terminal_link import TerminalLink
 
 SPIN_S = 150e-6
 LONGEST_SLEEP_S = 0.05
@@ -61,7 +62,7 @@ class PtyLine:
 
         Args:
             chain: whose clock starts at 0 now; built with the same `baud_check`.
-            link: symbolic link to make to the terminal; one that is there already is replaced.
+            link: symbolic link to make to the terminal; one that a simulator has left is replaced.
             baud_check: tell the chain the rate to which the host sets the terminal.
             observer: gets all bytes that pass.
 
@@ -70,7 +71,6 @@ class PtyLine:
         """
         self._chain = chain
         self._baud_check = baud_check
-        self._link = link
         self._observer = observer
         chain.on_remark = observer.remarked if observer else None
         self._modules = itertools.cycle(chain.modules)
@@ -79,10 +79,12 @@ class PtyLine:
         tty.setraw(self._slave)  # our end of the slave stays open, so that a host may come and go
         os.set_blocking(self._master, False)
         self.path = Path(os.ttyname(self._slave))
-        if link:
-            if link.is_symlink():
-                link.unlink()
-            link.symlink_to(self.path)
+        try:
+            self._link = TerminalLink(link, self.path) if link else None
+        except OSError:
+            os.close(self._master)
+            os.close(self._slave)
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -92,8 +94,8 @@ class PtyLine:
 
     def close(self) -> None:
         """Give the terminal back and remove the link."""
-        if self._link and self._link.is_symlink() and self._link.readlink() == self.path:
-            self._link.unlink()
+        if self._link:
+            self._link.close()
         os.close(self._master)
         os.close(self._slave)
 

@@ -35,6 +35,7 @@ from ldcnd.transport.line_discipline import (
     nearest,
     switch_direction,
 )
+from ldcnd.transport.terminal_link import why_not_served
 from ldcnd.transport.transport import Receiver, Transport
 
 OPEN_TIME_S = 5.0
@@ -319,6 +320,7 @@ class SerialPort(Transport):
 
 def _open(settings: SerialSettings) -> _Serial:
     """Open the port; blocks, so it runs in a worker."""
+    _require_served(settings.path)
     seven_even = settings.framing == "7e1" and not _is_pseudo_terminal(settings.path)
     port = _Serial(
         settings.path,
@@ -333,6 +335,7 @@ def _open(settings: SerialSettings) -> _Serial:
         if settings.exclusive:
             # pyserial's lock binds only programs that use it; this one refuses every other user's open
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+        _require_served(settings.path)  # the simulator may have ended, and the number been given away, in between
         _settle_rates(port, settings)
         _settle_direction(port, settings)
         if settings.low_latency:
@@ -341,6 +344,11 @@ def _open(settings: SerialSettings) -> _Serial:
         port.close()
         raise
     return port
+
+
+def _require_served(path: str) -> None:
+    if why := why_not_served(path):
+        raise _Refused(why, f"start `ldcnd sim --pty {path}` again, or remove the link")
 
 
 def _settle_rates(port: _Serial, settings: SerialSettings) -> None:

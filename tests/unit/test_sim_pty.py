@@ -1,5 +1,6 @@
 """The chain behind a pseudo-terminal, on the wall clock."""
 
+import asyncio
 import os
 import select
 import signal
@@ -13,8 +14,10 @@ from contextlib import contextmanager
 
 import pytest
 
+from ldcnd.errors import TransportLost
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
+from ldcnd.transport.serial_port import SerialSettings, open_serial_port
 
 pytestmark = pytest.mark.real_time
 
@@ -147,3 +150,38 @@ def test_process_serves_until_it_is_told_to_stop(tmp_path, number):
     assert reply == b"\x79\x79"
     assert (process.returncode, rest) == (0, "closed\n")
     assert not link.is_symlink()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("reused", [True, False])
+def test_the_terminal_of_a_killed_simulator_is_not_opened_even_when_it_is_anothers_by_now(tmp_path, reused):
+    link = tmp_path / "line"
+    settings = SerialSettings(str(link), 19_200)
+    command = [sys.executable, "-c", PROGRAM, str(link)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603 - our own program
+        path = process.stdout.readline().strip()
+        asyncio.run(open_and_close(settings))
+        process.kill()
+        process.communicate(timeout=5)
+    strangers = []
+    while reused and not any(os.ttyname(near) == path for _, near in strangers):
+        strangers.append(os.openpty())
+        assert len(strangers) < 100
+    before = [termios.tcgetattr(near) for _, near in strangers]
+
+    with pytest.raises(TransportLost, match=r"cannot be opened: .*ldcnd sim --pty"):
+        asyncio.run(open_and_close(settings))
+
+    assert before == [termios.tcgetattr(near) for _, near in strangers]
+    for descriptor in (each for pair in strangers for each in pair):
+        os.close(descriptor)
+    with served(link) as line:  # what is left is replaced
+        assert link.readlink() == line.path
+        asyncio.run(open_and_close(settings))
+        with pytest.raises(OSError, match="serves"), served(link):
+            pass
+
+
+async def open_and_close(settings):
+    port = await open_serial_port(settings)
+    await port.close()

@@ -1,0 +1,79 @@
+"""The link that a simulated line makes to its terminal, and the proof that this terminal is still its own.
+
+The kernel gives the number of a terminal to the next program that asks for one, as soon as a simulator is killed; the
+link that it leaves then leads to a stranger. So beside the link there is a file, locked for as long as the simulator
+runs: the kernel drops the lock however that ends.
+"""
+
+import fcntl
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+
+LOOKS = 20
+LOOK_S = 0.01
+"""Whoever opens a port looks at the lock for a moment, so one that is about to be taken is tried again, seconds."""
+
+
+def lock_of(link: Path) -> Path:
+    """Return the file beside a link that is locked while its simulator runs."""
+    return link.with_name(f"{link.name}.lock")
+
+
+class TerminalLink:
+    """A link to a terminal, for as long as this process serves it; replaces one that a simulator has left.
+
+    Raises:
+        OSError: it cannot be made, or another process serves it.
+    """
+
+    def __init__(self, link: Path, terminal: Path) -> None:
+        self._link = link
+        self._terminal = terminal
+        self._lock = os.open(lock_of(link), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            self._take()
+            os.truncate(self._lock, 0)
+            os.write(self._lock, f"{terminal}\n".encode())
+            if link.is_symlink():
+                link.unlink()
+            link.symlink_to(terminal)
+        except OSError:
+            os.close(self._lock)
+            raise
+
+    def close(self) -> None:
+        """Remove it, unless it leads elsewhere by now."""
+        if self._link.is_symlink() and self._link.readlink() == self._terminal:
+            self._link.unlink()
+        with suppress(OSError):
+            lock_of(self._link).unlink()
+        os.close(self._lock)
+
+    def _take(self) -> None:
+        for _ in range(LOOKS):
+            with suppress(BlockingIOError):
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            time.sleep(LOOK_S)
+        raise OSError(f"another `ldcnd sim` serves {self._link}")
+
+
+def why_not_served(path: str) -> str:
+    """Say why a port is not the terminal that a simulator has linked there; empty where no simulator made a link."""
+    link = Path(path)
+    if not link.is_symlink():
+        return ""
+    try:
+        lock = os.open(lock_of(link), os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return ""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        its_own = os.pread(lock, 4096, 0).decode(errors="replace").strip()
+        return "" if its_own == str(link.readlink()) else "the link does not lead to the terminal of its simulator"
+    finally:
+        os.close(lock)
+    return "the simulator that has made this link runs no more, and its terminal may be another program's"
