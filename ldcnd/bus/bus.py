@@ -115,6 +115,8 @@ log = get_logger("bus")
 
 FIRST_REOPEN_S = 0.1
 LONGEST_REOPEN_S = 2.0
+STAYS_S = 3.0
+"""A port that is lost sooner than this was not really open: as of a serial server that accepts and closes, seconds."""
 LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
@@ -367,7 +369,7 @@ class Bus(Users):
 
     async def run(self) -> None:
         """Own the port until cancelled: open it, and open it again with bounded back-off whenever it is lost."""
-        delay_s = FIRST_REOPEN_S
+        delay_s = pause_s = FIRST_REOPEN_S  # after one that does not open, and after one that does not stay open
         failure = ""
         while True:
             self._tried_at_s = self._loop.time()
@@ -380,10 +382,22 @@ class Bus(Users):
                 await asyncio.sleep(delay_s)
                 delay_s = min(2 * delay_s, LONGEST_REOPEN_S)
                 continue
-            delay_s, failure = FIRST_REOPEN_S, ""
-            await self._use(transport)
-            log.warning("line lost", bus=self.settings.name, reason=self._loss_reason)
-            await asyncio.sleep(FIRST_REOPEN_S)
+            opened_s = self._loop.time()
+            said = self._loop.call_later(STAYS_S if failure else 0.0, self._say_open)
+            try:
+                await self._use(transport)
+            finally:
+                said.cancel()
+            stayed = self._loop.time() - opened_s >= STAYS_S
+            if stayed or self._loss_reason != failure:
+                log.warning("line lost", bus=self.settings.name, reason=self._loss_reason)
+            failure = "" if stayed else self._loss_reason
+            delay_s, pause_s = FIRST_REOPEN_S, FIRST_REOPEN_S if stayed else pause_s
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, LONGEST_REOPEN_S)
+
+    def _say_open(self) -> None:
+        log.info("line open", bus=self.settings.name, baud=self.settings.baud)
 
     async def _use(self, transport: Transport) -> None:
         """Serve the line until it is lost or the caller is cancelled; then every caller has its outcome."""
@@ -393,7 +407,6 @@ class Bus(Users):
         self._line = line = Line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
         self._closed.clear()
         self._opened.set()
-        log.info("line open", bus=self.settings.name, baud=self.settings.baud)
         try:
             line.kick()
             await self._closed.wait()

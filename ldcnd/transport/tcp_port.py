@@ -18,6 +18,8 @@ from ldcnd.transport.transport import Receiver, Transport
 CLOSE_TIME_S = 1.0
 UNACKNOWLEDGED_MS = 5000
 """Time without acknowledgement after which the far end is gone; without it the kernel tries for some 15 minutes."""
+KEEPALIVE_S = 1
+"""Time without traffic after which the kernel asks whether the far end is there, and again, seconds."""
 BACKLOG_BYTES = 4096
 """More than this unsent means that the far end takes nothing; some dozens of exchanges have timed out by then."""
 READ_BYTES = 4096
@@ -54,6 +56,9 @@ class TcpPort(Transport):
         end = stream.get_extra_info("socket")
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
+        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
         self._descriptor: int = end.fileno()
 
     @override
@@ -82,8 +87,9 @@ class TcpPort(Transport):
         # nothing more to read ends it; the end of the stream stays readable, so the loop still reports it
         with contextlib.suppress(OSError):
             for _ in range(LONGEST_DISCARD):
-                if not os.read(self._descriptor, READ_BYTES):
+                if not (dropped := os.read(self._descriptor, READ_BYTES)):
                     return
+                self._incoming.hear(dropped)
 
     def set_baud(self, baud: int) -> None:
         """Refuse: only the far end can.

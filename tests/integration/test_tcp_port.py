@@ -103,6 +103,30 @@ async def test_a_far_end_that_hangs_up_is_reported_once(far: FarEnd, port: Trans
     assert str(far.number) in receiver.losses[0]
 
 
+async def test_why_a_server_hangs_up_is_said_in_its_words(far: FarEnd):
+    opened = await open_tcp_port("127.0.0.1", far.number, 5.0)
+    client, receiver = await far.accept(), RecordingReceiver()
+    client.send(b"Port already in use\r\n")
+    await asyncio.sleep(0.05)
+    opened.attach(receiver)  # drops what has come
+    client.close()
+    await receiver.wait_lost()
+
+    assert "saying 'Port already in use'" in receiver.losses[0]
+    await opened.close()
+
+
+async def test_replies_of_drives_are_not_taken_for_words(far: FarEnd, port: Transport):
+    receiver = RecordingReceiver()
+    port.attach(receiver)
+    far.client.send(b"\x79\x79\x01")
+    await receiver.wait_for(3)
+    far.client.close()
+    await receiver.wait_lost()
+
+    assert "saying" not in receiver.losses[0]
+
+
 async def test_a_reset_connection_is_reported_once(far: FarEnd, port: Transport):
     receiver = RecordingReceiver()
     port.attach(receiver)

@@ -227,6 +227,25 @@ async def test_a_reopened_line_starts_at_the_configured_rate():
         assert rig.bus.baud == 115_200
 
 
+async def test_a_port_that_is_lost_as_soon_as_it_is_open_is_tried_ever_more_slowly_and_said_once(capsys):
+    rig = Rig()
+    loop = asyncio.get_running_loop()
+
+    async with running(rig):
+        until_s = loop.time() + 60.0
+        while loop.time() < until_s:
+            await rig.bus.wait_opened()
+            rig.line.lose()
+            await rig.bus.wait_closed()
+        attempts = rig.bus.statistics.openings
+        await rig.bus.wait_opened()
+        await asyncio.sleep(5.0)
+
+    said = capsys.readouterr().out
+    assert attempts <= 35
+    assert (said.count("line lost"), said.count("line open")) == (1, 2)
+
+
 async def test_a_far_end_with_its_own_rate_refuses_before_anything_is_sent():
     rig = Rig()
     rig.opener.fixed_baud = True
