@@ -1,7 +1,9 @@
 """Jog an axis by a joystick or gamepad: `jog_by_joystick.py DEVICE [ENDPOINT [AXIS]]`, such as /dev/input/js0.
 
 The stick sets the speed in four steps, while button 0 is held: letting go of either ends the jog, and so does a device
-that is unplugged. Every renewal is sent because both are still there, so a program that hangs ends it, too.
+that is unplugged, or one that has said nothing for HOLD_S: a stick in a hand is never quite still, and a wireless one
+that has lost its radio falls silent. Then the button must be pressed anew. Every renewal is sent because both are still
+there, so a program that hangs ends it, too.
 """
 
 import asyncio
@@ -18,6 +20,7 @@ BUTTON, STICK, INITIAL = 0x01, 0x02, 0x80
 FULL = 32767
 STEPS = 4
 FASTEST = 8.0  # units a second
+HOLD_S = 0.5  # longest silence of the device, and longest time between two renewals
 
 
 class Joystick:
@@ -35,12 +38,20 @@ class Joystick:
         await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), device)
         with suppress(asyncio.IncompleteReadError, OSError):
             while True:
-                _, value, kind, number = EVENT.unpack(await reader.readexactly(EVENT.size))
-                if number == 0 and kind & ~INITIAL == BUTTON:
+                silence = loop.call_later(HOLD_S, self.let_go)
+                try:
+                    _, value, kind, number = EVENT.unpack(await reader.readexactly(EVENT.size))
+                finally:
+                    silence.cancel()
+                if number == 0 and kind == BUTTON:  # not what the kernel says when the device is opened: INITIAL
                     self.pressed = bool(value)
                 elif number == 0 and kind & ~INITIAL == STICK:
                     self.stick = value
                 self.moved.set()
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Take the button for released."""
         self.pressed = False
         self.moved.set()
 
@@ -62,7 +73,7 @@ async def main(device: BinaryIO, endpoint: str | None = None, axis: str = "x") -
                 await hand.moved.wait()
                 continue
             try:
-                async with x.jogging(hand.velocity) as jog:
+                async with x.jogging(hand.velocity, hold_s=HOLD_S) as jog:
                     print("jogs", flush=True)
                     while hand.velocity:
                         await jog.held(hand.velocity)

@@ -4,6 +4,7 @@ import asyncio
 import os
 import struct
 import sys
+import time
 from asyncio.subprocess import PIPE
 
 import pytest
@@ -59,19 +60,35 @@ async def test_a_joystick_jogs_while_its_button_and_stick_are_held(tmp_path):
             sys.executable, str(ROOT / "examples" / "jog_by_joystick.py"), str(device), endpoint, "x", stdout=PIPE
         )
         with await asyncio.to_thread(device.open, "wb", buffering=0) as hand:
-            hand.write(stick(0, -16_000, 2, 0))  # without the button nothing moves
+            hand.write(button(0, 1, 0x81, 0))  # as the kernel does when the device is opened
+            hand.write(stick(0, -16_000, 0x82, 0))
+            await tremble(hand, stick, 1.0)  # without the button nothing moves
             hand.write(button(0, 1, 1, 0))
             async with asyncio.timeout(30):
                 assert await example.stdout.readline() == b"jogs\n"
-                await asyncio.sleep(1.0)
+                await tremble(hand, stick, 1.0)
                 hand.write(button(0, 0, 1, 0))
                 halted = await example.stdout.readline()
                 hand.write(button(0, 1, 1, 0))
                 assert await example.stdout.readline() == b"jogs\n"
+                silent = await example.stdout.readline()  # its radio is gone
+                began = time.monotonic()
+                await tremble(hand, stick, 1.0)
+                hand.write(button(0, 1, 1, 0))
+                assert await example.stdout.readline() == b"jogs\n"
+                assert time.monotonic() - began >= 1.0  # it did not go on by itself
         async with asyncio.timeout(30):
             unplugged, _ = await example.communicate()
 
     assert example.returncode == 0
-    first, second = (float(line.split()[-1]) for line in (halted, unplugged))
-    assert first < -1.0
-    assert second < first + 0.5
+    first, second, third = (float(line.split()[-1]) for line in (halted, silent, unplugged))
+    assert -1.0 > first > -8.0
+    assert first > second > first - 8.0
+    assert second >= third > second - 8.0
+
+
+async def tremble(hand, stick, seconds):
+    """Hold the stick as a hand does: never quite still."""
+    for number in range(int(seconds / 0.05)):
+        hand.write(stick(0, -16_000 + number % 2, 2, 0))
+        await asyncio.sleep(0.05)

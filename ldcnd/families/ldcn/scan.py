@@ -317,7 +317,7 @@ def configured_line(name: str, port: str, drives: Sequence[ScannedDrive]) -> str
 name = "{name}"
 port = {json.dumps(port)}
 baud = {baud}  # the drives are brought to it; they were found at {seen}
-# adapter_latency_ms = 1.0  # as the scan measured it
+# adapter_latency_ms = MILLISECONDS  # the finding "cost" of the scan tells what it measured
 {margin if simulated else "# margin_ms = 25"}
 # start = "adopt"  # takes drives over as they are; "reset", the default, resets and addresses them
 """
