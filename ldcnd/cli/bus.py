@@ -8,7 +8,7 @@ import click
 
 from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, of_options, with_target
-from ldcnd.cli.typed import Finite
+from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.daemon.process.replay import config_of
@@ -25,7 +25,7 @@ TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
 FORMAT = click.option(
     "--format", "form", type=click.Choice(FORMATS), help="[default: by the suffix of --out, else text]"
 )
-OUT = click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write a file instead of printing.")
+OUT = click.option("--out", type=NewFile(), help="Write a file instead of printing.")
 
 
 def _install_dissector(context: click.Context, _option: click.Parameter, wanted: bool) -> None:  # noqa: FBT001 - click's
@@ -140,6 +140,7 @@ def list_buses(target: Target) -> None:
 )
 @FORMAT
 @OUT
+@force_option
 @DISSECTOR
 @with_target
 def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Path | None) -> None:
@@ -158,6 +159,7 @@ def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Pa
 @click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 @FORMAT
 @OUT
+@force_option
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a record.")
 def convert(file: Path, form: str | None, out: Path | None, *, as_json: bool) -> None:
     """Put the capture in FILE into another form, as `wire-log` has them."""

@@ -12,7 +12,7 @@ from ldcnd.cli.connection import AxisName, Target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, show_lines
 from ldcnd.cli.terminal_person import TerminalPerson
-from ldcnd.cli.typed import Finite
+from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.commissioning.checklist import STEPS, Checklist, axis_of
@@ -37,9 +37,10 @@ from ldcnd.version import version
 @click.option("--list", "only_list", is_flag=True, help="Show the checklist; run nothing.")
 @click.option(
     "--report",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=NewFile(),
     help="Write a report of everything that is known at the end (HTML).",
 )
+@force_option
 @click.option(
     "--for", "for_s", type=Finite(0, 3600, min_open=True), help="Longest motion of a step, seconds, instead of a key."
 )

@@ -9,7 +9,7 @@ import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.parameter_file import ParameterFile, as_toml, load_parameters
-from ldcnd.cli.typed import Whole
+from ldcnd.cli.typed import NewFile, Whole, force_option
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
 from ldcnd.model.parameters import (
@@ -94,16 +94,14 @@ def set_parameter(
 
 @command.command()
 @click.argument("axis", type=AXIS)
-@click.argument("file", type=click.Path(path_type=Path), required=False)
-@click.option("--force", is_flag=True, help="Write over FILE if it is there.")
+@click.argument("file", type=NewFile(), required=False)
+@force_option
 @with_target
-def dump(target: Target, axis: str, file: Path | None, *, force: bool) -> None:
+def dump(target: Target, axis: str, file: Path | None) -> None:
     """Write all parameters of AXIS as TOML to FILE or the terminal: both memories, type, version, switches, date.
 
     A FILE that is there already is kept: it may be the only copy of what another drive held.
     """
-    if file and file.exists() and not force:
-        raise click.UsageError(f"{file} is there already; give another name, or --force to write over it")
     text = as_toml(axis, target.run(lambda client: read_dump(client, axis)), datetime.now(UTC))
     if file:
         file.write_text(text, encoding="utf-8")

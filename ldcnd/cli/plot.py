@@ -9,6 +9,7 @@ import click
 
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
+from ldcnd.cli.typed import NewFile, force_option
 from ldcnd.client.trace_file import column_title
 from ldcnd.errors import ConfigError
 from ldcnd.model.events import FINAL, CommandEvent, CommandStatus
@@ -24,7 +25,8 @@ MOST_LABELS = 40
 @click.command()
 @click.argument("recording", type=RECORDING)
 @click.argument("axis")
-@click.option("--output", "-o", type=click.Path(path_type=Path), required=True, help="Picture to write, such as a PNG.")
+@click.option("--output", "-o", type=NewFile(), required=True, help="Picture to write, such as a PNG.")
+@force_option
 def command(recording: Path, axis: str, output: Path) -> None:
     """Draw AXIS of RECORDING: its quantities, commands and faults against time; needs the extras record and plot."""
     require_mcap()

@@ -9,7 +9,7 @@ from typing import Any, Self, TextIO
 
 import click
 
-from ldcnd.cli.typed import Whole
+from ldcnd.cli.typed import ForceOption, NewFile, Whole
 from ldcnd.config.simulated_line import FaultPlanConfig
 from ldcnd.config.toml import read_toml
 from ldcnd.families.family import PacketCutter, ServedLine, ServesLines
@@ -79,9 +79,10 @@ command = click.Command(
         click.Option(["--seed"], type=Whole(), help="Of everything that is random: instead of the file's, or of 1."),
         click.Option(
             ["--wire-log"],
-            type=click.Path(path_type=Path),
+            type=NewFile(),
             help="Write what the host does to this file (a capture).",
         ),
+        ForceOption(),
         click.Option(["--json", "as_json"], is_flag=True, help="Print the terminal and the modules as JSON."),
     ],
 )

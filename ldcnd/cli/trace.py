@@ -10,7 +10,7 @@ from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.output import show_passing
-from ldcnd.cli.typed import Finite, Whole, axis_of
+from ldcnd.cli.typed import Finite, NewFile, Whole, axis_of, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
@@ -73,9 +73,7 @@ def _file(_context: click.Context, _parameter: click.Parameter, value: Path | No
     return require_suffix(value) if value else None
 
 
-out_option = click.option(
-    "--out", type=click.Path(path_type=Path), callback=_file, help="Write the trace to FILE.csv or FILE.json."
-)
+out_option = click.option("--out", type=NewFile(), callback=_file, help="Write the trace to FILE.csv or FILE.json.")
 
 
 @click.group()
@@ -93,6 +91,7 @@ def command() -> None:
 @click.option("--full-scale", multiple=True, callback=_full_scale, help="CHANNEL:LARGEST, to resolve it finer.")
 @click.option("--timeout", type=Finite(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")
 @out_option
+@force_option
 @with_target
 def take(
     target: Target,
@@ -134,6 +133,7 @@ def take(
 @command.command()
 @click.argument("axis", type=AXIS)
 @out_option
+@force_option
 @with_target
 def last(target: Target, axis: str, out: Path | None) -> None:
     """Fetch the last trace of AXIS, of any client."""
@@ -167,7 +167,8 @@ def show(file: Path) -> None:
 
 @command.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--output", "-o", type=click.Path(path_type=Path), required=True, help="Picture to write, such as a PNG.")
+@click.option("--output", "-o", type=NewFile(), required=True, help="Picture to write, such as a PNG.")
+@force_option
 def plot(file: Path, output: Path) -> None:
     """Draw FILE; needs the extra `plot`."""
     plot_trace(load_trace(file), output)

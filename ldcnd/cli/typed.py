@@ -1,9 +1,13 @@
 """Typed input: names with the nearest right one, and numbers as `ldcnd.number_text` reads them."""
 
+import os
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
 
 import click
+from typing_extensions import override
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import UnknownAxis
@@ -82,3 +86,44 @@ class Whole(click.IntRange):
     def _describe_range(self) -> str:
         """Return its limits for help; nothing without limits."""
         return "" if self.min is None and self.max is None else super()._describe_range()
+
+
+_FORCE = "ldcnd.force"
+
+
+class NewFile(click.Path):
+    """A file that a command writes: one that is there already may be the only copy of what it holds, and is kept.
+
+    A terminal, a pipe or another device is written to; `force_option` lets a file be written over.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, dir_okay=False)
+
+    @override
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if path.is_file() and not (ctx and ctx.meta.get(_FORCE)):
+            self.fail(f"{path} is there already; give another name, or --force to write over it", param, ctx)
+        return path
+
+
+class ForceOption(click.Option):
+    """Lets a command write over the file that it is given as a `NewFile`."""
+
+    def __init__(self, *_declared: object, **_given: object) -> None:
+        super().__init__(
+            ["--force"],
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_keep_force,
+            help="Write over the file if it is there.",
+        )
+
+
+def _keep_force(context: click.Context, _parameter: click.Parameter, force: bool) -> None:  # noqa: FBT001 - click's
+    context.meta[_FORCE] = force
+
+
+force_option = click.option("--force", cls=ForceOption)

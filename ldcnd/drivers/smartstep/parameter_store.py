@@ -417,7 +417,9 @@ def parameter_info(parameter: Parameter) -> ParameterInfo:
 def _pending(parameter: Parameter, value: ParameterValue) -> tuple[str, ...]:
     if not value.differs:
         return ()
-    return (f"{parameter.label}: {value.active} is in use, {value.stored} is stored: they meet at the next power-on",)
+    return (
+        f"{parameter.label}: RAM {value.active}, EEPROM {value.stored}: at the next power-on {value.stored} is used",
+    )
 
 
 def _entry(word: int) -> AlarmEntry:
