@@ -630,20 +630,9 @@ class AxisService:
                 except TimeoutError:
                     deadline_s = math.inf
                     waits(self._under_way or permit.command_id)
-                self._ask_in_turn(permit)
-            self._ask_in_turn(permit)
-            return await execute()
-
-    def _ask_in_turn(self, permit: Permit) -> None:
-        """Ask whether a move may still have its turn: also what overtakes it without a latch withdraws it."""
-        try:
+                permit.ask()
             permit.ask()
-        except StopLatched:
-            if self.tracker.stop_latched or self.tracker.stop_pending:
-                raise
-            name = self.config.name
-            text = f"axis {name}: {permit.verb} was withdrawn by a halt or a later move before it began"
-            raise CommandAborted(text, axis=name) from None
+            return await execute()
 
     @property
     def _under_way(self) -> str | None:
