@@ -253,7 +253,7 @@ def test_the_command_line_says_why_what_it_waited_for_did_not_begin(monkeypatch)
         here.wait(halting)
 
         assert ran.code == 1
-        assert "withdrawn by a halt or a later move before it began" in ran.errors
+        assert "was overtaken by halt" in ran.errors
 
 
 async def _begun(work):
