@@ -71,6 +71,11 @@ class Proof:
         """
         self.holds, self._problem, self._silent = False, problem, silent
 
+    @property
+    def is_another(self) -> bool:
+        """Whether something answers that is not known to be what is meant."""
+        return not self.holds and not self._silent
+
     def refusal(self) -> LdcndError:
         """Return the refusal of what would change something."""
         if self._silent:

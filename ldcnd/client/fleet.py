@@ -10,7 +10,7 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, DaemonInfo
 from ldcnd.model.samples import FaultSample, StateSample
-from ldcnd.model.trouble import axis_troubles, line_troubles
+from ldcnd.model.condition import assess, line_troubles
 
 ASKED_AT_ONCE = 8
 """Maximum number of concurrent queries of rigs."""
@@ -126,6 +126,6 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
         f"{axis.info.axis}: {trouble.text}"
         for axis in axes
         if axis.info.bus not in down
-        for trouble in axis_troubles(axis.state, axis.fault, axis.health)
+        for trouble in assess(axis.state, axis.fault, axis.health).wrong
     ]
     return problems

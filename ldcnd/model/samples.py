@@ -261,6 +261,10 @@ class StateSample(Sample):
     """The command under way."""
     last_error: str | None = None
     """Why the last command ended other than done, until the next command is accepted."""
+    has_reference: bool = True
+    """Whether its drive can have a reference; false where `home` and `set_position` are not among its commands."""
+    reference_lost: bool = False
+    """The position was valid and is not any more; false on an axis that was never homed, and again once it is valid."""
     speed_override: float = Field(default=100.0, ge=0, le=100)
     """Percent of every velocity, for the whole rig; nothing moves at 0."""
 

@@ -1,7 +1,7 @@
 """The words in which a glance is shown: one table of axes, one of lines."""
 
-from ldcnd.model.samples import LinkState, Moving, Quality
-from ldcnd.model.trouble import Severity
+from ldcnd.model.samples import Moving
+from ldcnd.model.condition import Severity
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 UNKNOWN = "-"
@@ -16,27 +16,26 @@ BUS_TITLES = ("", "bus", "line", "busy", "exchanges", "errors", "resent", "poll 
 
 def axis_cells(row: AxisGlance) -> tuple[str, ...]:
     """Return the cells of an axis, one for each of `AXIS_TITLES`."""
-    mark = "" if row.quality in {None, Quality.GOOD} else "?"
-    state = row.state.value if row.state else UNKNOWN
-    if row.link is LinkState.DOWN:
-        state = "no answer"
-    elif row.state and row.moving is Moving.UNKNOWN:
-        state += ", moving?"
     rate = UNKNOWN if row.rate_hz is None else f"{row.rate_hz:.0f}/{row.rate_wanted_hz:.0f} Hz"
     return (
         MARKS[row.severity],
         row.bus,
         row.axis,
-        state,
-        UNKNOWN if row.position is None else f"{row.position:.3f}{mark} {row.unit}",
-        UNKNOWN if row.velocity is None else f"{row.velocity:.3f}",
+        row.shown_state,
+        row.shown_position,
+        UNKNOWN if row.velocity is None or row.moving is Moving.UNKNOWN else f"{row.velocity:.3f}",
         UNKNOWN if row.target is None else f"{row.target:.3f}",
         UNKNOWN if row.adc_volts is None else f"{row.adc_volts:.2f} V",
         UNKNOWN if row.age_s is None else f"{row.age_s:.1f} s",
         rate,
         row.holder or UNKNOWN,
-        row.trouble,
+        _all_said(row),
     )
+
+
+def _all_said(row: AxisGlance) -> str:
+    """Return the worst trouble in full, and what else there is in a few words each."""
+    return "; ".join((row.trouble, *row.condition[1:])) if row.condition else row.trouble
 
 
 def bus_cells(row: BusGlance) -> tuple[str, ...]:
@@ -45,7 +44,7 @@ def bus_cells(row: BusGlance) -> tuple[str, ...]:
         MARKS[row.severity],
         row.bus,
         "up" if row.up else "down",
-        f"{row.utilisation:.0%}",
+        f"{row.utilisation:.0%}" if row.up else UNKNOWN,
         UNKNOWN if row.exchanges_per_s is None else f"{row.exchanges_per_s:.0f}/s",
         str(row.errors),
         str(row.resent),

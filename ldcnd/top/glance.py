@@ -2,7 +2,7 @@
 
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
-from ldcnd.model.trouble import Severity
+from ldcnd.model.condition import Place, Severity
 
 
 class Glance(Frozen):
@@ -28,7 +28,17 @@ class AxisGlance(Glance):
     moving: Moving
     """Whether it moves."""
     position: float | None
-    """Where it is."""
+    """Where it is, as far as `place` says so."""
+    place: Place
+    """Whether the position says where it is."""
+    condition: tuple[str, ...]
+    """Everything that is to be said of it, in a few words each, the worst first."""
+    cause: str
+    """What several axes have in common that is wrong, such as their line; empty where the trouble is its own."""
+    shown_position: str
+    """The position in words: in brackets and with its mark where it does not say where the axis is."""
+    shown_state: str
+    """The state in words."""
     velocity: float | None
     """How fast it moves."""
     target: float | None
@@ -54,6 +64,8 @@ class BusGlance(Glance):
 
     bus: str
     """Its name."""
+    cause: str
+    """As that of the axes that it concerns."""
     up: bool
     """Its drives are polled."""
     utilisation: float
@@ -85,5 +97,6 @@ class RigGlance(Frozen):
     """All of them."""
 
     def count(self, severity: Severity) -> int:
-        """Return how many axes and lines have this severity."""
-        return sum(row.severity is severity for row in self.axes) + sum(row.severity is severity for row in self.buses)
+        """Return how many causes have this severity: what several axes have in common counts once."""
+        causes = {row.cause or f"{row.axis}: {row.trouble}" for row in self.axes if row.severity is severity}
+        return len(causes | {row.cause for row in self.buses if row.severity is severity})

@@ -23,7 +23,7 @@ from ldcnd.model.samples import (
     TelemetryItem,
     VelocitySample,
 )
-from ldcnd.model.trouble import Severity, axis_troubles, line_troubles
+from ldcnd.model.condition import SHARED, Kind, Severity, Trouble, assess, line_troubles
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 SILENT_S = 3.0
@@ -98,7 +98,7 @@ class RigView:
         axes = description.axes if description else ()
         names = description.daemon.buses if description else ()
         reports = {name: report for name in names if (report := self._latest(self._keys.bus_health(name), BusHealth))}
-        rows = [self._axis(axis, reports.get(axis.bus), now_s, silent=bool(trouble)) for axis in axes]
+        rows = [self._axis(axis, reports.get(axis.bus), now_s, trouble if self._description else "") for axis in axes]
         lines = [self._bus(report) for report in reports.values()]
         return RigGlance(
             rig=self._keys.rig,
@@ -115,7 +115,7 @@ class RigView:
             return f"the daemon has been silent for {silent_s:.0f} s: what is shown is what it said last"
         return "" if self._description else "waiting for the daemon"
 
-    def _axis(self, info: AxisInfo, line: BusHealth | None, now_s: float, *, silent: bool) -> AxisGlance:
+    def _axis(self, info: AxisInfo, line: BusHealth | None, now_s: float, silent: str) -> AxisGlance:
         position_key = self._keys.telemetry(info.axis, TelemetryItem.POSITION)
         position = self._latest(position_key, PositionSample)
         velocity = self._latest(self._keys.telemetry(info.axis, TelemetryItem.VELOCITY), VelocitySample)
@@ -123,20 +123,29 @@ class RigView:
         fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
-        worst = next(iter(axis_troubles(state, fault, health)), None)
+        age_s = now_s - self._kept[position_key].at_s if position else None
+        condition = assess(
+            state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent
+        )
+        worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
             axis=info.axis,
             bus=info.bus,
             unit=info.unit,
             state=state.state if state else None,
-            moving=state.moving if state and not silent else Moving.UNKNOWN,
+            moving=state.moving if state and condition.live else Moving.UNKNOWN,
             position=position.value if position else None,
+            place=condition.place,
+            condition=condition.notes,
+            cause=cause_of(worst, info.bus),
+            shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, age_s),
+            shown_state=condition.state,
             velocity=velocity.value if velocity else None,
             target=state.command.target if state and state.command else None,
             adc_volts=adc.volts if adc else None,
             quality=position.quality if position else None,
-            age_s=now_s - self._kept[position_key].at_s if position else None,
+            age_s=age_s,
             rate_hz=health.rate_hz if health else None,
             rate_wanted_hz=health.rate_wanted_hz if health else None,
             link=state.link if state else None,
@@ -158,6 +167,7 @@ class RigView:
         poll, stop = _lane(report, "poll"), _lane(report, "stop")
         return BusGlance(
             bus=report.bus,
+            cause=f"{Kind.LINE_DOWN}: {report.bus}" if down else f"{report.bus}: {trouble}",
             up=report.up,
             utilisation=report.utilisation,
             exchanges_per_s=(report.exchanges - before.exchanges) / period_s if before and period_s > 0 else None,
@@ -176,6 +186,15 @@ class RigView:
     @staticmethod
     def _decoded(kept: _Kept, model: type[ModelT]) -> ModelT:
         return decode_received(model, kept.sample.payload, kept.sample.encoding)
+
+
+def cause_of(worst: Trouble | None, bus: str) -> str:
+    """Return what an axis has in common with others that is wrong; empty where its trouble is its own."""
+    if worst is None:
+        return ""
+    if worst.kind is Kind.LINE_DOWN:
+        return f"{Kind.LINE_DOWN}: {bus}"
+    return str(worst.kind) if worst.kind in SHARED else ""
 
 
 def _errors(report: BusHealth) -> int:

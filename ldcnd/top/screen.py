@@ -13,7 +13,7 @@ from textual.widgets import DataTable, Footer, Static
 from ldcnd.client.rig_client import RigClient
 from ldcnd.errors import LdcndError
 from ldcnd.model.commands import Halt, Reset, StopReply
-from ldcnd.model.trouble import Severity
+from ldcnd.model.condition import Severity
 from ldcnd.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, bus_cells, headline
 from ldcnd.top.follow import follow
 from ldcnd.top.rig_view import RigView

@@ -32,6 +32,10 @@ WINDOW_OF_EL = 1 / 400
 SHORTEST_READING_PAUSE_S = 0.005
 """Shortest time between two readings of an axis that settles."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
+NOT_IDENTIFIED = Fault(
+    "not_identified",
+    "what answers is not known to be this drive, so only what stops it is sent; correct the wiring or the configuration",
+)
 STOP_UNCONFIRMED = Fault(
     "stop_unconfirmed",
     "a stop was requested and the drive has not confirmed it; it is sent again until the drive does",
@@ -83,6 +87,7 @@ OF_DAEMON = (
     LINK_LOST,
     LOOP_OPENED,
     JUMPED,
+    NOT_IDENTIFIED,
     NOT_SETTLED,
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
@@ -263,12 +268,16 @@ class AxisTracker:
     """The state of one axis, changed only by what was observed or commanded.
 
     Attributes:
+        has_reference: the drive can be homed, or its position be set.
         found: takes every fault as it comes up.
         refused: why the reference that an earlier daemon has kept was refused; empty when none was, and once there is
             another one.
+        reference_lost: the place was known and is not any more, until it is known again; a reset does not clear it.
         settle: judges the end of the motion under way; None where the end of its profile is its end.
         proof: that who answers is its drive; None for an axis without a line.
     """
+
+    has_reference = True
 
     def __init__(self, name: str, unit: str, ended: Ended = _ignore_end, proof: Proof | None = None) -> None:
         """Begin in ignorance.
@@ -285,7 +294,7 @@ class AxisTracker:
         self.unit = unit
         self.state = AxisState.DISABLED
         self.enabled = False
-        self.referenced = False
+        self._referenced = self.reference_lost = False
         self.position_lost = False
         self.stop_latched = False
         self.stop_pending = False
@@ -313,7 +322,7 @@ class AxisTracker:
             self.quality,
             self.state,
             self.enabled,
-            self.referenced,
+            self._referenced,
             self.moving,
             self.link,
             self.stop_latched,
@@ -322,6 +331,21 @@ class AxisTracker:
             self.last_error,
             self.speed_share,
         )
+
+    @property
+    def referenced(self) -> bool:
+        """Whether the place is known."""
+        return self._referenced
+
+    @referenced.setter
+    def referenced(self, known: bool) -> None:
+        self.reference_lost = not known and (self._referenced or self.reference_lost)
+        self._referenced = known
+
+    @property
+    def speed_override(self) -> float:
+        """Percent of every velocity."""
+        return 100.0 * self.speed_share
 
     @property
     def moving(self) -> Moving:
@@ -437,7 +461,7 @@ class AxisTracker:
 
     def refuse_reference(self, reason: str) -> None:
         """The reference that an earlier daemon has kept does not hold: a warning until there is another one."""
-        self.refused = reason
+        self.refused, self.reference_lost = reason, True
         text = f"{REFERENCE_REFUSED.text}: {reason}; home the axis, or set its position"
         self._own = (*self._own, replace(REFERENCE_REFUSED, text=text))
 
@@ -492,13 +516,15 @@ class AxisTracker:
 
     def disconnected(self, now_ns: int) -> None:
         """The drive is gone: nothing is known any more, and nothing resumes."""
-        if self.link is LinkState.DOWN:
+        another = self.proof is not None and self.proof.is_another
+        was_up = self.link is not LinkState.DOWN
+        if not was_up and (not another or any(fault.code == NOT_IDENTIFIED.code for fault in self.active_faults)):
             return
         self.link = LinkState.DOWN
         self.referenced = False
         self._rest.forget()
-        self._faults((LINK_LOST,), now_ns)
-        if self.state is not AxisState.DISABLED:
+        self._faults((NOT_IDENTIFIED if another else LINK_LOST,), now_ns)
+        if was_up and self.state is not AxisState.DISABLED:
             self._fail(LINK_LOST.text)
 
     def _faults(self, faults: tuple[Fault, ...], now_ns: int) -> None:
@@ -636,6 +662,8 @@ def _entry(fault: Fault, now_ns: int) -> FaultEntry:
 
 class ObservedTracker(AxisTracker):
     """An `AxisTracker` without commands: Disabled, Standstill, moving, ErrorStop as the drive shows them."""
+
+    has_reference = False
 
     def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:  # noqa: ARG002 - of the contract
         """Digest a reading."""

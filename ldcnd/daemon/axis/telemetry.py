@@ -173,6 +173,8 @@ class AxisTelemetry:
                     "stop_pending": stop_pending,
                     "command": command and _current(command),
                     "last_error": last_error,
+                    "has_reference": tracker.has_reference,
+                    "reference_lost": tracker.reference_lost,
                     "speed_override": 100.0 * share,
                 }
             )

@@ -172,6 +172,8 @@ class BusService:
                     log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
                 self.problem = error.message
                 self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
+                for axis in self.axes:
+                    axis.disconnected()
                 await self._pause(retry_s)
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue

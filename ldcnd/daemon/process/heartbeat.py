@@ -18,7 +18,7 @@ from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.model.health import HeartbeatHealth
-from ldcnd.model.trouble import Kind, axis_troubles, line_troubles
+from ldcnd.model.condition import Kind, assess, line_troubles
 from ldcnd.transport.level import GpioLine, LevelFile, ModemLine, Output
 
 log = get_logger("heartbeat")
@@ -127,7 +127,7 @@ class Heartbeat:
         if not line.bus.on_time(now_s):
             return f"{name}: the line does not keep to its plan"
         for axis in line.axes:
-            for trouble in axis_troubles(axis.tracker):
+            for trouble in assess(axis.tracker).troubles:
                 if trouble.kind in HOLDING:
                     return f"{axis.config.name}: {trouble.text}"
         return ""

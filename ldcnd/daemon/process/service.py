@@ -33,7 +33,7 @@ from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
 from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import FaultEntry, LinkState
-from ldcnd.model.trouble import Kind, axis_troubles, line_troubles
+from ldcnd.model.condition import Kind, assess, line_troubles
 from ldcnd.planning.plan import require_plan
 
 log = get_logger("service")
@@ -288,7 +288,7 @@ def describe(rig: Rig) -> str:
             wrong.setdefault(trouble.text, []).append(name)
         for axis in bus.axes if up else ():
             tracker = axis.tracker
-            troubles = axis_troubles(tracker, _Faults(tracker.active_faults, tracker.first_fault))
+            troubles = assess(tracker, _Faults(tracker.active_faults, tracker.first_fault)).wrong
             for trouble in [each for each in troubles if each.kind is not Kind.MISSED_POLLS][:1]:
                 wrong.setdefault(trouble.text, []).append(axis.config.name)
     buses_up = sum(bus.report is not None for bus in rig.buses)

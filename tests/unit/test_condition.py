@@ -4,7 +4,7 @@ import pytest
 
 from ldcnd.model.health import AxisHealth, ItemHealth
 from ldcnd.model.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
-from ldcnd.model.trouble import Severity, Trouble, axis_troubles, line_troubles
+from ldcnd.model.condition import Severity, Trouble, assess, line_troubles
 
 
 def state(**changes) -> StateSample:
@@ -45,6 +45,10 @@ def health(rate_hz: float, *, wanted_hz: float = 20.0, asked_hz: float | None = 
     )
 
 
+def troubles_of(state: StateSample | None, faults: FaultSample | None, health: AxisHealth | None) -> tuple[Trouble, ...]:
+    return assess(state, faults, health).troubles
+
+
 def said(troubles: tuple[Trouble, ...]) -> list[tuple[Severity, str]]:
     return [(trouble.severity, trouble.text) for trouble in troubles]
 
@@ -58,11 +62,11 @@ def wrong(text: str) -> list[tuple[Severity, str]]:
 
 
 def test_an_axis_that_is_well_has_none():
-    assert axis_troubles(state(), faults(), health(20.0)) == ()
+    assert troubles_of(state(), faults(), health(20.0)) == ()
 
 
 def test_what_was_never_heard_of_is_a_doubt():
-    assert said(axis_troubles(None, None, None)) == notice("nothing was received from it yet")
+    assert said(troubles_of(None, None, None)) == notice("nothing was received from it yet")
 
 
 def test_a_line_that_is_not_up_is_wrong_and_says_why_where_that_is_known():
@@ -74,13 +78,13 @@ def test_a_line_that_is_not_up_is_wrong_and_says_why_where_that_is_known():
 def test_of_a_drive_that_does_not_answer_nothing_else_is_said():
     gone = state(link=LinkState.DOWN, state=AxisState.ERROR_STOP, stop_latched=True)
 
-    assert said(axis_troubles(gone, faults(entry("link_lost")), health(0.0))) == wrong("the drive does not answer")
+    assert said(troubles_of(gone, faults(entry("link_lost")), health(0.0))) == wrong("the drive does not answer")
 
 
 def test_a_stop_that_no_drive_has_confirmed_comes_before_everything_even_of_a_drive_that_does_not_answer():
     gone = state(link=LinkState.DOWN, stop_latched=True, stop_pending=True)
 
-    assert [trouble.text for trouble in axis_troubles(gone, faults(entry("overheat")), None)] == [
+    assert [trouble.text for trouble in troubles_of(gone, faults(entry("overheat")), None)] == [
         "a stop is NOT confirmed by the drive: use the machine's emergency stop",
         "the drive does not answer",
     ]
@@ -90,7 +94,7 @@ def test_faults_that_stop_come_before_warnings_and_the_first_cause_before_its_co
     active = faults(entry("position_wrap", stops=False), entry("position_error"), entry("overheat"))
     caused = active.model_copy(update={"first": entry("overheat")})
 
-    found = axis_troubles(state(state=AxisState.ERROR_STOP, stop_latched=True), caused, None)
+    found = troubles_of(state(state=AxisState.ERROR_STOP, stop_latched=True), caused, None)
 
     assert [(trouble.severity, trouble.text.partition(":")[0]) for trouble in found] == [
         (Severity.WRONG, "overheat"),
@@ -106,11 +110,11 @@ def test_faults_that_stop_come_before_warnings_and_the_first_cause_before_its_co
     [("home: no switch", "in error stop: home: no switch"), (None, "in error stop: reset it to go on")],
 )
 def test_an_error_stop_whose_fault_is_over_is_wrong_all_the_same(last_error, text):
-    assert said(axis_troubles(state(state=AxisState.ERROR_STOP, last_error=last_error), faults(), None)) == wrong(text)
+    assert said(troubles_of(state(state=AxisState.ERROR_STOP, last_error=last_error), faults(), None)) == wrong(text)
 
 
 def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on():
-    assert axis_troubles(state(last_error="home: no switch"), faults(), None) == ()
+    assert troubles_of(state(last_error="home: no switch"), faults(), None) == ()
 
 
 @pytest.mark.parametrize(
@@ -125,10 +129,10 @@ def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on(
     ],
 )
 def test_samples_that_come_too_seldom_are_told(report, told):
-    assert said(axis_troubles(state(), faults(), report)) == (notice(told) if told else [])
+    assert said(troubles_of(state(), faults(), report)) == (notice(told) if told else [])
 
 
 def test_polls_that_are_missed_explain_a_low_rate():
-    found = axis_troubles(state(link=LinkState.DEGRADED), faults(), health(1.0))
+    found = troubles_of(state(link=LinkState.DEGRADED), faults(), health(1.0))
 
     assert said(found) == notice("the drive missed its latest polls")
