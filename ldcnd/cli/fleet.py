@@ -5,7 +5,6 @@ import asyncio
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.quantities import state_word
 from ldcnd.cli.typed import Finite
 from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.errors import SessionError
@@ -51,7 +50,7 @@ def table(rig: RigReport) -> list[str]:
 def _axis(axis: AxisReport) -> str:
     info, state, health = axis.info, axis.state, axis.health
     where = f"{info.bus}/{info.address}"
-    what = state_word(state) if state else "unknown"
+    what = axis.condition.summary
     link = state.link.value if state else "?"
     rate = f"{health.rate_hz:6.1f} Hz" if health else "     ? Hz"
     return f"{info.axis:12} {info.model:14} {where:12} {link:8} {rate}  {what}"

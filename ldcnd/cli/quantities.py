@@ -3,16 +3,15 @@
 import math
 
 from ldcnd.model.commands import CommandReply, Verb
+from ldcnd.model.condition import assess
 from ldcnd.model.events import CommandOutcome
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import (
     AdcSample,
-    AxisState,
     FaultSample,
     InputsSample,
     IoSample,
     LatchSample,
-    Moving,
     PositionSample,
     Sample,
     StateSample,
@@ -77,19 +76,9 @@ def outcome(info: AxisInfo, ended: CommandOutcome, state: StateSample) -> str:
     return f"{axis}: {done}, {state_word(state)}{where}"
 
 
-STATE_WORDS = {
-    AxisState.DISCRETE_MOTION: "moving",
-    AxisState.CONTINUOUS_MOTION: "running",
-    AxisState.ERROR_STOP: "error stop",
-}
-
-
 def state_word(state: StateSample) -> str:
-    """Return the state of an axis in the console's words."""
-    word = STATE_WORDS.get(state.state, state.state.value.replace("_", " "))
-    if state.stop_pending:
-        return f"{word}, stop NOT CONFIRMED by the drive"
-    return f"{word}, stop latched" if state.stop_latched else word
+    """Return the state of an axis and everything that is to be said of it."""
+    return assess(state).summary
 
 
 def sample_text(sample: Sample) -> str:
@@ -115,9 +104,7 @@ def sample_text(sample: Sample) -> str:
             pins = "".join("01"[level] for level in sample.levels)
             return f"io       lines 1 to 12 {pins}, A/D {sample.adc}, counter {sample.counter}{_worth(sample)}"
         case StateSample():
-            moving = "" if sample.moving is not Moving.UNKNOWN else ", moving: unknown"
-            link = "" if sample.link == "up" else f", link {sample.link}"
-            return f"state    {state_word(sample)}{moving}{link}"
+            return f"state    {state_word(sample)}"
         case FaultSample():
             return "fault    " + ("; ".join(f"{fault.code}: {fault.text}" for fault in sample.active) or "none")
         case _:

@@ -10,7 +10,7 @@ from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.model.meta import AxisInfo, DaemonInfo
 from ldcnd.model.samples import FaultSample, StateSample
-from ldcnd.model.condition import assess, line_troubles
+from ldcnd.model.condition import Condition, assess, line_troubles
 
 ASKED_AT_ONCE = 8
 """Maximum number of concurrent queries of rigs."""
@@ -29,6 +29,13 @@ class AxisReport(Frozen):
     """Its last faults; null before the first."""
     health: AxisHealth | None
     """How fresh its samples are; null before the first report."""
+    line_up: bool = True
+    """Its line is up."""
+
+    @property
+    def condition(self) -> Condition:
+        """Whether its place is known, and all that is to be said of it."""
+        return assess(self.state, self.fault, self.health, line_up=self.line_up)
 
 
 class RigReport(Frozen):
@@ -102,8 +109,15 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
         return view.model_copy(update={"problems": (f"stopped answering: {error.message}",)})
     freshness = {axis.axis: axis for bus in buses for axis in bus.axes}
     known = {axis.axis: axis for axis in axes}  # two daemons on one rig tell of each axis twice
+    down = {bus.bus for bus in buses if not bus.up}
     views = tuple(
-        AxisReport(info=axis, state=states.get(name), fault=faults.get(name), health=freshness.get(name))
+        AxisReport(
+            info=axis,
+            state=states.get(name),
+            fault=faults.get(name),
+            health=freshness.get(name),
+            line_up=axis.bus not in down,
+        )
         for name, axis in known.items()
     )
     problems = ["another daemon serves this rig: nothing is moved"] if rival else []
@@ -126,6 +140,6 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
         f"{axis.info.axis}: {trouble.text}"
         for axis in axes
         if axis.info.bus not in down
-        for trouble in assess(axis.state, axis.fault, axis.health).wrong
+        for trouble in axis.condition.wrong
     ]
     return problems

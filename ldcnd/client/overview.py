@@ -1,0 +1,53 @@
+"""What is known of every axis of a rig now: description, last samples, their age, and its condition."""
+
+from dataclasses import dataclass
+
+from ldcnd.client.health import last_bus_health, last_health
+from ldcnd.client.rig_client import RigClient
+from ldcnd.model.condition import Condition, assess
+from ldcnd.model.health import AxisHealth
+from ldcnd.model.meta import AxisInfo
+from ldcnd.model.samples import FaultSample, PositionSample, StateSample
+
+
+@dataclass(frozen=True, slots=True)
+class AxisNow:
+    """One axis as its daemon has shown it last.
+
+    Attributes:
+        info: its description.
+        state: None before the first.
+        position: None before the first.
+        age_s: age of the position by the daemon's own clock, seconds; None without one.
+        health: its last report; None before the first.
+        condition: whether its place is known, and all that is to be said of it.
+    """
+
+    info: AxisInfo
+    state: StateSample | None
+    position: PositionSample | None
+    age_s: float | None
+    health: AxisHealth | None
+    condition: Condition
+
+
+async def overview(client: RigClient) -> list[AxisNow]:
+    """Return every axis, in the order of lines and addresses.
+
+    Raises:
+        SessionError: no daemon answers.
+    """
+    axes, states, positions = await client.axes(), await client.states(), await client.positions()
+    faults, report = await client.faults(), await last_health(client)
+    lines = {line.bus: line for line in await last_bus_health(client)}
+    stamps = [sample.t for samples in (states, positions) for sample in samples.values()]
+    now_ns = max([*stamps, report.t if report else 0], default=0)  # the clocks of two hosts may differ
+    found = []
+    for info in axes:
+        line, state, position = lines.get(info.bus), states.get(info.axis), positions.get(info.axis)
+        health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
+        age_s = (now_ns - position.t) / 1e9 if position else None
+        fault: FaultSample | None = faults.get(info.axis)
+        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up)
+        found.append(AxisNow(info, state, position, age_s, health, condition))
+    return found
