@@ -15,8 +15,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
+from ldcnd.model.condition import Place, assess
 from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.samples import LinkState, ShadowSample
+from ldcnd.model.samples import FaultSample, LinkState, ShadowSample, StateSample
 
 SHORTEST_LATENCY_S = 64e-6
 """Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""
@@ -41,6 +42,8 @@ class HealthCollector(Collector):
         self._daemon: tuple[float, DaemonHealth] | None = None
         self._buses: dict[str, tuple[float, BusHealth]] = {}
         self._shadows: dict[str, tuple[float, ShadowSample]] = {}
+        self._states: dict[str, tuple[float, StateSample]] = {}
+        self._faults: dict[str, FaultSample] = {}
 
     def take(self, report: DaemonHealth | BusHealth) -> None:
         """Replace the report that came before."""
@@ -52,6 +55,13 @@ class HealthCollector(Collector):
     def take_shadow(self, axis: str, sample: ShadowSample) -> None:
         """Replace what an observer has said of an axis."""
         self._shadows = {**self._shadows, axis: (self._now_s(), sample)}
+
+    def take_state(self, axis: str, sample: StateSample | FaultSample) -> None:
+        """Replace what is known of the state or the faults of an axis."""
+        if isinstance(sample, StateSample):
+            self._states = {**self._states, axis: (self._now_s(), sample)}
+        else:
+            self._faults = {**self._faults, axis: sample}
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics; those of reports that have stopped coming are left out."""
@@ -65,6 +75,7 @@ class HealthCollector(Collector):
         yield from self._of_buses(buses)
         yield from self._of_lanes(buses)
         yield from self._of_axes(buses)
+        yield from self._of_conditions(buses)
         yield from self._of_shadows()
 
     def _of_daemon(self, daemon: DaemonHealth | None) -> Iterator[Metric]:
@@ -132,6 +143,28 @@ class HealthCollector(Collector):
                 if axis.eeprom_writes is not None:
                     wear.add_metric(values, axis.eeprom_writes)
         yield from (up, age, wanted, rate, faults, wear)
+
+    def _of_conditions(self, buses: list[BusHealth]) -> Iterator[Metric]:
+        labels = ["rig", "axis"]
+        known = GaugeMetricFamily(
+            "ldcnd_axis_place_known", "1 while the position says where the axis is", labels=labels
+        )
+        severity = GaugeMetricFamily(
+            "ldcnd_axis_severity", "0 none, 1 minor, 2 major, 3: its values are not to be believed", labels=labels
+        )
+        condition = GaugeMetricFamily(
+            "ldcnd_axis_condition", "1 for each thing that is to be said of an axis", labels=[*labels, "condition"]
+        )
+        down = {axis.axis for bus in buses if not bus.up for axis in bus.axes}
+        since_s = self._now_s() - FRESH_S
+        for axis, (at_s, state) in self._states.items():
+            silence = "" if at_s >= since_s else "its state is not reported any more"
+            now = assess(state, self._faults.get(axis), line_up=axis not in down, silence=silence)
+            known.add_metric([self._rig, axis], float(now.place is Place.KNOWN))
+            severity.add_metric([self._rig, axis], now.alarm)
+            for note in dict.fromkeys((*([now.mark] if now.mark else []), *now.notes)):
+                condition.add_metric([self._rig, axis, note], 1.0)
+        yield from (known, severity, condition)
 
     def _of_shadows(self) -> Iterator[Metric]:
         labels = ["rig", "axis", "figure"]

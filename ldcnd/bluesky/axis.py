@@ -23,6 +23,7 @@ from ldcnd.errors import (
     StopLatched,
     WrongState,
 )
+from ldcnd.model.condition import assess
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import LinkState, Moving, PositionSample, Quality
 
@@ -149,7 +150,8 @@ class ReadableAxis:
         return self._of((await self._measured()).sample)
 
     def _of(self, sample: PositionSample) -> "dict[str, Reading[float]]":
-        return {self.name: reading(sample.value, sample.t * 1e-9, sample.quality)}
+        condition = assess(self._axis.state.sample)
+        return {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
 
     async def _measured(self) -> Position:
         """Return a position that is a measurement, not old, and newer than the end of the last motion."""

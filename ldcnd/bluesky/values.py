@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, TypeVar
 
+from ldcnd.model.condition import Condition
 from ldcnd.model.samples import Quality
 
 if TYPE_CHECKING:
@@ -12,8 +13,13 @@ ValueT = TypeVar("ValueT")
 SEVERITIES = {Quality.GOOD: 0, Quality.UNCERTAIN: 1, Quality.BAD: 2}
 
 
-def reading(value: ValueT, at_s: float, quality: Quality = Quality.GOOD) -> "Reading[ValueT]":
-    """Return a value with the instant at which it was true, in seconds since 1970."""
+def reading(
+    value: ValueT, at_s: float, quality: Quality = Quality.GOOD, condition: Condition | None = None
+) -> "Reading[ValueT]":
+    """Return a value with the instant at which it was true, in seconds since 1970, and the condition of its axis."""
+    if condition and condition.alarm > SEVERITIES[quality]:
+        said = ", ".join(dict.fromkeys((*([condition.mark] if condition.mark else []), *condition.notes)))
+        return {"value": value, "timestamp": at_s, "alarm_severity": condition.alarm.value, "message": said}
     if quality is Quality.GOOD:
         return {"value": value, "timestamp": at_s}
     message = f"quality {quality.value}"

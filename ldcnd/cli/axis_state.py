@@ -25,7 +25,6 @@ from ldcnd.model.samples import (
     TelemetryItem,
 )
 
-
 SILENT_S = 3.0
 """Time without a sample after which `axis watch` says why, seconds."""
 

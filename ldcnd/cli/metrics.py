@@ -12,7 +12,7 @@ from ldcnd.client.health import health_reports
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
-from ldcnd.model.samples import ShadowSample, TelemetryItem
+from ldcnd.model.samples import FaultSample, ShadowSample, StateSample, TelemetryItem
 
 if TYPE_CHECKING:
     from ldcnd.metrics import HealthCollector
@@ -45,19 +45,30 @@ async def _serve(client: RigClient, address: ListenAddress) -> None:
         async with (
             health_reports(client, collector.take),
             client.samples(item=TelemetryItem.SHADOW) as shadows,
+            client.samples(item=TelemetryItem.STATE) as states,
+            client.samples(item=TelemetryItem.FAULT) as faults,
             metrics_server(registry, address.host, address.port) as port,
             asyncio.TaskGroup() as group,
         ):
-            following = group.create_task(_follow(shadows, collector), name="shadows")
+            for axis, state in (await client.states()).items():
+                collector.take_state(axis, state)
+            for axis, fault in (await client.faults()).items():
+                collector.take_state(axis, fault)
+            following = [
+                group.create_task(_follow(samples, collector), name="samples") for samples in (shadows, states, faults)
+            ]
             click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
             await ending.wait()
-            following.cancel()
+            for task in following:
+                task.cancel()
     except OSError as error:
         where = f"{address.in_url}:{address.port}"
         raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
 
 
-async def _follow(shadows: Samples, collector: "HealthCollector") -> None:
-    async for axis, sample in shadows:
+async def _follow(samples: Samples, collector: "HealthCollector") -> None:
+    async for axis, sample in samples:
         if isinstance(sample, ShadowSample):
             collector.take_shadow(axis, sample)
+        elif isinstance(sample, StateSample | FaultSample):
+            collector.take_state(axis, sample)

@@ -115,7 +115,7 @@ class Axis(AxisVerbs, Watched):
         if isinstance(sample, Sample):
             sample = decode_received(PositionSample, sample.payload, sample.encoding)
             self._position = sample, at_s
-        return Position(sample, self._loop.time() - at_s)
+        return Position(sample, self._loop.time() - at_s, self._state[0] if self._state else None)
 
     def positions(self) -> Positions:
         """Iterate over the positions that come from now on; several readers do not disturb each other."""

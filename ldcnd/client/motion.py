@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from ldcnd.client.rig_client import CHECK_PERIOD_S
 from ldcnd.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
 from ldcnd.model.commands import CommandReply
+from ldcnd.model.condition import Condition, assess
 from ldcnd.model.events import FINAL, CommandOutcome, CommandStatus
 from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
 
@@ -22,10 +23,17 @@ class Position:
     Attributes:
         sample: as it was published.
         age_s: for how long it is known here, in seconds; how old it was on arrival, `sample.t` tells.
+        state: of the axis, as it was published last; None before the first.
     """
 
     sample: PositionSample
     age_s: float
+    state: StateSample | None = None
+
+    @property
+    def condition(self) -> Condition:
+        """Whether the position says where the axis is, and all that is to be said of it."""
+        return assess(self.state, age_s=self.age_s)
 
     @property
     def value(self) -> float:
@@ -47,7 +55,8 @@ class Position:
 
     def __str__(self) -> str:
         uncertainty = "" if self.quality is Quality.GOOD else f", {self.quality}"
-        return f"{self.value:.4f} {self.unit} ({self.age_s:.2f} s old{uncertainty})"
+        where = self.condition.position(f"{self.value:.4f}", self.unit)
+        return f"{where} ({self.age_s:.2f} s old{uncertainty})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +108,7 @@ class State:
         return self.sample.stop_latched
 
     def __str__(self) -> str:
-        latched = ", stop latched" if self.stop_latched else ""
-        link = "" if self.link is LinkState.UP else f", link {self.link}"
-        return f"{self.state}{latched}{link} ({self.age_s:.2f} s old)"
+        return f"{assess(self.sample, age_s=self.age_s).summary} ({self.age_s:.2f} s old)"
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,10 +4,12 @@ import asyncio
 from collections.abc import Mapping
 
 from ldcnd.client.rig_client import RigClient
+from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import RigReply
 from ldcnd.errors import LdcndError, OutcomeUnknown
 from ldcnd.log import get_logger
+from ldcnd.messaging.session import Sample
 from ldcnd.model.meta import CommandList
 from ldcnd.model.plan import RigBudget
 
@@ -34,6 +36,7 @@ class RigWatch:
         self.client = client
         self.endpoint = endpoint
         self._values = values
+        self._conditions = Conditions(client.rig, values.take, asyncio.get_running_loop().time)
         self._instances: set[str] = set()
         self._stirred = asyncio.Event()
         self._reply = RigReply(
@@ -65,9 +68,18 @@ class RigWatch:
 
     async def run(self) -> None:
         """Watch until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._conditions.run(), name=f"conditions of {self.client.rig}")
+            await self._watch()
+
+    def _take(self, sample: Sample) -> None:
+        self._values.take(sample)
+        self._conditions.take(sample)
+
+    async def _watch(self) -> None:
         while True:
             try:
-                async with self.client.published(self._values.take, linger_s=LINGER_S):
+                async with self.client.published(self._take, linger_s=LINGER_S):
                     await self._follow()
             except LdcndError as error:
                 self._show(problem=error.message)
@@ -101,7 +113,11 @@ class RigWatch:
         self._values.begin_again(rig)
         try:
             await self._describe()
-            self._values.settle(rig, await self.client.last_published())
+            published = await self.client.last_published()
+            for sample in published:
+                self._conditions.take(sample)
+            self._values.settle(rig, published)
+            self._conditions.show_again()
         except LdcndError as error:
             self._show(problem=error.message)
             return False
@@ -135,6 +151,7 @@ class RigWatch:
     def _show(self, *, problem: str | None) -> None:
         connected = bool(self._instances) and (problem is None or len(self._instances) > 1)
         self._reply = self._reply.model_copy(update={"connected": connected, "problem": problem})
+        self._conditions.silence = "" if connected else problem or "its daemon has not been seen yet"
         told = {"connected": connected, "problem": problem, "instance": self.instance}
         if told != self._told:
             self._told = told

@@ -14,6 +14,8 @@ from ldcnd.client.motion import Motion
 from ldcnd.epics.fields import NO_ALARM, Action, Alarm, Field, Put, Value, choice, integer, number, string, text
 from ldcnd.errors import CommandAborted, LdcndError, LeaseRequired, ValueOutOfRange, WrongState
 from ldcnd.model.commands import BufferMode, Verb
+from ldcnd.model.condition import Alarm as Severity
+from ldcnd.model.condition import assess
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import (
     AdcSample,
@@ -41,6 +43,12 @@ QUALITIES = {
     Quality.GOOD: NO_ALARM,
     Quality.UNCERTAIN: Alarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
     Quality.BAD: SILENT,
+}
+ALARMS = {
+    Severity.NONE: NO_ALARM,
+    Severity.MINOR: Alarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM),
+    Severity.MAJOR: Alarm(AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM),
+    Severity.INVALID: SILENT,
 }
 INPUTS = ("forward_limit", "reverse_limit", "index", "stop_input", "amplifier_enable")
 SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
@@ -85,6 +93,8 @@ class MotorRecord:
         self._released = asyncio.Event()  # the jog under way is to end
         self._jogging: asyncio.Future[None] | None = None
         self._alarm = SILENT
+        self._faults: FaultSample | None = None
+        self._condition = assess(None)
         self._switches = 0  # bits of MSTA
         velocity, acceleration = defaults
         self._highest_velocity = info.limits.velocity or NO_LIMIT
@@ -161,6 +171,7 @@ class MotorRecord:
         self.fields[name] = self._val
         self.fields |= {
             f"{name}:state": string(),
+            f"{name}:condition": text(),
             f"{name}:velocity": number(0.0, f"{unit}/s", precision=precision),
             f"{name}:faults": text(),
             f"{name}:first_fault": string(),
@@ -234,6 +245,7 @@ class MotorRecord:
             case InputsSample():
                 await self._take_inputs(sample, alarm, at_s)
             case FaultSample():
+                self._faults = sample
                 await self._show_beside("faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
                 await self._show_beside("first_fault", sample.first.code if sample.first else "")
             case StateSample():
@@ -248,14 +260,14 @@ class MotorRecord:
     async def _take_state(self, sample: StateSample) -> None:
         self._moving = sample.moving
         self._changed.set()
-        if sample.link is LinkState.DOWN or sample.moving is Moving.UNKNOWN:
+        self._condition = assess(sample, self._faults)
+        before, self._alarm = self._alarm, ALARMS[self._condition.alarm]
+        if sample.moving is Moving.UNKNOWN:
             self._alarm = SILENT
-        elif sample.state is AxisState.ERROR_STOP:
-            self._alarm = Alarm(AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM)
-        elif sample.stop_latched or sample.stop_pending or sample.link is LinkState.DEGRADED:
-            self._alarm = Alarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
-        else:
-            self._alarm = NO_ALARM
+        await self._show_beside("condition", ", ".join(self._condition.notes))
+        if self._alarm != before:  # no position may come that would carry it
+            for field in ("RBV", "DRBV", "RRBV"):
+                await self[field].show(self[field].value, self._alarm)
         await self._show_beside("state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
         await self["CNEN"].show("Enable" if sample.enabled else "Disable")
         await self["MSTA"].show(
@@ -286,6 +298,8 @@ class MotorRecord:
     async def silent(self) -> None:
         """Show that nothing is known of the axis: the daemon does not publish."""
         self._moving, self._alarm = Moving.UNKNOWN, SILENT
+        self._condition = assess(None, silence="nothing is published any more")
+        await self._show_beside("condition", ", ".join(self._condition.notes))
         await self["RBV"].show(self["RBV"].value, SILENT)
         await self.show_motion()
 

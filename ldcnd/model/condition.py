@@ -234,12 +234,18 @@ _NOT_CONFIRMED = Trouble(
 _NO_ANSWER = Trouble(Kind.NO_ANSWER, _WRONG, "the drive does not answer", "no answer")
 _ON_DEAD_LINE = Trouble(Kind.LINE_DOWN, _WRONG, "the line is not up", "line down")
 _NOT_IDENTIFIED = Trouble(
-    Kind.NOT_IDENTIFIED, _WRONG, "what answers is not known to be its drive: only what stops it is sent", "not identified"
+    Kind.NOT_IDENTIFIED,
+    _WRONG,
+    "what answers is not known to be its drive: only what stops it is sent",
+    "not identified",
 )
 _NEVER_SEEN = Trouble(Kind.UNKNOWN, _NOTICE, "nothing was received from it yet", "nothing received")
 _OLD = Trouble(Kind.OLD, _WRONG, "its position is old: nothing newer came", "old")
 _REFERENCE_LOST = Trouble(
-    Kind.REFERENCE_LOST, _WRONG, "has lost its reference: its position is not known before it is homed", "reference lost"
+    Kind.REFERENCE_LOST,
+    _WRONG,
+    "has lost its reference: its position is not known before it is homed",
+    "reference lost",
 )
 _NOT_HOMED = Trouble(Kind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
 _LATCHED = Trouble(Kind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")

@@ -9,11 +9,10 @@ from contextlib import AsyncExitStack
 
 from ldcnd.client.rig import Rig
 from ldcnd.messaging.session import Session
+from ldcnd.model.condition import Alarm, Place, assess
 from ldcnd.model.meta import AxisInfo
 from ldcnd.model.samples import (
-    AxisState,
     FaultSample,
-    LinkState,
     PositionSample,
     Quality,
     Sample,
@@ -32,6 +31,8 @@ PERIOD_S = 1.0
 SILENT_NS = 5_000_000_000
 """An axis whose last state is older is stale."""
 OK, WARN, ERROR, STALE = range(4)
+LEVELS = {Alarm.NONE: OK, Alarm.MINOR: WARN, Alarm.MAJOR: ERROR, Alarm.INVALID: ERROR}
+NOT_REPORTED = "its state is not reported any more"
 
 
 class Bridge:
@@ -58,7 +59,7 @@ class Bridge:
                 self._states[axis] = sample
             case FaultSample():
                 self._faults[axis] = sample
-            case PositionSample() if axis in self.joints and sample.quality is not Quality.BAD:
+            case PositionSample() if axis in self.joints and self._is_known(axis, sample):
                 scale = SI[self._axes[axis].unit]
                 velocity = self._velocities.get(axis)
                 is_fresh = velocity is not None and abs(sample.t - velocity.t) <= FRESH_NS
@@ -70,21 +71,25 @@ class Bridge:
         """Return a report on every axis."""
         return DiagnosticArray(now_ns, tuple(self._status(name, now_ns) for name in self._axes))
 
+    def _is_known(self, axis: str, sample: PositionSample) -> bool:
+        """Tell whether a position says where the axis is: a joint state has no place for a reservation."""
+        state = self._states.get(axis)
+        if sample.quality is Quality.BAD or state is None:
+            return False
+        return assess(state, self._faults.get(axis)).place is Place.KNOWN
+
     def _status(self, axis: str, now_ns: int) -> DiagnosticStatus:
         info, state, faults = self._axes[axis], self._states.get(axis), self._faults.get(axis)
         active = faults.active if faults else ()
-        values = tuple((fault.code, fault.text) for fault in active)
-        if state is None or now_ns - state.t > SILENT_NS:
-            level, message = STALE, "nothing is known"
-        elif state.link is LinkState.DOWN or state.state is AxisState.ERROR_STOP or any(f.stops for f in active):
-            level, message = (
-                ERROR,
-                state.state.value if state.link is not LinkState.DOWN else "the drive does not answer",
-            )
-        elif active or state.stop_latched or state.link is LinkState.DEGRADED:
-            level, message = WARN, state.state.value
-        else:
-            level, message = OK, state.state.value
+        is_old = state is not None and now_ns - state.t > SILENT_NS
+        condition = assess(state, faults, silence=NOT_REPORTED if is_old else "")
+        values = (
+            ("place", condition.place.value),
+            *((fault.code, fault.text) for fault in active),
+            *((trouble.short, trouble.text) for trouble in condition.troubles),
+        )
+        level = STALE if state is None or is_old else LEVELS[condition.alarm]
+        message = condition.summary
         return DiagnosticStatus(level, f"{self._rig}: {axis}", message, f"{info.bus}/{info.address}", values)
 
 

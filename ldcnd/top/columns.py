@@ -1,7 +1,7 @@
 """The words in which a glance is shown: one table of axes, one of lines."""
 
-from ldcnd.model.samples import Moving
 from ldcnd.model.condition import Severity
+from ldcnd.model.samples import Moving
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 UNKNOWN = "-"

@@ -1,8 +1,8 @@
 """A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
 
+from ldcnd.model.condition import Place, Severity
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
-from ldcnd.model.condition import Place, Severity
 
 
 class Glance(Frozen):

@@ -10,6 +10,7 @@ from typing import TypeVar
 from ldcnd.messaging.codec import decode_received
 from ldcnd.messaging.keys import Keys
 from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.model.condition import SHARED, Kind, Severity, Trouble, assess, line_troubles
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.health import BusHealth, LaneHealth
 from ldcnd.model.leases import HolderList
@@ -23,7 +24,6 @@ from ldcnd.model.samples import (
     TelemetryItem,
     VelocitySample,
 )
-from ldcnd.model.condition import SHARED, Kind, Severity, Trouble, assess, line_troubles
 from ldcnd.top.glance import AxisGlance, BusGlance, RigGlance
 
 SILENT_S = 3.0
@@ -124,9 +124,7 @@ class RigView:
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
         age_s = now_s - self._kept[position_key].at_s if position else None
-        condition = assess(
-            state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent
-        )
+        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent)
         worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(

@@ -45,7 +45,7 @@ function Navigation({ at }) {
 
 /** One line on how things are: heard by screen readers when it changes. */
 function Summary() {
-  const wrong = problems(rigs.values()).flatMap(({ level, places }) => places.map(() => ({ level })));
+  const wrong = problems(rigs.values());
   const worst = wrong.some((each) => each.level === "bad") ? "bad" : wrong.length ? "warn" : "";
   const mine = controlled();
   return html`<p class="summary" role="status">

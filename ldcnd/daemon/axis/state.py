@@ -34,7 +34,7 @@ SHORTEST_READING_PAUSE_S = 0.005
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
 NOT_IDENTIFIED = Fault(
     "not_identified",
-    "what answers is not known to be this drive, so only what stops it is sent; correct the wiring or the configuration",
+    "what answers is not known to be this drive: only what stops it is sent; correct the wiring or the configuration",
 )
 STOP_UNCONFIRMED = Fault(
     "stop_unconfirmed",

@@ -168,12 +168,7 @@ class BusService:
             try:
                 report = await self.network.bring_up()
             except LdcndError as error:  # also a stop that took one of its packets off the queue
-                if error.message != self.problem:
-                    log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
-                self.problem = error.message
-                self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
-                for axis in self.axes:
-                    axis.disconnected()
+                self._not_up(error)
                 await self._pause(retry_s)
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue
@@ -200,6 +195,15 @@ class BusService:
             for axis in self.axes:
                 axis.line_up = False
                 axis.disconnected()
+
+    def _not_up(self, error: LdcndError) -> None:
+        """Keep why the line is not up; its axes show whether nothing answers, or something that is not theirs."""
+        if error.message != self.problem:
+            log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
+        self.problem = error.message
+        self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
+        for axis in self.axes:
+            axis.disconnected()
 
     async def _send_pending_stops(self) -> None:
         """Send what no drive has confirmed, to all axes that wait for it at once."""

@@ -17,8 +17,8 @@ from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.line.rig import Rig
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
-from ldcnd.model.health import HeartbeatHealth
 from ldcnd.model.condition import Kind, assess, line_troubles
+from ldcnd.model.health import HeartbeatHealth
 from ldcnd.transport.level import GpioLine, LevelFile, ModemLine, Output
 
 log = get_logger("heartbeat")

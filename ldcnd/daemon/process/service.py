@@ -31,9 +31,9 @@ from ldcnd.daemon.process.daemon import Daemon
 from ldcnd.daemon.process.systemd import Notifier
 from ldcnd.errors import ConfigError
 from ldcnd.log import get_logger
+from ldcnd.model.condition import Kind, assess, line_troubles
 from ldcnd.model.plan import RigBudget
 from ldcnd.model.samples import FaultEntry, LinkState
-from ldcnd.model.condition import Kind, assess, line_troubles
 from ldcnd.planning.plan import require_plan
 
 log = get_logger("service")

@@ -3,7 +3,7 @@
 import { html, useState } from "../html.js";
 import { Action, Facts, Panel } from "../parts/controls.js";
 import { age, clock, decimalsOf, number, words } from "../parts/format.js";
-import { Lamp, QualityWord, StateWord } from "../parts/state.js";
+import { Lamp, Mark, QualityWord, StateWord } from "../parts/state.js";
 import { readSignals, signalsOf } from "../session/captures.js";
 import { feed } from "../session/feed.js";
 import { obstacle } from "../session/obstacles.js";
@@ -12,17 +12,21 @@ export function NowPanel({ axis }) {
   const { info, samples, state } = axis;
   const decimals = decimalsOf(info);
   const { position, adc } = samples;
-  const left = state?.command?.target == null || !position ? null : state.command.target - position.value;
-  return html`<${Panel} title="Now" data-stale=${axis.rig.worth ? "yes" : "no"}>
+  const { known, live, mark } = axis.condition;
+  const target = live ? state?.command?.target : null;
+  const left = target == null || !position ? null : target - position.value;
+  return html`<${Panel} title="Now" data-stale=${live ? "no" : "yes"}>
     <div class="now">
-      <p class="big"><output aria-label="Position">${number(position?.value, decimals)}</output>
+      <p class="big" data-known=${known ? "yes" : "no"}><output aria-label="Position"
+        >${known ? number(position?.value, decimals) : `(${number(position?.value, decimals)})`}</output>
         <span class="unit">${info.unit}</span></p>
+      ${!known && html`<p class="place-mark"><${Mark} level=${live ? "warn" : "bad"}>${mark}<//></p>`}
       <p class="now-state"><${StateWord} axis=${axis} /> <${QualityWord} axis=${axis} /></p>
     </div>
     <${Facts} of=${[
-      ["velocity", html`${number(axis.velocity, decimals)} <span class="unit">${info.unit}/s</span>`],
+      ["velocity", html`${number(live ? axis.velocity : null, decimals)} <span class="unit">${info.unit}/s</span>`],
       ["following error", html`${number(position?.following_error, decimals)} <span class="unit">${info.unit}</span>`],
-      ["target", html`${number(state?.command?.target, decimals)} <span class="unit">${info.unit}</span>`],
+      ["target", html`${number(target, decimals)} <span class="unit">${info.unit}</span>`],
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
@@ -31,8 +35,8 @@ export function NowPanel({ axis }) {
       ["last error", state?.last_error ?? "none"],
     ]} />
     <h3>Status</h3>
-    <${StatusLamps} state=${state} />
-    <${Inputs} sample=${samples.inputs} />
+    <${StatusLamps} state=${state} live=${live} />
+    <${Inputs} sample=${samples.inputs} live=${live} />
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
   <//>`;
@@ -52,24 +56,25 @@ function remaining(command) {
   return `ends in ${age(Math.max(0, (command.expected_end - feed.nowNs()) / 1e9))}`;
 }
 
-function StatusLamps({ state }) {
+function StatusLamps({ state, live }) {
+  const now = live ? state : null; // what is latched stays true of an axis that does not answer
   return html`<ul class="lamps" aria-label="Status bits">
-    <${Lamp} label="loop closed" on=${state?.enabled} />
-    <${Lamp} label="homed" on=${state?.referenced} />
-    <${Lamp} label="moving" on=${state && state.moving !== "unknown" ? state.moving === "yes" : null} />
-    <${Lamp} label="answers" on=${state && state.link !== "down"} yes=${state?.link} no="down"
+    <${Lamp} label="loop closed" on=${now?.enabled} />
+    ${(state?.has_reference ?? true) && html`<${Lamp} label="homed" on=${now?.referenced} level="" />`}
+    <${Lamp} label="moving" on=${now && now.moving !== "unknown" ? now.moving === "yes" : null} />
+    <${Lamp} label="answers" on=${state && live && state.link !== "down"} yes=${state?.link} no="down"
       level=${state?.link === "degraded" ? "warn" : ""} />
     <${Lamp} label="stop latched" on=${state?.stop_latched} level="warn" />
     ${state?.stop_pending && html`<${Lamp} label="stop confirmed by the drive" on=${true} yes="NO" level="bad" />`}
-    <${Lamp} label="error stop" on=${state && state.state === "error_stop"} level="bad" />
+    <${Lamp} label="error stop" on=${now && now.state === "error_stop"} level="bad" />
   </ul>`;
 }
 
 /** What every poll carries; a level that the drive does not show is unknown. */
-function Inputs({ sample }) {
+function Inputs({ sample, live }) {
   if (!sample) return null;
   const lamp = (name, yes = "high", no = "low") =>
-    html`<${Lamp} label=${words(name)} on=${sample[name]} yes=${yes} no=${no} />`;
+    html`<${Lamp} label=${words(name)} on=${live ? sample[name] : null} yes=${yes} no=${no} />`;
   return html`<h3>Inputs</h3>
     <ul class="lamps" aria-label="Inputs">
       ${lamp("reverse_limit")}${lamp("forward_limit")}${lamp("index")}

@@ -2,9 +2,9 @@
 
 import { html, useId, useState } from "../html.js";
 import { Action, Facts, Tick } from "../parts/controls.js";
-import { dateAndClock, decimalsOf, duration, number, percent } from "../parts/format.js";
+import { dateAndClock, decimalsOf, duration, number, percent, words } from "../parts/format.js";
 import { problems } from "../parts/problems.js";
-import { FaultWords, Mark, Meter, QualityWord, StateWord } from "../parts/state.js";
+import { FaultWords, Mark, Meter, Place, QualityWord, StateWord } from "../parts/state.js";
 import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -86,7 +86,7 @@ function RigSection({ rig }) {
 function BusSection({ rig, bus }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.info?.bus === bus.name);
   return html`<section class="bus" aria-label=${`Line ${bus.name} of ${rig.name}`}>
-    <${BusLine} bus=${bus} />
+    <${BusLine} rig=${rig} bus=${bus} />
     <table class="axes" role="table" aria-label=${`Axes of ${rig.name} on ${bus.name}`}>
       <thead role="rowgroup"><tr role="row">${COLUMNS.map((each) => html`<th role="columnheader" scope="col">${each}</th>`)}</tr></thead>
       <tbody role="rowgroup">${axes.map((axis) => html`<${AxisRow} key=${axis.name} axis=${axis} />`)}</tbody>
@@ -94,14 +94,15 @@ function BusSection({ rig, bus }) {
   </section>`;
 }
 
-function BusLine({ bus }) {
+function BusLine({ rig, bus }) {
   const { info, health } = bus;
+  const up = rig.worth ? null : bus.up;
   return html`<header class="bus-line">
     <h3>${bus.name}</h3>
-    <${Mark} level=${info && !info.up ? "bad" : ""}>${info ? (info.up ? "up" : "down") : "unknown"}<//>
+    <${Mark} level=${up === false ? "bad" : ""}>${up === null ? "unknown" : up ? "up" : "down"}<//>
     <span class="quiet">${info?.port}, ${info?.baud} baud</span>
-    <${Meter} label="in use" share=${health?.utilisation} text=${percent(health?.utilisation)}
-      level=${health?.utilisation > FULL ? "warn" : ""} />
+    ${up && html`<${Meter} label="in use" share=${health?.utilisation} text=${percent(health?.utilisation)}
+      level=${health?.utilisation > FULL ? "warn" : ""} />`}
     <ul class="counters" aria-label="Link quality">
       ${COUNTERS.map(([counter, label]) => html`<${Counter} bus=${bus} counter=${counter} label=${label} />`)}
     </ul>
@@ -117,19 +118,20 @@ function Counter({ bus, counter, label }) {
 function AxisRow({ axis }) {
   const { info, samples, state, health } = axis;
   const decimals = decimalsOf(info);
-  const { position, adc } = samples;
+  const { adc } = samples;
+  const { live } = axis.condition;
   const cell = (label, content, kind = "") => html`<td role="cell" data-label=${label} class=${kind}>${content}</td>`;
-  return html`<tr role="row" data-axis=${axis.name}>
+  return html`<tr role="row" data-axis=${axis.name} data-stale=${live ? "no" : "yes"}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
       <small>${info.model} · ${info.address}</small></th>
     ${cell("State", html`<${StateWord} axis=${axis} />${
       state?.stop_pending
         ? html` <${Mark} level="bad">stop NOT confirmed<//>`
         : state?.stop_latched && html` <${Mark} level="warn">stop latched<//>`
-    }`)}
-    ${cell("Position", html`<b>${number(position?.value, decimals)}</b> <span class="unit">${info.unit}</span>`, "number main")}
-    ${cell("Velocity", html`${number(axis.velocity, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
-    ${cell("Target", number(state?.command?.target, decimals), "number")}
+    }${axis.refusal && html` <${Mark} level="bad">${axis.refusal}<//>`}`)}
+    ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} />`, "number main")}
+    ${cell("Velocity", html`${number(live ? axis.velocity : null, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
+    ${cell("Target", number(live ? state?.command?.target : null, decimals), "number")}
     ${cell("A/D", adc ? html`${number(adc.volts, 2)} <span class="unit">V</span>` : html`<span class="quiet">none</span>`, "number")}
     ${cell("Faults", html`<${FaultWords} axis=${axis} />`)}
     ${cell("Values", html`<${QualityWord} axis=${axis} />${" "}
@@ -161,6 +163,12 @@ function ShortAction({ title, name, act, obstacle: way }) {
     >${title}<span class="unseen"> ${name}</span><//>${way && html`<span class="unseen" id=${reason}>${way}</span>`}`;
 }
 
+/** Why an axis refused a command, with the nearest value that it would take. */
+function refused(axis, verb, { message, nearest }) {
+  const text = message.replace(`axis ${axis.name}: `, "");
+  return `${words(verb)} refused: ${text}${nearest === null ? "" : `; nearest that is taken: ${nearest}`}`;
+}
+
 /** What can be asked of all axes of a rig at once; each one that cannot do it now is passed over. */
 function RigCommands({ rig }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.can("power"));
@@ -172,9 +180,17 @@ function RigCommands({ rig }) {
   const ready = (act) => axes.filter((axis) => obstacle(axis, act) === null);
   const each = (act, verb, body) => async () => {
     const asked = ready(act);
+    for (const axis of axes) axis.refusal = null;
     const outcomes = await Promise.allSettled(asked.map((axis) => command(axis, verb, body)));
-    const failed = outcomes.flatMap(({ reason }, at) => (reason ? [`${asked[at].name}: ${reason.message}`] : []));
-    setTold(failed.join(" ") || `${verb === "power" ? (body.on ? "enabled" : "disabled") : verb}: ${asked.map(({ name }) => name).join(", ")}`);
+    outcomes.forEach(({ reason }, at) => {
+      if (reason) asked[at].refusal = refused(asked[at], verb, reason);
+    });
+    for (const axis of axes) {
+      const way = act === "home" && !asked.includes(axis) && obstacle(axis, act);
+      if (way) axis.refusal = `${words(verb)} refused: ${way}`;
+    }
+    const failed = axes.filter((axis) => axis.refusal);
+    setTold(failed.length ? `${words(verb)}: refused by ${failed.map(({ name }) => name).join(", ")}; the reasons are in their rows.` : `${verb === "power" ? (body.on ? "enabled" : "disabled") : verb}: ${asked.map(({ name }) => name).join(", ")}`);
   };
   const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" act=${each(act, verb, body)}
     obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;

@@ -1,7 +1,7 @@
 /** State, quality and the like: always a word with a shape, and colour only where something deserves a look. */
 
 import { html } from "../html.js";
-import { age, words } from "./format.js";
+import { age, number, words } from "./format.js";
 
 const LEVELS = {
   disabled: "off",
@@ -12,13 +12,28 @@ const LEVELS = {
   stopping: "moving",
   error_stop: "bad",
 };
-const WORDS = { discrete_motion: "moving", continuous_motion: "running", error_stop: "error stop" };
 
 /** The state of an axis. */
 export function StateWord({ axis }) {
-  const state = axis.state?.state;
-  const level = axis.rig.worth || !state ? "unknown" : LEVELS[state];
-  return html`<span class="state" data-level=${level}>${state ? (WORDS[state] ?? words(state)) : "unknown"}</span>`;
+  const { live, state } = axis.condition;
+  return html`<span class="state" data-level=${live ? (LEVELS[axis.state?.state] ?? "unknown") : "unknown"}>${state}</span>`;
+}
+
+/** The position of an axis as text: in brackets and with its mark where it does not say where the axis is. */
+export function placeText(axis, decimals) {
+  const { known, mark } = axis.condition;
+  const value = number(axis.samples.position?.value, decimals);
+  return known ? value : `(${value}) ${mark}`;
+}
+
+/** The same, the mark below the number. */
+export function Place({ axis, decimals, tag = "b" }) {
+  const { known, mark, live } = axis.condition;
+  const value = number(axis.samples.position?.value, decimals);
+  return html`<span class="place" data-known=${known ? "yes" : "no"}><${tag} aria-label="Position"
+    >${known ? value : `(${value})`}</${tag}> <span class="unit">${axis.info.unit}</span>${
+      !known && html` <${Mark} level=${live ? "warn" : "bad"}>${mark}<//>`
+    }</span>`;
 }
 
 /** How much the values are worth and how old they are. */

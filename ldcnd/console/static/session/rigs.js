@@ -9,8 +9,8 @@ const DESCRIBED_ANEW_MS = 1_050;
 const HOLDERS_EACH_MS = 1_000;
 const DRAWN_EACH_MS = 100;
 const SILENT_AFTER_S = 3;
-const OLD_AFTER_S = 1.5;
-const OLD_AFTER_PERIODS = 4;
+/** What is shown of an axis of which no condition came yet. */
+const NOTHING_KNOWN = { known: false, live: false, mark: "no data", state: "unknown", alarm: "invalid", troubles: [] };
 /** A drive reports its velocity in whole counts a servo tick: below this share of the limit, positions say it better. */
 const SLOW_SHARE = 0.1;
 /** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
@@ -26,6 +26,8 @@ export class Axis {
   monitors = {};
   trace = null;
   holder = null;
+  /** What a command for all axes was refused with here, in words; null when it was not. */
+  refusal = null;
   shadows = [];
   #positions = [];
   #motion = { key: null, sinceNs: 0 };
@@ -80,7 +82,7 @@ export class Axis {
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
-    if (sample) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
+    if (sample?.t) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
   }
 
   /** Age of a sample in seconds; null before the first. */
@@ -89,16 +91,20 @@ export class Axis {
     return arrived ? arrived.ageS + (performance.now() - arrived.atMs) / 1e3 : null;
   }
 
+  /** Whether its place is known and what is to be said of it, as the console process has decided; see `condition.py`. */
+  get condition() {
+    const told = this.samples.condition ?? NOTHING_KNOWN;
+    const { worth } = this.rig; // that nothing comes from the console process only the page can know
+    if (!worth || !told.live) return told;
+    return { ...told, known: false, live: false, mark: worth.word, state: `unknown, was ${told.state}` };
+  }
+
   /** How much the last values are worth now, in a word, and whether that needs attention. */
   get quality() {
-    const known = this.rig.worth;
-    if (known) return known;
+    const { live, mark } = this.condition;
+    if (!live) return { word: mark, level: "bad" };
     const sample = this.samples.position ?? this.samples.state;
-    if (!sample) return { word: "no data", level: "bad" };
-    const item = this.samples.position ? "position" : "state";
-    const rate = this.health?.rate_wanted_hz || 1;
-    if (this.ageS(item) > OLD_AFTER_S + OLD_AFTER_PERIODS / rate) return { word: "old", level: "bad" };
-    return { word: sample.quality, level: { good: "", uncertain: "warn" }[sample.quality] ?? "bad" };
+    return { word: sample?.quality ?? mark, level: { good: "", uncertain: "warn" }[sample?.quality] ?? "bad" };
   }
 
   #remember(sample) {
@@ -137,6 +143,16 @@ export class Bus {
   report(sample) {
     if (!sample) this.reports = [];
     else this.reports = [...this.reports, sample].slice(-REPORTS_KEPT);
+  }
+
+  /** Whether its drives are polled; null while that is not known. */
+  get up() {
+    return this.health?.up ?? this.info?.up ?? null;
+  }
+
+  /** Why it is not up, in a sentence. */
+  get problem() {
+    return `The line is not up${this.info?.problem ? `: ${this.info.problem}` : "."}`;
   }
 
   /** By how much a counter has grown within the reports kept, a minute. */

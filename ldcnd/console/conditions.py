@@ -1,0 +1,174 @@
+"""The condition of every axis of one rig, decided here and sent to pages as a value beside the daemon's own.
+
+A page shows it and has no rule of its own. A condition changes without a sample too: positions get old, a daemon falls
+silent. So it is decided again a few times a second, and goes to pages when it is another.
+"""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import msgpack
+
+from ldcnd.errors import LdcndError
+from ldcnd.messaging.codec import Encoding, decode_received
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.model.condition import Condition, Kind, Place, Severity, Trouble, assess
+from ldcnd.model.health import BusHealth
+from ldcnd.model.samples import FaultSample, PositionSample, StateSample, TelemetryItem
+from ldcnd.model.samples import Sample as Measured
+
+TOPIC = "condition"
+"""The last chunk of the key under which a page gets the condition of an axis; no daemon publishes it."""
+PERIOD_S = 0.25
+"""Time between two decisions, seconds."""
+SILENT_S = 3.0
+"""Time without any sample after which a daemon counts as silent, seconds."""
+LEVELS = {Severity.FINE: "", Severity.NOTICE: "warn", Severity.WRONG: "bad"}
+MeasuredT = TypeVar("MeasuredT", bound=Measured)
+_MODELS: dict[str, type[Measured]] = {
+    TelemetryItem.STATE: StateSample,
+    TelemetryItem.FAULT: FaultSample,
+    TelemetryItem.POSITION: PositionSample,
+}
+
+
+@dataclass(slots=True)
+class _Axis:
+    """What came of one axis, decoded when it is needed."""
+
+    state: Sample | None = None
+    fault: Sample | None = None
+    position: Sample | None = None
+    shown: bytes = b""
+
+
+class Conditions:
+    """The conditions of the axes of one rig.
+
+    Args:
+        rig: its name.
+        put: takes a sample for the pages.
+        now_s: a clock, in seconds.
+
+    Attributes:
+        silence: why nothing comes from the daemon, as the console knows it; empty while it is there.
+    """
+
+    def __init__(self, rig: str, put: Callable[[Sample], None], now_s: Callable[[], float]) -> None:
+        self.silence = ""
+        self._keys = Keys(rig)
+        self._telemetry = self._keys.telemetry("x", TelemetryItem.STATE).removesuffix(f"x/{TelemetryItem.STATE}")
+        self._put = put
+        self._now_s = now_s
+        self._axes: dict[str, _Axis] = {}
+        self._lines: dict[str, BusHealth] = {}
+        self._newest: tuple[int, float] = (0, 0.0)  # the daemon's clock, and when it was that late here
+        self._heard_at_s = now_s()
+
+    def take(self, sample: Sample) -> None:
+        """Take a published sample."""
+        self._heard_at_s = self._now_s()
+        if sample.key.startswith(self._telemetry):
+            name, _, item = sample.key[len(self._telemetry) :].partition("/")
+            if item in _MODELS:
+                axis = self._axes.setdefault(name, _Axis())
+                setattr(axis, item, sample if sample.kind is SampleKind.PUT else None)
+        elif sample.key.startswith(f"{self._keys.health}/") and sample.kind is SampleKind.PUT:
+            try:
+                report = decode_received(BusHealth, sample.payload, sample.encoding)
+            except LdcndError:
+                return  # of a daemon of another version
+            self._lines[report.bus] = report
+            self._note_clock(report.t)
+
+    def show_again(self) -> None:
+        """Send all of them once more: the pages' values were put in order."""
+        for axis in self._axes.values():
+            axis.shown = b""
+        self.show()
+
+    def show(self) -> None:
+        """Decide anew, and send what is another."""
+        silence = self.silence
+        silent_s = self._now_s() - self._heard_at_s
+        if not silence and silent_s > SILENT_S:
+            silence = "the daemon is silent: these are the last known values"
+        for name, axis in self._axes.items():
+            if axis.state is None and axis.position is None:
+                continue  # an I/O module
+            payload = msgpack.packb(self._condition(name, axis, silence))
+            if payload != axis.shown:
+                axis.shown = payload
+                key = f"{self._telemetry}{name}/{TOPIC}"
+                self._put(Sample(key, payload, Encoding.MSGPACK, SampleKind.PUT, measured_at_ns=None))
+
+    async def run(self) -> None:
+        """Decide until cancelled."""
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            self.show()
+
+    def _condition(self, name: str, axis: _Axis, silence: str) -> dict[str, object]:
+        state, fault = _decoded(axis.state, StateSample), _decoded(axis.fault, FaultSample)
+        position = _decoded(axis.position, PositionSample)
+        for sample in (state, position):
+            if sample:
+                self._note_clock(sample.t)
+        line = next((line for line in self._lines.values() if any(each.axis == name for each in line.axes)), None)
+        health = next((each for each in line.axes if each.axis == name), None) if line else None
+        condition = assess(
+            state,
+            fault,
+            health,
+            age_s=self._age_s(position.t) if position else None,
+            line_up=line is None or line.up,
+            silence=silence,
+        )
+        return as_payload(condition)
+
+    def _note_clock(self, t: int) -> None:
+        if t > self._newest[0]:
+            self._newest = (t, self._now_s())
+
+    def _age_s(self, t: int) -> float:
+        """Return how old an instant is by the daemon's own clock: that of this host may differ."""
+        newest, at_s = self._newest
+        return (newest - t) / 1e9 + self._now_s() - at_s
+
+
+def as_payload(condition: Condition) -> dict[str, object]:
+    """Return a condition as pages get it."""
+    return {
+        "place": condition.place.value,
+        "known": condition.place is Place.KNOWN,
+        "mark": condition.mark,
+        "state": condition.state,
+        "live": condition.live,
+        "alarm": condition.alarm.name.lower(),
+        "troubles": [_trouble(each) for each in condition.troubles],
+    }
+
+
+def _trouble(trouble: Trouble) -> dict[str, str]:
+    text = trouble.text
+    if trouble.kind in (Kind.FAULT, Kind.WARNING):
+        text = f"{trouble.short}: {text.partition(': ')[2]}"
+    text = f"{text[:1].upper()}{text[1:]}"
+    return {
+        "kind": trouble.kind.name.lower(),
+        "level": LEVELS[trouble.severity],
+        "text": text if text.endswith((".", "?", "!")) else f"{text}.",
+        "short": trouble.short,
+    }
+
+
+def _decoded(sample: Sample | None, model: type[MeasuredT]) -> MeasuredT | None:
+    if sample is None:
+        return None
+    try:
+        return decode_received(model, sample.payload, sample.encoding)
+    except LdcndError:
+        return None  # of a daemon of another version
