@@ -60,6 +60,12 @@ def list_axes(target: Target) -> None:
     A position in brackets does not say where the axis is; the words behind it say why.
     """
     axes = target.run(overview)
+    for now, line in zip(axes, table(axes), strict=True):
+        target.show(row(now), line)
+
+
+def table(axes: list[AxisNow]) -> list[str]:
+    """Return a line for each axis; a number that does not say where the axis is stands in brackets."""
     cells = [
         (
             now.info.axis,
@@ -67,23 +73,22 @@ def list_axes(target: Target) -> None:
             f"{now.info.bus}/{now.info.address}",
             now.condition.position(_digits(now), now.info.unit, now.age_s),
             now.condition.state,
-            f"moving {_row(now).moving}",
+            f"moving {row(now).moving}",
             f"link {now.state.link if now.state else 'unknown'}",
             ", ".join(now.condition.notes),
         )
         for now in axes
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for now, row in zip(axes, cells, strict=True):
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        target.show(_row(now), line.rstrip())
+    return ["  ".join(map(str.ljust, each, widths)).rstrip() for each in cells]
 
 
 def _digits(now: AxisNow) -> str | None:
     return f"{now.position.value:.{decimals(now.info)}f}" if now.position else None
 
 
-def _row(now: AxisNow) -> AxisRow:
+def row(now: AxisNow) -> AxisRow:
+    """Return an axis as `--json` has it."""
     state, position = now.state, now.position
     return AxisRow(
         **now.info.model_dump(),

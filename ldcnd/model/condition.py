@@ -248,6 +248,7 @@ _REFERENCE_LOST = Trouble(
     "reference lost",
 )
 _NOT_HOMED = Trouble(Kind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
+_HOMING = Trouble(Kind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
 _LATCHED = Trouble(Kind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
 _UNCOMMANDED = Trouble(Kind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
 _OVERRIDE_ZERO = Trouble(
@@ -256,7 +257,8 @@ _OVERRIDE_ZERO = Trouble(
 _MISSED_POLLS = Trouble(Kind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
 SHARED = frozenset({Kind.SILENCE, Kind.NOT_HOMED, Kind.STANDS_BY_OVERRIDE})
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
-_MARKS_OF_FAULTS = {"readings_contradict": "readings contradict", "drive_reset": "drive was reset"}
+_MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
+"""Faults whose name says best why the position is lost."""
 _AT_REST = frozenset({AxisState.DISABLED, AxisState.STANDSTILL, AxisState.ERROR_STOP})
 
 
@@ -342,15 +344,14 @@ def _is_old(age_s: float | None, health: AxisHealth | None) -> bool:
 def _place(state: State, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
-        codes = [fault.code for fault in faults.active] if faults else []
-        marks = [_MARKS_OF_FAULTS[code] for code in codes if code in _MARKS_OF_FAULTS]
-        return Place.CONTRADICTED, marks[0] if marks else "position lost"
+        codes = [fault.code for fault in faults.active if fault.code in _MARKING_FAULTS] if faults else []
+        return Place.CONTRADICTED, _words(codes[0]) if codes else "position lost"
     if is_old:
         return Place.OLD, _OLD.short
     if state.referenced or not state.has_reference:
         return Place.KNOWN, ""
     if state.state is AxisState.HOMING:
-        return Place.NOT_HOMED, "homing"
+        return Place.NOT_HOMED, _HOMING.short
     return Place.NOT_HOMED, _REFERENCE_LOST.short if state.reference_lost else _NOT_HOMED.short
 
 
@@ -363,9 +364,9 @@ def _found(state: State, faults: Faults | None, health: AxisHealth | None, place
         found.append(Trouble(Kind.ERROR_STOP, _WRONG, text, "error stop"))
     if place is Place.OLD:
         found.append(_OLD)
-    lacks_reference = state.has_reference and not state.referenced and state.state is not AxisState.HOMING
-    if lacks_reference:
-        found.append(_REFERENCE_LOST if state.reference_lost else _NOT_HOMED)
+    if state.has_reference and not state.referenced:
+        lost = _REFERENCE_LOST if state.reference_lost else _NOT_HOMED
+        found.append(_HOMING if state.state is AxisState.HOMING else lost)
     if state.stop_latched and not state.stop_pending:
         found.append(_LATCHED)
     if state.moving is Moving.YES and state.command is None and state.state in _AT_REST:
@@ -400,7 +401,11 @@ def _first_cause_first(faults: Faults) -> list[FaultEntry]:
 
 
 def _of_fault(entry: FaultEntry, kind: Kind, severity: Severity) -> Trouble:
-    return Trouble(kind, severity, f"{entry.code}: {entry.text}", entry.code.replace("_", " "))
+    return Trouble(kind, severity, f"{entry.code}: {entry.text}", _words(entry.code))
+
+
+def _words(code: str) -> str:
+    return code.replace("_", " ")
 
 
 def _slowness(health: AxisHealth) -> list[Trouble]:

@@ -29,13 +29,8 @@ def axis_cells(row: AxisGlance) -> tuple[str, ...]:
         UNKNOWN if row.age_s is None else f"{row.age_s:.1f} s",
         rate,
         row.holder or UNKNOWN,
-        _all_said(row),
+        row.trouble,
     )
-
-
-def _all_said(row: AxisGlance) -> str:
-    """Return the worst trouble in full, and what else there is in a few words each."""
-    return "; ".join((row.trouble, *row.condition[1:])) if row.condition else row.trouble
 
 
 def bus_cells(row: BusGlance) -> tuple[str, ...]:

@@ -138,7 +138,7 @@ class RigView:
             condition=condition.notes,
             cause=cause_of(worst, info.bus),
             shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, age_s),
-            shown_state=condition.state,
+            shown_state=condition.summary,
             velocity=velocity.value if velocity else None,
             target=state.command.target if state and state.command else None,
             adc_volts=adc.volts if adc else None,

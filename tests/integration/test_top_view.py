@@ -4,8 +4,8 @@ import asyncio
 from contextlib import asynccontextmanager
 
 from ldcnd.model.commands import Halt, MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, LinkState, Moving
 from ldcnd.model.condition import Severity
+from ldcnd.model.samples import AxisState, LinkState, Moving
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.top.columns import as_text, headline
 from ldcnd.top.follow import follow

@@ -2,9 +2,9 @@
 
 import pytest
 
+from ldcnd.model.condition import Severity, Trouble, assess, line_troubles
 from ldcnd.model.health import AxisHealth, ItemHealth
 from ldcnd.model.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
-from ldcnd.model.condition import Severity, Trouble, assess, line_troubles
 
 
 def state(**changes) -> StateSample:
@@ -45,7 +45,9 @@ def health(rate_hz: float, *, wanted_hz: float = 20.0, asked_hz: float | None = 
     )
 
 
-def troubles_of(state: StateSample | None, faults: FaultSample | None, health: AxisHealth | None) -> tuple[Trouble, ...]:
+def troubles_of(
+    state: StateSample | None, faults: FaultSample | None, health: AxisHealth | None
+) -> tuple[Trouble, ...]:
     return assess(state, faults, health).troubles
 
 

@@ -151,7 +151,7 @@ def check_referenced(axis: AxisTracker) -> None:
     if not axis.referenced:
         kept = f"; what was kept of it was refused: {axis.refused}" if axis.refused else ""
         raise NotReferenced(
-            f"axis {axis.name} is not referenced: its position means nothing{kept}",
+            f"axis {axis.name} is not homed: its position is not known{kept}",
             axis=axis.name,
             remedy=Remedy("{} or {}", step("home"), step("set_position", "set_position")),
         )

@@ -1,7 +1,7 @@
 """Commands of several axes, of a module or of the rig as a whole, and questions: what is not for one axis alone."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Protocol
@@ -35,6 +35,7 @@ from ldcnd.model.commands import (
     MoveAbsolute,
     Preview,
     ReportShadow,
+    Verb,
     Why,
     WhyReply,
 )
@@ -179,7 +180,12 @@ class RigCommands:
 
     def _why(self, axis: AxisService, request: Why) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that."""
-        return explain(axis.tracker, lambda: self._admit(axis.config.name, request.lease), absolute=request.absolute)
+        return explain(
+            axis.tracker,
+            lambda: self._admit(axis.config.name, request.lease),
+            axis.driver.capabilities,
+            absolute=request.absolute,
+        )
 
     def _own(self, axis: str, leases: tuple[str, ...]) -> str | None:
         """Return which of these leases is the one on an axis; None when another one is, or none."""
@@ -425,12 +431,22 @@ def _bus_of(rig: Rig, name: str) -> BusService:
     return next(bus for bus in rig.buses if any(axis.config.name == name for axis in bus.axes))
 
 
-def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) -> WhyReply:
+MOTIONS = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY, Verb.JOG, Verb.SET_PWM})
+"""Commands of which a drive that can be moved at all takes one at least."""
+OF_DRIVES = frozenset({*MOTIONS, Verb.POWER, Verb.HALT, Verb.HOME, Verb.SET_POSITION, Verb.RESET, Verb.SET_GAINS})
+"""Commands that only some drives take."""
+NO_COMMAND_HELPS = "the drive takes no command for that: use its own inputs and its own tool"
+
+
+def explain(
+    tracker: AxisTracker, admit: Callable[[], None], capabilities: Collection[Verb], *, absolute: bool
+) -> WhyReply:
     """Evaluate every guard for a motion.
 
     Args:
         tracker: what is known of the axis.
         admit: raises what the authority would refuse the sender with.
+        capabilities: the commands that its drive takes: no remedy names another one.
         absolute: whether the motion would name a position.
     """
     checks: list[Callable[[], None]] = [
@@ -439,22 +455,26 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         lambda: guards.check_not_latched(tracker),
         *(_fault(tracker.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
         lambda: guards.check_not_in_error(tracker),
-        lambda: guards.check_enabled(tracker),
-        lambda: guards.check_stands(tracker),
     ]
-    if absolute:
+    if MOTIONS.isdisjoint(capabilities):
+        checks.append(lambda: _refuse_motion(tracker.name))
+    else:
+        checks += [lambda: guards.check_enabled(tracker), lambda: guards.check_stands(tracker)]
+    if absolute and Verb.MOVE_ABSOLUTE in capabilities:
         checks.append(lambda: guards.check_referenced(tracker))
     causes = []
     for check in checks:
         try:
             check()
         except LdcndError as error:
+            steps = remedy_steps(error)
+            possible = all(each.verb in capabilities or each.verb not in OF_DRIVES for each in steps)
             causes.append(
                 Cause(
                     code=error.code.value,
                     text=error.message,
-                    remedy=error.remedy,
-                    steps=remedy_steps(error),
+                    remedy=error.remedy if possible else NO_COMMAND_HELPS,
+                    steps=steps if possible else (),
                     page=error.page,
                 )
             )
@@ -465,6 +485,10 @@ def explain(tracker: AxisTracker, admit: Callable[[], None], *, absolute: bool) 
         causes=tuple(causes),
         first_fault=f"{first.code}: {first.text}" if first else None,
     )
+
+
+def _refuse_motion(axis: str) -> None:
+    raise NotSupported(f"axis {axis}: its drive takes no motion over the line", axis=axis, remedy=NO_COMMAND_HELPS)
 
 
 def _fault(axis: str, fault: FaultEntry) -> Callable[[], None]:

@@ -1,0 +1,370 @@
+"""Every condition of an axis on every face: whatever shows a position says in words when it is not known.
+
+Each face gets the same samples by its own way in, and is read as its user reads it.
+"""
+
+import asyncio
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgpack
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+
+from ldcnd.cli import axis_state, fleet
+from ldcnd.client.axis import Axis
+from ldcnd.client.fleet import AxisReport, RigReport
+from ldcnd.client.overview import AxisNow
+from ldcnd.client.rig_client import RigClient
+from ldcnd.console.conditions import Conditions
+from ldcnd.messaging.codec import Encoding, encode
+from ldcnd.messaging.keys import Keys
+from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.metrics import HealthCollector
+from ldcnd.model.condition import Place, assess
+from ldcnd.model.frozen import Frozen
+from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, StopWaitHealth
+from ldcnd.model.meta import AxisInfo, AxisLimits, DaemonInfo
+from ldcnd.model.samples import (
+    AxisState,
+    FaultEntry,
+    FaultSample,
+    LinkState,
+    Moving,
+    PositionSample,
+    Quality,
+    StateSample,
+    TelemetryItem,
+)
+from ldcnd.ros2.bridge import ERROR, OK, STALE, WARN, Bridge
+from ldcnd.top.columns import as_text
+from ldcnd.top.rig_view import Description, RigView
+
+NOW_NS = 1_000_000_000_000
+NUMBER = 60.0
+KEYS = Keys("sim")
+INFO = AxisInfo(
+    axis="x", bus="line0", address=1, family="ldcn", model="ls-182ap", identity="LS-182AP", unit="mm",
+    counts_per_unit=1000.0, direction="forward", limits=AxisLimits(
+        position_min=None, position_max=None, velocity=None, acceleration=None), capabilities=(), items=(
+        "position", "state", "fault"), adc_full_scale=None,
+)  # fmt: skip
+
+
+def fault(code: str, *, stops: bool = True) -> FaultEntry:
+    return FaultEntry(code=code, text=f"meaning of {code}", since=0, source="daemon", stops=stops)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A condition: what is known, and what every face that knows it has to say.
+
+    Attributes:
+        name: as the reference has it.
+        state: what differs from an axis that stands, enabled and homed.
+        says: what stands on faces; `without` is said by those that know neither faults, nor the line, nor ages.
+        place: whether the position is known.
+    """
+
+    name: str
+    state: dict[str, object]
+    says: str
+    place: Place
+    faults: tuple[FaultEntry, ...] = ()
+    age_s: float = 0.0
+    line_up: bool = True
+    without: str | None = None
+
+
+DOWN = {"link": LinkState.DOWN, "moving": Moving.UNKNOWN, "referenced": False, "quality": Quality.BAD}
+LOST = {"quality": Quality.UNCERTAIN, "referenced": False, "reference_lost": True, "state": AxisState.ERROR_STOP}
+CASES = (
+    Case("well", {}, "", Place.KNOWN),
+    Case("not homed", {"referenced": False}, "not homed", Place.NOT_HOMED),
+    Case("reference lost", {"referenced": False, "reference_lost": True}, "reference lost", Place.NOT_HOMED),
+    Case("homing", {"referenced": False, "state": AxisState.HOMING, "moving": Moving.YES}, "homing", Place.NOT_HOMED),
+    Case("drive does not answer", DOWN, "no answer", Place.NOT_ANSWERING, (fault("link_lost"),)),
+    Case("line down", DOWN, "line down", Place.NOT_ANSWERING, line_up=False, without="no answer"),
+    Case("not identified", DOWN, "not identified", Place.NOT_ANSWERING, (fault("not_identified"),),
+         without="no answer"),
+    Case("old", {}, "old", Place.OLD, age_s=57.0, without=""),
+    Case("readings contradict", LOST, "readings contradict", Place.CONTRADICTED, (fault("readings_contradict"),),
+         without="position lost"),
+    Case("drive was reset", LOST, "drive reset", Place.CONTRADICTED, (fault("drive_reset"),),
+         without="position lost"),
+    Case("moves without a command", {"state": AxisState.DISABLED, "moving": Moving.YES}, "moves without a command",
+         Place.KNOWN),
+    Case("stop latched", {"stop_latched": True}, "stop latched", Place.KNOWN),
+    Case("stop pending", {"stop_latched": True, "stop_pending": True}, "stop NOT CONFIRMED by the drive", Place.KNOWN),
+    Case("stop pending, no answer", {**DOWN, "stop_pending": True}, "stop NOT CONFIRMED by the drive",
+         Place.NOT_ANSWERING),
+    Case("speed override 0 %", {"speed_override": 0.0}, "speed override 0 %", Place.KNOWN),
+    Case("speed override 30 %", {"speed_override": 30.0}, "speed override 30 %", Place.KNOWN),
+    Case("error stop", {"state": AxisState.ERROR_STOP, "last_error": "a jam"}, "error stop", Place.KNOWN),
+    Case("a fault", {"state": AxisState.ERROR_STOP}, "overheat", Place.KNOWN, (fault("overheat"),),
+         without="error stop"),
+    Case("missed polls", {"link": LinkState.DEGRADED, "quality": Quality.UNCERTAIN, "moving": Moving.UNKNOWN},
+         "missed polls", Place.KNOWN),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Known:
+    """The samples of a case."""
+
+    case: Case
+    state: StateSample
+    faults: FaultSample
+    position: PositionSample
+    line: BusHealth
+
+
+def known(case: Case) -> Known:
+    t, quality = NOW_NS - round(case.age_s * 1e9), case.state.get("quality", Quality.GOOD)
+    stamp = {"t": NOW_NS, "t_error_ns": 0, "seq": 1}
+    standing = StateSample(
+        **stamp, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=True, moving=Moving.NO,
+        link=LinkState.UP, stop_latched=False, command=None,
+    )  # fmt: skip
+    axis = AxisHealth(axis="x", link=LinkState.UP, sample_age_s=0.0, rate_wanted_hz=20, rate_hz=20, faults=0)
+    line = BusHealth(
+        t=NOW_NS, seq=1, bus="line0", up=case.line_up, utilisation=0.1, exchanges=1, timeouts=0, corrupt_replies=0,
+        rejected_packets=0, resent=0, resynchronisations=0, stray_bytes=0, losses=0, lanes=(),
+        stop_wait=StopWaitHealth(bound_s=None, probes=0, p99_s=0, longest_s=0), axes=(axis,),
+    )  # fmt: skip
+    return Known(
+        case,
+        standing.model_copy(update=case.state),
+        FaultSample(**stamp, quality=quality, active=case.faults, first=case.faults[0] if case.faults else None),
+        PositionSample(
+            **{**stamp, "t": t}, quality=quality, value=NUMBER, unit="mm", counts=60_000, following_error=0.0
+        ),
+        line,
+    )
+
+
+def put(key: str, model: Frozen) -> Sample:
+    payload, encoding = encode(model, Encoding.MSGPACK)
+    return Sample(key, payload, encoding, SampleKind.PUT, None)
+
+
+def published(at: Known) -> list[Sample]:
+    tele = KEYS.telemetry
+    return [
+        put(tele("x", TelemetryItem.STATE), at.state),
+        put(tele("x", TelemetryItem.FAULT), at.faults),
+        put(tele("x", TelemetryItem.POSITION), at.position),
+        put(KEYS.bus_health("line0"), at.line),
+    ]
+
+
+def axis_now(at: Known) -> AxisNow:
+    health = at.line.axes[0]
+    condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up)
+    return AxisNow(INFO, at.state, at.position, at.case.age_s, health, condition)
+
+
+def axis_list(at: Known) -> str:
+    return axis_state.table([axis_now(at)])[0]
+
+
+def axis_list_json(at: Known) -> str:
+    row = json.loads(axis_state.row(axis_now(at)).model_dump_json())
+    assert {"position", "quality", "age_s", "state", "referenced", "link", "moving"} <= row.keys()
+    return " ".join((row["place"], row["state"], *row["condition"]))
+
+
+def axis_watch(at: Known) -> str:
+    watched = axis_state.Watched()
+    watched.begin(axis_now(at))
+    watched.text("x", at.faults)
+    return f"{watched.text('x', at.position)}\n{watched.text('x', at.state)}"
+
+
+def top(at: Known) -> str:
+    view = RigView("sim", 0.0)
+    for sample in published(at):
+        view.take(sample, 100.0 - (at.case.age_s if sample.key.endswith("position") else 0.0))
+    view.take(put(KEYS.health, DaemonHealth(t=NOW_NS, seq=0, loop_lag_s=0, published=0, missed_reports=0)), 100.0)
+    view.describe(Description(DAEMON, (INFO,), {"x": "scan"}))
+    return "\n".join(as_text(view.glance(100.0))[2:4])
+
+
+DAEMON = DaemonInfo.model_construct(rig="sim", version="1", instance="a", buses=("line0",))
+
+
+def fleet_table(at: Known) -> str:
+    report = AxisReport(info=INFO, state=at.state, fault=at.faults, health=at.line.axes[0], line_up=at.case.line_up)
+    return "\n".join(fleet.table(RigReport(rig="sim", instance="a", daemon=None, health=None, axes=(report,))))
+
+
+def metrics(at: Known) -> str:
+    collector = HealthCollector("sim", lambda: 100.0)
+    collector.take(at.line)
+    collector.take_state("x", at.state)
+    collector.take_state("x", at.faults)
+    registry = CollectorRegistry()
+    registry.register(collector)
+    return generate_latest(registry).decode()
+
+
+def ros2(at: Known) -> str:
+    bridge = Bridge("sim", {"x": INFO})
+    bridge.take("x", at.state)
+    bridge.take("x", at.faults)
+    (status,) = bridge.diagnostics(NOW_NS).statuses
+    return f"{status.message} {status.values}"
+
+
+def client_of(at: Known) -> Axis:
+    broker, loop = MemoryBroker(), asyncio.new_event_loop()
+    try:
+        axis = Axis("x", RigClient(broker.session(), "sim"), loop)
+    finally:
+        loop.close()
+    for take, model in ((axis._take_state, at.state), (axis._take_position, at.position)):
+        take(put("x", model))
+    return axis
+
+
+def python_repr(at: Known) -> str:
+    return f"{client_of(at)!r}"
+
+
+def notebook(at: Known) -> str:
+    return client_of(at)._repr_html_()
+
+
+def bluesky(at: Known) -> str:
+    values = pytest.importorskip("ldcnd.bluesky.values")
+    read = values.reading(at.position.value, 0.0, Quality.GOOD, assess(at.state))
+    return str(read)
+
+
+def epics(at: Known) -> str:
+    motor = pytest.importorskip("ldcnd.epics.motor")
+
+    async def shown() -> str:
+        record = motor.MotorRecord(INFO, (1.0, 1.0), None, None, frozenset, moves=False)
+        for sample in (at.faults, at.position, at.state):
+            await record.take(sample)
+        said = record.fields["x:condition"].value
+        return f"{record['SEVR'].value} {record['RBV'].alarm.severity.name} {said}"
+
+    return asyncio.run(shown())
+
+
+def console(at: Known) -> str:
+    sent: list[Sample] = []
+    conditions = Conditions("sim", sent.append, lambda: 100.0)
+    for sample in published(at):
+        conditions.take(sample)
+    conditions.show()
+    told = msgpack.unpackb(sent[-1].payload)
+    return " ".join((told["mark"], told["state"], *(each["short"] for each in told["troubles"])))
+
+
+ALL_KNOWN = (axis_list, axis_list_json, top, console)
+"""Faces that know faults, lines and ages."""
+NO_AGE = (fleet_table, metrics)
+"""Those that know faults and lines."""
+FAULTS_ONLY = (axis_watch, ros2, epics)
+"""Those that know faults."""
+STATE_ONLY = (python_repr, notebook, bluesky)
+"""Those that know the state alone."""
+FACES = (*ALL_KNOWN, *NO_AGE, *FAULTS_ONLY, *STATE_ONLY)
+
+
+def wanted(case: Case, face: object) -> str:
+    """Return what a face has to say of a case."""
+    if face is bluesky and not assess(known(case).state).alarm:
+        return ""  # a reading has a message where it has an alarm
+    if case.without is None or face in ALL_KNOWN:
+        return case.says
+    knows = case.name != "old" and (face in NO_AGE or (face in FAULTS_ONLY and case.name != "line down"))
+    return case.says if knows else case.without
+
+
+@pytest.mark.parametrize("face", FACES, ids=lambda face: face.__name__)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_face_says_every_condition(case, face, record_property):
+    record_property("cells", len(CASES) * len(FACES))
+    told = face(known(case))
+
+    assert wanted(case, face) in told
+    if face is not bluesky and case.name == "well":
+        for other in CASES:
+            assert not other.says or f" {other.says}" not in told.replace("s old", "")
+
+
+NUMBERS = {axis_list: "60.000", axis_watch: "60.0000", top: "60.000", python_repr: "60.0000", notebook: "60.0000"}
+
+
+@pytest.mark.parametrize("face", NUMBERS, ids=lambda face: face.__name__)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_number_that_does_not_say_where_the_axis_is_stands_in_brackets_with_words(case, face):
+    told, digits = face(known(case)), NUMBERS[face]
+    is_known = case.place is Place.KNOWN or not wanted(case, face)
+
+    assert (f"({digits})" in told) is not is_known
+    assert digits in told
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_joint_state_leaves_out_a_place_that_is_not_known(case):
+    at, bridge = known(case), Bridge("sim", {"x": INFO})
+    bridge.take("x", at.state)
+    bridge.take("x", at.faults)
+
+    joint = bridge.take("x", at.position)
+
+    assert (joint is not None) is (case.place in (Place.KNOWN, Place.OLD))
+
+
+LEVELS = {Place.KNOWN: {OK, WARN, ERROR}, Place.NOT_HOMED: {WARN, ERROR}}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_alarm_systems_get_no_ok_of_an_axis_whose_place_is_not_known(case):
+    at = known(case)
+    condition = axis_now(at).condition
+    bridge = Bridge("sim", {"x": INFO})
+    bridge.take("x", at.state)
+    bridge.take("x", at.faults)
+
+    assert condition.place is case.place
+    assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %"))
+    if case.place is not Place.KNOWN and case.name != "old":
+        assert bridge.diagnostics(NOW_NS).statuses[0].level in {WARN, ERROR}
+        assert not epics(at).startswith("NO_ALARM")
+        assert 'ldcnd_axis_place_known{axis="x",rig="sim"} 0.0' in metrics(at)
+
+
+def test_a_daemon_that_is_silent_leaves_nothing_to_be_believed():
+    at = known(CASES[0])
+    condition = assess(at.state, at.faults, silence="the daemon is silent")
+    bridge = Bridge("sim", {"x": INFO})
+    bridge.take("x", at.state)
+
+    assert (condition.place, condition.live) == (Place.NOT_ANSWERING, False)
+    assert condition.position("60.000", "mm", 7.0) == "(60.000) mm daemon silent, 7 s old"
+    assert bridge.diagnostics(NOW_NS + 60 * 10**9).statuses[0].level == STALE
+
+
+def reference() -> str:
+    """Return the table of the reference."""
+    lines = ["| condition | place | beside the number | values believed | alarm | said |", "|---|---|---|---|---|---|"]
+    for case in CASES:
+        now = axis_now(known(case)).condition
+        live = "yes" if now.live else "no"
+        cells = (case.name, now.place.value, now.mark, live, now.alarm.name.lower(), ", ".join(now.notes))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def test_the_reference_has_this_table():
+    page = Path(__file__).parents[2] / "docs" / "reference" / "conditions.md"
+
+    assert reference() in page.read_text(encoding="utf-8")
