@@ -364,7 +364,7 @@ def _found(state: State, faults: Faults | None, health: AxisHealth | None, place
         found.append(Trouble(Kind.ERROR_STOP, _WRONG, text, "error stop"))
     if place is Place.OLD:
         found.append(_OLD)
-    if state.has_reference and not state.referenced:
+    if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause
         lost = _REFERENCE_LOST if state.reference_lost else _NOT_HOMED
         found.append(_HOMING if state.state is AxisState.HOMING else lost)
     if state.stop_latched and not state.stop_pending:

@@ -128,7 +128,7 @@ function AxisRow({ axis }) {
       state?.stop_pending
         ? html` <${Mark} level="bad">stop NOT confirmed<//>`
         : state?.stop_latched && html` <${Mark} level="warn">stop latched<//>`
-    }${axis.refusal && html` <${Mark} level="bad">${axis.refusal}<//>`}`)}
+    }`)}
     ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} />`, "number main")}
     ${cell("Velocity", html`${number(live ? axis.velocity : null, Math.min(decimals, 2))} <span class="unit">${info.unit}/s</span>`, "number")}
     ${cell("Target", number(live ? state?.command?.target : null, decimals), "number")}
@@ -138,7 +138,10 @@ function AxisRow({ axis }) {
       <small>${number(health?.rate_hz, 1)} of ${number(health?.rate_wanted_hz, 1)} Hz</small>`)}
     ${cell("Control", html`<${HolderWord} axis=${axis} />`)}
     ${cell("Commands", html`<${AxisCommands} axis=${axis} />`, "commands")}
-  </tr>`;
+  </tr>${
+    axis.refusal &&
+    html`<tr role="row" class="refusal"><td role="cell" colspan=${COLUMNS.length}><${Mark} level="bad">${axis.name}: ${axis.refusal}<//></td></tr>`
+  }`;
 }
 
 /** What can be asked of one axis without leaving the page; why not is in the title and read to screen readers. */
