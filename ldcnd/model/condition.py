@@ -331,9 +331,9 @@ def _unreachable(state: State, faults: Faults | None, *, silence: str, line_up: 
         return _silent(silence)
     if faults and any(fault.code == "not_identified" for fault in faults.active):
         return _NOT_IDENTIFIED
-    if not line_up:
-        return _ON_DEAD_LINE
-    return _NO_ANSWER if state.link is LinkState.DOWN else None
+    if state.link is not LinkState.DOWN:
+        return None  # a report on its line may be a second older than this
+    return _NO_ANSWER if line_up else _ON_DEAD_LINE
 
 
 def _is_old(age_s: float | None, health: AxisHealth | None) -> bool:

@@ -117,7 +117,7 @@ async def test_the_record_has_the_fields_that_clients_use():
         beside = {name.partition(":x:")[2] for name in made.variables if ":x:" in name}
 
     assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
-    assert beside == {"adc", "control", "faults", "first_fault", "inputs", "message", "state", "velocity"}
+    assert beside == {"adc", "condition", "control", "faults", "first_fault", "inputs", "message", "state", "velocity"}
 
 
 async def test_a_jog_runs_until_it_is_released():

@@ -11,6 +11,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.errors import AxisUnreachable, LeaseHeld, NotIdentified, OutcomeUnknown, WrongState
 from ldcnd.model.commands import Halt, MoveVelocity, Power, Reset, SetGains, SetOutputs, Stop, Why
+from ldcnd.model.condition import assess
 from ldcnd.model.leases import Acquire
 from ldcnd.model.rig_commands import SetIo, SetIoTimer
 from ldcnd.model.samples import AxisState, LinkState, Moving
@@ -92,11 +93,13 @@ async def test_a_line_that_is_down_takes_no_motion_after_a_stop_and_a_reset():
         with pytest.raises(NotIdentified):
             await rig.client.command("x", MoveVelocity(velocity=5000.0))
         why = await rig.client.ask(Why(), "x")
-        state = await rig.client.state("x")
+        state, told = await rig.client.state("x"), (await rig.client.faults())["x"]
 
         assert not taken(rig)
         assert drive(chain, 1).shaft.position_counts == pytest.approx(0.0, abs=2)
         assert (state.link, state.moving) == (LinkState.DOWN, Moving.UNKNOWN)
+        assert "not_identified" in {fault.code for fault in told.active}
+        assert assess(state, told).mark == "not identified"
         assert "not_identified" in {cause.code for cause in why.causes}
         assert any("PIC-SERVO version 4" in cause.text for cause in why.causes)
 
