@@ -257,6 +257,15 @@ def test_a_counter_that_is_set_back_in_mid_motion_has_jumped_also_where_the_axis
     assert axis.judged.step is Step.JUMPED
 
 
+def test_a_false_velocity_that_would_explain_a_jump_does_not_hide_it():
+    axis = Axis()
+
+    verdicts = [axis.read(at(40_000, velocity), standing=False) for velocity in (30e6, *[0.0] * (ROUNDS - 1))]
+
+    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.BELIEVED]
+    assert axis.judged.step is Step.JUMPED
+
+
 @pytest.mark.parametrize("off", [-20_000, -2500, -700, 700, 2500, 20_000])
 def test_one_false_reply_in_mid_motion_is_no_jump(off: int):
     speed = 50_000.0

@@ -189,7 +189,8 @@ class PlausibilityGate:
             self._sure = True
             return self._believe(reading, timing)
         if agrees:
-            self._agreeing += 1
+            # a false velocity in the reading before explains any way; the true one in this reading does not
+            self._agreeing, self._far = self._agreeing + 1, self._far or fit is _Fit.FAR
         else:
             self._agreeing, self._far = 1, fit is _Fit.FAR
         # late replies of another drive agree as well
