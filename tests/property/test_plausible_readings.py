@@ -111,7 +111,7 @@ class Story:
         speed = abs(one.shaft.velocity_counts) / one.profile.servo_cycle_s
         self.fastest = max(self.fastest, speed, self.speed * COUNTS)
         tick_s = one.profile.servo_cycle_s * self.divisor
-        gap_s = 1 / self.rate_hz + LATE_S
+        gap_s = 1 / self.rate_hz + LATE_S + 2 * tick_s
         self.tolerance = NOISE + EL / 8 + (self.fastest + 1 / tick_s) * gap_s
         if not one.loop.servo_on:
             self.open_at_s = now_s
@@ -245,7 +245,7 @@ class Story:
             # on a line that loses replies it may have been out of reach, which costs the reference as well
             if not self.faults and not codes & {"position_jump", "drive_reset", "readings_contradict"}:
                 self.flaws.append(f"no fault after its counter was set: {codes}")
-            if not self.stops and not was_stopped and drive(self.chain, 1).loop.servo_on:
+            if not (self.stops or was_stopped or self.faults) and drive(self.chain, 1).loop.servo_on:
                 self.flaws.append("not stopped after its counter was set")
         if deed == "nothing" and self.divisor <= STABLE and not self.faults and codes:
             self.flaws.append(f"{codes} though nothing was wrong")
