@@ -136,7 +136,7 @@ async def test_a_halt_withdraws_what_waits():
 
         ended = await outcome(rig, waiting.command_id)
         assert ended.status is CommandStatus.ABORTED
-        assert "before it began" in (ended.reason or "")
+        assert "overtaken by halt" in (ended.reason or "")
         assert await position_of(rig) == pytest.approx(halted_at, abs=0.0011)
 
 
