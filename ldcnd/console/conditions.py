@@ -76,6 +76,8 @@ class Conditions:
             if item in _MODELS:
                 axis = self._axes.setdefault(name, _Axis())
                 setattr(axis, item, sample if sample.kind is SampleKind.PUT else None)
+                if item != TelemetryItem.POSITION:
+                    self._show(name, axis, self._silence)  # with it on one frame: a page shows no mixture
         elif sample.key.startswith(f"{self._keys.health}/") and sample.kind is SampleKind.PUT:
             try:
                 report = decode_received(BusHealth, sample.payload, sample.encoding)
@@ -92,18 +94,23 @@ class Conditions:
 
     def show(self) -> None:
         """Decide anew, and send what is another."""
-        silence = self.silence
-        silent_s = self._now_s() - self._heard_at_s
-        if not silence and silent_s > SILENT_S:
-            silence = "the daemon is silent: these are the last known values"
         for name, axis in self._axes.items():
-            if axis.state is None and axis.position is None:
-                continue  # an I/O module
-            payload = msgpack.packb(self._condition(name, axis, silence))
-            if payload != axis.shown:
-                axis.shown = payload
-                key = f"{self._telemetry}{name}/{TOPIC}"
-                self._put(Sample(key, payload, Encoding.MSGPACK, SampleKind.PUT, measured_at_ns=None))
+            self._show(name, axis, self._silence)
+
+    @property
+    def _silence(self) -> str:
+        if self.silence or self._now_s() - self._heard_at_s <= SILENT_S:
+            return self.silence
+        return "the daemon is silent: these are the last known values"
+
+    def _show(self, name: str, axis: _Axis, silence: str) -> None:
+        if axis.state is None and axis.position is None:
+            return  # an I/O module
+        payload = msgpack.packb(self._condition(name, axis, silence))
+        if payload != axis.shown:
+            axis.shown = payload
+            key = f"{self._telemetry}{name}/{TOPIC}"
+            self._put(Sample(key, payload, Encoding.MSGPACK, SampleKind.PUT, measured_at_ns=None))
 
     async def run(self) -> None:
         """Decide until cancelled."""
