@@ -27,6 +27,7 @@ class ErrorCode(StrEnum):
     NETWORK_MISMATCH = "network_mismatch"
     # the drive
     DRIVE_FAULT = "drive_fault"
+    TRACE_TIMED_OUT = "trace_timed_out"
     ADDRESS_ERROR = "address_error"
     DATA_ERROR = "data_error"
     BYTE_COUNT_ERROR = "byte_count_error"
@@ -254,6 +255,13 @@ class DriveFault(LdcndError):
     def page(self) -> str | None:
         """The page of the fault that `value` names, or that of the error."""
         return (page_of(self.value) if isinstance(self.value, str) else None) or super().page
+
+
+class TraceTimedOut(DriveFault):
+    """The trigger of a trace did not come, or its samples did not, in the time allowed."""
+
+    code = ErrorCode.TRACE_TIMED_OUT
+    way_out = "look whether the channel reaches the level of the trigger, or wait longer for it"
 
 
 class AddressRefused(DriveFault):

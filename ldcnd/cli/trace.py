@@ -51,7 +51,7 @@ def _trigger(_context: click.Context, _parameter: click.Parameter, value: str | 
     channel, _, rest = value.partition(":")
     kind, _, level = rest.partition(":")
     try:
-        return TraceTrigger(channel=channel, kind=TriggerKind(kind), level=read_number(level or "0"))
+        return TraceTrigger(channel=channel, kind=TriggerKind(kind), level=read_number(level) if level else None)
     except ValueError:
         kinds = ", ".join(TriggerKind)
         raise click.BadParameter(f"{value!r} is not CHANNEL:KIND:LEVEL with one of {kinds}") from None
@@ -200,7 +200,8 @@ def _summary(trace: Trace) -> list[str]:
     ]
     if header.trigger and header.trigger_index is not None:
         trigger = header.trigger
-        lines.append(f"trigger at sample {header.trigger_index}: {trigger.channel} {trigger.kind} {trigger.level:g}")
+        level = "" if trigger.level is None else f" {trigger.level:g}"
+        lines.append(f"trigger at sample {header.trigger_index}: {trigger.channel} {trigger.kind}{level}")
     if header.trigger_late_s:
         lines.append(f"the condition was met at most {header.trigger_late_s * 1e3:.1f} ms before")
     lines += [_extremes(channel, column) for channel, column in zip(header.channels, trace.values, strict=True)]
@@ -242,7 +243,7 @@ def plot_trace(trace: Trace, path: Path) -> None:
         if header.trigger_index is not None:
             axes.axvline(0.0, color="tab:red", linewidth=0.8)
         if header.trigger and header.trigger.channel == channel.name and not signal:
-            axes.axhline(header.trigger.level, color="tab:red", linewidth=0.8, linestyle=":")
+            axes.axhline(header.trigger.level or 0.0, color="tab:red", linewidth=0.8, linestyle=":")
     rows[-1].set_xlabel("ms")
     figure.suptitle(f"{header.axis}, trace {header.trace_id}" + (f"\n{header.problem}" if header.problem else ""))
     save_figure(figure, path)

@@ -57,13 +57,17 @@ async def plan_transfer(
 
 async def carry_out(client: RigClient, axis: str, plan: PlannedParameters, progress: Progress) -> Transfer:
     """Send the writes of a plan one by one; stop at the first that fails. Planning again completes it."""
-    remarks: list[str] = []
+    last: dict[str, tuple[str, ...]] = {}  # of each parameter only what is true after its last write
     for place, write in enumerate(plan.writes):
         progress(place, write)
         request = WriteParameter(parameter=write.parameter, value=write.value, memory=write.memory)
         try:
             reply = await client.command(axis, request)
         except LdcndError as error:
-            return Transfer(plan.writes[:place], (write, error), plan.writes[place + 1 :], tuple(remarks))
-        remarks += reply.remarks
-    return Transfer(plan.writes, remarks=tuple(dict.fromkeys(remarks)))
+            return Transfer(plan.writes[:place], (write, error), plan.writes[place + 1 :], _all_of(last))
+        last[write.parameter] = reply.remarks
+    return Transfer(plan.writes, remarks=_all_of(last))
+
+
+def _all_of(remarks: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(each for said in remarks.values() for each in said))

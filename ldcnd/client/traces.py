@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ldcnd.client.notebook import panes
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, WrongState, step
+from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, TraceTimedOut, WrongState, step
 from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 CHECK_PERIOD_S = 0.1
@@ -143,7 +143,8 @@ async def fetch_trace(client: RigClient, axis: str, trace_id: str | None = None)
             remedy=Remedy("wait for its end, or {}", step("trace_abort")),
         )
     if header.phase is not TracePhase.COMPLETE:
-        raise DriveFault(
+        failed = TraceTimedOut if header.phase is TracePhase.TIMED_OUT else DriveFault
+        raise failed(
             f"axis {axis}: trace {header.trace_id} is {header.phase.value}: {header.problem or 'it has no samples'}",
             axis=axis,
             value=header.phase.value,

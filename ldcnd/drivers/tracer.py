@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ldcnd.errors import DriveFault
+from ldcnd.errors import ValueOutOfRange
 from ldcnd.model.traces import (
     DriveTraceInfo,
     TakeTrace,
@@ -19,10 +19,6 @@ SIGNAL_LEVEL = 0.5
 """Between the two values of a signal."""
 Progress = Callable[[TracePhase, float | None], None]
 """Called with each new phase of a trace, and while its memory is read with the share that has been; does not wait."""
-
-
-class TraceTimedOut(DriveFault):
-    """The trigger did not come, or the samples did not, in the time allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +69,27 @@ class Recorded:
     problems: tuple[str, ...] = ()
 
 
+def level_of(trigger: TraceTrigger) -> float:
+    """Return the level of a trigger on what is no signal.
+
+    Raises:
+        ValueOutOfRange: it has none.
+    """
+    if trigger.level is None:
+        raise ValueOutOfRange(
+            f"a trigger on {trigger.channel!r} needs a level, in the unit of the channel",
+            value=trigger.channel,
+            remedy="give one: only a signal, which is 0 or 1, needs none",
+        )
+    return trigger.level
+
+
 class TriggerWatch:
     """Decides at which sample of the watched channel a trace by the host is triggered."""
 
     def __init__(self, trigger: TraceTrigger, *, signal: bool) -> None:
         self._kind = trigger.kind
-        self._level = SIGNAL_LEVEL if signal else trigger.level
+        self._level = SIGNAL_LEVEL if signal else level_of(trigger)
         self._before: float | None = None  # of the last sample that had a value
 
     def fires(self, value: float | None, *, ready: bool) -> bool:

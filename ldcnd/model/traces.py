@@ -48,8 +48,8 @@ class TraceTrigger(Frozen):
     """One of the recorded channels."""
     kind: TriggerKind
     """When it fires."""
-    level: float = 0.0
-    """In the channel's unit; not used for signals."""
+    level: float | None = None
+    """In the channel's unit; every channel but a signal needs one."""
 
 
 class TracePhase(StrEnum):

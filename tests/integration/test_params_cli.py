@@ -31,11 +31,13 @@ def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path, monkeypa
         without_type = rig.run(f"params restore feed {some} --yes")
         restored = rig.run(f"params restore feed {some} --yes --any-type")
         cloned = rig.run("params clone feed spool --dry-run")
+        beyond = rig.run("params set feed Pn102 5000")
         listed = rig.run("params list feed")
         kept = saved.read_text()
         again = rig.run(f"params dump feed {saved}")
         kept_still = saved.read_text() == kept
         forced = rig.run(f"params dump feed {saved} --force")
+        stored = rig.run("params set feed Pn102 55 --eeprom")
 
     assert "\\n" not in cloned.printed + listed.printed
     assert (again.code, "already" in again.errors, kept_still, forced.code) == (2, True, True, 0)
@@ -44,9 +46,12 @@ def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path, monkeypa
     assert (same.code, same.printed, same.errors) == (0, "", "")
     assert (without_type.code, "type" in without_type.printed) == (1, True)
     assert (cloned.code, "Pn102 EEPROM 40 (0028H) -> 56 (0038H)" in cloned.printed) == (0, True)
+    assert "at the next power-on" not in restored.errors + restored.printed
+    assert (beyond.code, "it takes 1 to 2000" in beyond.errors) == (1, True)
+    assert "RAM 56, EEPROM 55: at the next power-on 55 is used" in stored.errors
     assert (refused.code, "[data_error]" in refused.errors) == (1, True)
     assert (restored.code, "read back: the drive holds the values" in restored.printed) == (0, True)
-    assert '"Pn102": 2' in (tmp_path / "eeprom-writes.json").read_text()
+    assert '"Pn102": 3' in (tmp_path / "eeprom-writes.json").read_text()
 
 
 CHANGED = {each: each.limits.value.lowest + 7 if each.limits else 0x0011 for each in PARAMETERS if each is not PN000}

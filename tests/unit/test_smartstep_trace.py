@@ -17,7 +17,6 @@ from ldcnd.drivers.smartstep.profiles import (
     Verification,
 )
 from ldcnd.drivers.smartstep.trace_upload import TraceUpload
-from ldcnd.drivers.tracer import TraceTimedOut
 from ldcnd.errors import (
     BadReply,
     BusError,
@@ -25,6 +24,7 @@ from ldcnd.errors import (
     DriveFault,
     NotSupported,
     OutcomeUnknown,
+    TraceTimedOut,
     ValueOutOfRange,
     WrongState,
 )
@@ -394,7 +394,7 @@ async def test_either_edge_of_a_value_is_refused_because_the_drive_would_take_an
 async def test_a_change_of_a_value_triggers_by_both_edges():
     unit = running(pulses=0.0)
     async with smartstep_line([unit], profile=TRIGGERED) as line:
-        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.CHANGE)
+        trigger = TraceTrigger(channel="speed_feedback", kind=TriggerKind.CHANGE, level=0.0)
         armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), trigger=trigger))
         await asyncio.sleep(1.0)
         unit.drive.set_pulse_rate(100.0, asyncio.get_running_loop().time())

@@ -20,10 +20,9 @@ from ldcnd.drivers.tracer import (
     Progress,
     Recorded,
     Tracer,
-    TraceTimedOut,
     TriggerWatch,
 )
-from ldcnd.errors import BusDown, BusError, ValueOutOfRange
+from ldcnd.errors import BusDown, BusError, TraceTimedOut, ValueOutOfRange
 from ldcnd.exchange import Exchange, Timing
 from ldcnd.model.samples import TelemetryItem
 from ldcnd.model.traces import TakeTrace, TraceChannel, TracePhase, TraceSource, TraceTrigger

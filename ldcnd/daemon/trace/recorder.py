@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.drivers.tracer import ArmedTrace, Recorded, Tracer, TraceTimedOut
+from ldcnd.drivers.tracer import ArmedTrace, Recorded, Tracer
 from ldcnd.errors import (
     BusyTracing,
     InternalError,
@@ -17,6 +17,7 @@ from ldcnd.errors import (
     NotSupported,
     OutcomeUnknown,
     Remedy,
+    TraceTimedOut,
     ValueOutOfRange,
     WrongState,
     step,

@@ -44,6 +44,7 @@ from ldcnd.errors import (
     BusBusy,
     BusDown,
     BusError,
+    DataRefused,
     DriveFault,
     NotSupported,
     OutcomeUnknown,
@@ -192,6 +193,8 @@ class UnitParameters(ParameterAccess):
         parameter = self._find(request.parameter, unlisted=request.unlisted)
         try:
             written = await self._write(parameter, request)
+        except DataRefused as refused:
+            raise _out_of_range(self._axis, parameter, request.value, refused) from refused
         except BusError:
             self._may_have_written(parameter.label, request.value, request.memory)
             raise
@@ -411,6 +414,22 @@ def parameter_info(parameter: Parameter) -> ParameterInfo:
         ),
         power_cycle=parameter.power_cycle.value if parameter.power_cycle else None,
         confidence=facts[0].confidence.value if facts else None,
+    )
+
+
+def _out_of_range(axis: str, parameter: Parameter, value: int, refused: DataRefused) -> DataRefused:
+    """Return a drive's refusal of a value with the range that is known; the drive alone decides."""
+    known = parameter.limits.value if parameter.limits else None
+    if known is None or known.lowest <= value <= known.highest:
+        return refused
+    nearest = known.lowest if value < known.lowest else known.highest
+    return DataRefused(
+        f"axis {axis}: {parameter.label} {value}: the drive refuses it; it takes {known.lowest} to {known.highest}",
+        axis=axis,
+        value=value,
+        limit=nearest,
+        nearest=nearest,
+        remedy=f"write {known.lowest} to {known.highest}",
     )
 
 

@@ -82,10 +82,17 @@ from ldcnd.drivers.tracer import (
     Progress,
     Recorded,
     Tracer,
-    TraceTimedOut,
     TriggerWatch,
 )
-from ldcnd.errors import AddressRefused, DriveFault, LdcndError, NotSupported, ReplyTimeout, ValueOutOfRange
+from ldcnd.errors import (
+    AddressRefused,
+    DriveFault,
+    LdcndError,
+    NotSupported,
+    ReplyTimeout,
+    TraceTimedOut,
+    ValueOutOfRange,
+)
 from ldcnd.log import get_logger
 from ldcnd.model.traces import DriveTraceInfo, TakeTrace, TracePhase, TraceSource, TraceTrigger
 
@@ -240,7 +247,7 @@ class SmartStepTracer(Tracer):
                 value=request.pre_trigger,
                 limit=0,
                 nearest=0,
-                remedy="leave pre_trigger out, or find the trigger bits with `ldcnd doctor trigger-bits`",
+                remedy="leave pre_trigger out, or find them: `ldcnd doctor trigger-bits --help`",
             )
         least_s, most_s = period_s(SHORTEST_INTERVAL, 1), period_s(LONGEST_INTERVAL, LARGEST_CYCLEC_US)
         if interval_s != "fastest" and not least_s / 2 <= interval_s <= most_s:

@@ -34,7 +34,7 @@ from ldcnd.drivers.smartstep.trace_data import (
     unit_of,
     unwrap,
 )
-from ldcnd.drivers.tracer import Recorded
+from ldcnd.drivers.tracer import Recorded, level_of
 from ldcnd.errors import NotSupported, ValueOutOfRange
 from ldcnd.model.traces import DriveTraceInfo, TraceChannel, TraceTrigger, TriggerKind
 
@@ -123,7 +123,7 @@ def trigger_condition(
     if bits is None:
         raise NotSupported(
             "the bits of the trigger condition are not known for this drive",
-            remedy="trace without a trigger, or find the bits with `ldcnd doctor trigger-bits`",
+            remedy="trace without a trigger, or find its bits: `ldcnd doctor trigger-bits --help`",
         )
     word = bits.io if trigger.channel in SIGNALS else (bits.trace1, bits.trace2)[assignment.memory(trigger.channel)]
     if kind is not TriggerKind.FALLING:
@@ -145,7 +145,7 @@ def trigger_operand(
         return 0
     if trigger.channel in SIGNALS:
         return assignment.memory(trigger.channel)
-    return trigger_level(profile, constants, DATA[trigger.channel], trigger.level)
+    return trigger_level(profile, constants, DATA[trigger.channel], level_of(trigger))
 
 
 BEARING = (
