@@ -192,7 +192,6 @@ class Axis(ReadableAxis):
         super().__init__(name, axis, info, rig, loop)
         self.velocity: float | None = None
         self.acceleration: float | None = None
-        self._setpoint: float | None = None
         self._under_way = 0
         self._stopped: bool | None = None
         self._fly: Fly | None = None
@@ -229,9 +228,9 @@ class Axis(ReadableAxis):
         await self._there(self._halt(success=success))
 
     async def locate(self) -> "Location[float]":
-        """Return where the axis was sent last, which is where it is before any move, and where it is."""
+        """Return where the axis was sent last, or stands since anything else stopped or moved it, and where it is."""
         position = (await self._there(self._measured())).value
-        return {"setpoint": position if self._setpoint is None else self._setpoint, "readback": position}
+        return {"setpoint": self._axis.target, "readback": position}
 
     async def check_value(self, value: float) -> None:
         """Move nothing, and raise what a move to a position would be refused for now.
@@ -242,7 +241,7 @@ class Axis(ReadableAxis):
         await self._there(self._check(float(value), self.velocity))
 
     async def read(self) -> "dict[str, Reading[float]]":
-        """Return the position and where the axis was sent last.
+        """Return the position and the setpoint, as `locate` does.
 
         Raises:
             AxisUnreachable: the drive does not answer.
@@ -251,8 +250,7 @@ class Axis(ReadableAxis):
         """
         read = await super().read()
         here = read[self.name]
-        asked = here["value"] if self._setpoint is None else self._setpoint
-        return {**read, f"{self.name}_setpoint": reading(asked, here["timestamp"])}
+        return {**read, f"{self.name}_setpoint": reading(self._axis.target, here["timestamp"])}
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the readings are."""
@@ -338,7 +336,7 @@ class Axis(ReadableAxis):
         keeping = asyncio.create_task(keep(), name=f"positions of {self.name}")
         try:
             await self._end_of(
-                self._axis.move_absolute(fly.end, velocity=fly.velocity, acceleration=self.acceleration), fly.end, began
+                self._axis.move_absolute(fly.end, velocity=fly.velocity, acceleration=self.acceleration), began
             )
             await self._measured()
         finally:
@@ -363,7 +361,7 @@ class Axis(ReadableAxis):
             except (CommandAborted, DriveFault, RequestRefused) as error:
                 with suppress(LdcndError):  # why it ended matters more than what its standstill took
                     await self._rest(is_news=isinstance(error, StopLatched))
-                if not (self._stopped and isinstance(error, CommandAborted)):
+                if not (self._stopped and isinstance(error, CommandAborted | RequestRefused)):
                     raise
             finally:
                 self._not_before_ns = self._axis.state.sample.t
@@ -372,12 +370,11 @@ class Axis(ReadableAxis):
         return self._start(name, moving())
 
     async def _move(self, target: float, velocity: float | None) -> None:
-        await self._end_of(self._axis.move_absolute(target, velocity=velocity, acceleration=self.acceleration), target)
+        await self._end_of(self._axis.move_absolute(target, velocity=velocity, acceleration=self.acceleration))
 
     async def _end_of(
         self,
         starting: Coroutine[object, object, Motion],
-        target: float | None = None,
         began: asyncio.Future[None] | None = None,
     ) -> None:
         if self._is_stopped():
@@ -386,7 +383,6 @@ class Axis(ReadableAxis):
                 f"axis {self._info.axis}: it was stopped before the motion began", axis=self._info.axis
             )
         motion = await starting
-        self._setpoint = target
         if began and not began.done():
             began.set_result(None)
         if self._is_stopped():  # it overtook the motion on its way to the daemon

@@ -11,7 +11,7 @@ import pydantic
 
 from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
-from ldcnd.client.motion import Motion, Position, State, Watched
+from ldcnd.client.motion import Motion, Position, Sent, State, Watched
 from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
@@ -84,6 +84,7 @@ class Axis(AxisVerbs, Watched):
         self._loop = loop
         self._state: tuple[StateSample, float] | None = None
         self._position: tuple[Sample | PositionSample, float] | None = None
+        self._sent: Sent | None = None
         self._changed = asyncio.Event()
         self._readers: weakref.WeakSet[Positions] = weakref.WeakSet()
         self._last: Motion | None = None  # of those begun here: what came before it has ended when it has
@@ -116,6 +117,17 @@ class Axis(AxisVerbs, Watched):
             sample = decode_received(PositionSample, sample.payload, sample.encoding)
             self._position = sample, at_s
         return Position(sample, self._loop.time() - at_s, self._state[0] if self._state else None)
+
+    @property
+    def target(self) -> float:
+        """Where it was sent last, by any program, in axis units; where it is, once anything else stopped or moved it.
+
+        Raises:
+            SessionError: nothing has come from it yet.
+        """
+        state = self.state.sample
+        target = self._sent.target(state) if self._sent else state.target
+        return self.position.value if target is None else target
 
     def positions(self) -> Positions:
         """Iterate over the positions that come from now on; several readers do not disturb each other."""
@@ -223,9 +235,11 @@ class Axis(AxisVerbs, Watched):
         if self._last and self._last.ended is None:
             await self.halt_now()
 
-    def begun(self, reply: CommandReply) -> Motion:
-        """Return the motion that a command has begun."""
+    def begun(self, reply: CommandReply, asked: float | None = None) -> Motion:
+        """Return the motion that a command has begun; `asked` is the requested target, in axis units."""
         self._last = Motion(reply, self)
+        turns = self._position is not None and self.position.sample.turns is not None
+        self._sent = Sent(reply, None if turns else asked)
         return self._last
 
     async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
@@ -235,7 +249,8 @@ class Axis(AxisVerbs, Watched):
         return await self._client.command(self.name, command)
 
     async def _start(self, make: Callable[[], AxisCommand[CommandReply]]) -> Motion:
-        return self.begun(await self._send(make))
+        command = _made(make)
+        return self.begun(await self._send(lambda: command), getattr(command, "position", None))
 
     async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
         command = _made(make)

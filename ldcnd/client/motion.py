@@ -126,6 +126,32 @@ class Progress:
     unit: str
 
 
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """The last motion that this client has begun, beside the states that are published of the axis.
+
+    Attributes:
+        reply: to its command.
+        asked: the requested target, in axis units, before the drive's registers rounded it; None without one, and on
+            an axis with a modulo, where the reply counts within a turn.
+    """
+
+    reply: CommandReply
+    asked: float | None = None
+
+    def target(self, state: StateSample) -> float | None:
+        """Return where the axis was sent last or came to rest after anything else; None where only a position tells.
+
+        Args:
+            state: the last one that has arrived; it may be older than the reply.
+        """
+        reply, named = self.reply, state.command is not None and state.command.command_id == self.reply.command_id
+        is_older = reply.since is not None and state.t <= reply.since and not named
+        target = reply.position if is_older else state.target
+        is_reply = target is not None and target == reply.position
+        return self.asked if is_reply and self.asked is not None else target
+
+
 class Watched(ABC):
     """An axis whose state and position arrive; `Axis` is one."""
 

@@ -10,9 +10,17 @@ from contextlib import suppress
 from caproto import AlarmSeverity, AlarmStatus
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.motion import Motion
+from ldcnd.client.motion import Motion, Sent
 from ldcnd.epics.fields import NO_ALARM, Action, Alarm, Field, Put, Value, choice, integer, number, string, text
-from ldcnd.errors import CommandAborted, LdcndError, LeaseRequired, ValueOutOfRange, WrongState
+from ldcnd.errors import (
+    CommandAborted,
+    LdcndError,
+    LeaseRequired,
+    PositionLimit,
+    RequestRefused,
+    ValueOutOfRange,
+    WrongState,
+)
 from ldcnd.model.commands import BufferMode, Verb
 from ldcnd.model.condition import Alarm as Severity
 from ldcnd.model.condition import assess
@@ -86,8 +94,13 @@ class MotorRecord:
         self._stop = stop
         self._clients = clients
         self._pending = 0
+        self._wanted_halts = 0  # as `_halts` was when the newest target was put
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
-        self._synchronised = False
+        self._wanted: float | None = None  # the newest target that was put and has no reply yet
+        self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
+        self._turn = asyncio.Lock()
+        self._sent: Sent | None = None
+        self._state: StateSample | None = None
         self._moving = Moving.UNKNOWN
         self._changed = asyncio.Event()
         self._released = asyncio.Event()  # the jog under way is to end
@@ -233,9 +246,7 @@ class MotorRecord:
                 for field in ("RBV", "DRBV"):
                     await self[field].show(sample.value, worst, at_s)
                 await self["RRBV"].show(sample.counts, worst, at_s)
-                if not self._synchronised:
-                    self._synchronised = True
-                    await self._val.show(sample.value)
+                await self._show_target()
             case VelocitySample():
                 await self._show_beside("velocity", sample.value, alarm, at_s)
                 if sample.value:
@@ -257,8 +268,16 @@ class MotorRecord:
                         "inputs", ", ".join(sample.active if sample.active is not None else sample.high)
                     )
 
+    async def _show_target(self) -> None:
+        """Show where the axis was sent, by whomever, or else where it is, unless a put is on its way."""
+        state = self._state
+        if self._wanted is not None or state is None:
+            return
+        target = self._sent.target(state) if self._sent else state.target
+        await self._val.show(self["RBV"].value if target is None else target)
+
     async def _take_state(self, sample: StateSample) -> None:
-        self._moving = sample.moving
+        self._moving, self._state = sample.moving, sample
         self._changed.set()
         self._condition = assess(sample, self._faults)
         before, self._alarm = self._alarm, ALARMS[self._condition.alarm]
@@ -278,6 +297,7 @@ class MotorRecord:
             | MSTA_PROBLEM * (sample.state is AxisState.ERROR_STOP)
             | MSTA_COMM * (sample.link is LinkState.DOWN)
         )
+        await self._show_target()
         await self.show_motion()
 
     async def _take_inputs(self, sample: InputsSample, alarm: Alarm, at_s: float) -> None:
@@ -342,18 +362,52 @@ class MotorRecord:
         if self["SET"].value == "Set":
             await axis.set_position(target)
             return Put(target)
-        return await self._moved(lambda: self._absolute(axis, target), target)
+        return await self._go(target)
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        axis = self._movable()
-        step = sign * float(self["TWV"].value)
-        target = (float(self._val.value) if self._pending else axis.position.value) + step
-        put = await self._moved(lambda: self._absolute(axis, target), target)
-        if put.value is not None:
-            await self._val.show(put.value)
+        self._movable()
+        target = float(self._val.value) if self._wanted is None else self._wanted
+        put = await self._go(target + sign * float(self["TWV"].value))
         return Put(0, put.end)
+
+    async def _go(self, target: float) -> Put:
+        """Send the axis to a target; of those that are put before it can be sent only the newest is."""
+        low, high = float(self["LLM"].value), float(self["HLM"].value)
+        if (low or high) and not low <= target <= high:
+            await self["LVIO"].show(1)
+            nearest = min(max(target, low), high)
+            raise PositionLimit(
+                f"axis {self.info.axis}: {target:g} {self.info.unit} is beyond its limit of {nearest:g}",
+                axis=self.info.axis,
+                value=target,
+                limit=nearest,
+                nearest=nearest,
+            )
+        self._wanted = target
+        if self._waiting is None:
+            self._waiting = asyncio.get_running_loop().create_future()
+            self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
+        waiting, self._wanted_halts = self._waiting, self._halts
+        await self._val.show(target)
+        return await asyncio.shield(waiting)
+
+    async def _go_to_newest(self, waiting: "asyncio.Future[Put]") -> None:
+        async with self._turn:
+            self._waiting, target, halts = None, self._wanted or 0.0, self._wanted_halts
+            try:
+                put = await self._moved(lambda: self._absolute(self._controlled(), target), halts, target)
+            except Exception as error:  # noqa: BLE001 - of those who have put it
+                if not waiting.cancelled():
+                    waiting.set_exception(error)
+            else:
+                if not waiting.cancelled():
+                    waiting.set_result(put)
+            finally:
+                if self._waiting is None:
+                    self._wanted = None
+                    await self._show_target()
 
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
@@ -363,8 +417,7 @@ class MotorRecord:
             raise ValueOutOfRange(
                 f"axis {self.info.axis}: HVEL is 0", axis=self.info.axis, remedy="put the velocity of the search there"
             )
-        put = await self._moved(lambda: axis.home(velocity=sign * velocity))
-        self._synchronised = False
+        put = await self._moved(lambda: axis.home(velocity=sign * velocity), self._halts)
         return Put(0, put.end)
 
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
@@ -449,9 +502,8 @@ class MotorRecord:
             acceleration=velocity / float(self["ACCL"].value),
         )
 
-    async def _moved(self, starting: Callable[[], Awaitable[Motion]], target: float | None = None) -> Put:
+    async def _moved(self, starting: Callable[[], Awaitable[Motion]], halts: int, target: float | None = None) -> Put:
         """Begin a motion, unless a halt is put meanwhile; DMOV is 0 from here to its end, however short it is."""
-        halts = self._halts
         await self._end_jog()  # the end of a jog is a halt, which must not come later
         self._pending += 1
         await self.show_motion()
@@ -466,15 +518,18 @@ class MotorRecord:
             self._pending -= 1
             await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
             await self.show_motion()
+            if self._halts != halts and isinstance(error, RequestRefused):
+                return Put()  # it was to be halted: that has overtaken it
             raise
         if motion is None:
             self._pending -= 1
             await self.show_motion()
             return Put()
+        self._sent = Sent(motion.reply, target if self.info.modulo is None else None)
         # the motion goes on when the client is gone that has put it, as it does with every motor record
         end = asyncio.shield(self._start(self._until_end(motion, halts), f"motion of {self.info.axis}"))
         await self["LVIO"].show(0)
-        return Put(target, end)
+        return Put(None, end)
 
     async def _until_end(self, motion: Motion, halts: int) -> None:
         try:

@@ -231,6 +231,8 @@ class CommandReply(Frozen):
     """Target in A/D counts, for an analog move."""
     duty: float | None = None
     """Duty as the drive's register makes it, -1 to 1."""
+    since: int | None = None
+    """When the motion was accepted, as in the command of `state`; null for a command that begins none."""
 
 
 class StopReply(Frozen):

@@ -265,6 +265,9 @@ class StateSample(Sample):
     """Whether its drive can have a reference; false where `home` and `set_position` are not among its commands."""
     reference_lost: bool = False
     """The position was valid and is not any more; false on an axis that was never homed, and again once it is valid."""
+    target: float | None = None
+    """Where the axis was sent last, in axis units; once something else has stopped or moved it, where it came to rest.
+    Null while it moves without a target, while its position loop is open, and while it is not known."""
     speed_override: float = Field(default=100.0, ge=0, le=100)
     """Percent of every velocity, for the whole rig; nothing moves at 0."""
 

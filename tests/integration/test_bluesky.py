@@ -105,6 +105,27 @@ def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
     assert (lab.truth("x"), lab.truth("y")) == pytest.approx(began, abs=IN_POSITION)
 
 
+@pytest.mark.parametrize("ending", ["stop", "latch", "another program"])
+def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_moved_it(lab: Laboratory, ending: str):
+    with lab.powered("x") as (x,):
+        status = x.set(40.0)
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
+        if ending == "stop":
+            lab.loop.run(x.stop())
+        elif ending == "latch":
+            lab.loop.run(lab.running.client.stop("x"))
+        else:
+            lab.loop.run(x._axis.move_absolute(3.0, buffer_mode="aborting"))
+        with suppress(CommandAborted, StopLatched):
+            status.wait(60)
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.NO and state.command is None))
+        located = lab.loop.run(x.locate())
+        x.reset().wait(10)
+
+        assert located["setpoint"] == pytest.approx(lab.truth("x"), abs=IN_POSITION)
+        assert located["setpoint"] < 40 - 1
+
+
 def test_a_fly_scan_yields_pages_of_positions_with_the_times_of_the_drive(lab: Laboratory, monkeypatch):
     monkeypatch.setattr(ldcnd.bluesky.axis, "PAGE_SAMPLES", 10)
 

@@ -12,11 +12,13 @@ from ldcnd.epics.gateway import gateway
 from ldcnd.errors import (
     CommandAborted,
     DriveFault,
+    LdcndError,
     LeaseRequired,
     PositionLimit,
     ValueOutOfRange,
     WrongState,
 )
+from ldcnd.model.commands import MoveAbsolute, Reset
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.leases import Acquire
 from ldcnd.model.samples import LinkState, Moving
@@ -75,6 +77,10 @@ FIELDS = [
     "DIR",
     "CNEN",
 ]
+
+
+AT_REST = 0.05
+"""Millimetres by which a shaft still settles once it stands, from where a halt or a stop has ended."""
 
 
 @asynccontextmanager
@@ -351,6 +357,75 @@ async def test_tweaks_homing_and_set_mode():
 
         assert made.variables["T:x.RBV"].value == pytest.approx(7, abs=0.02)
         assert (await running.client.state("x")).moving is Moving.NO
+
+
+@pytest.mark.parametrize("ending", ["STOP", "SPMG", "jog", "stop from elsewhere", "another program", "power"])
+async def test_a_relative_move_begins_where_the_axis_is_whatever_has_moved_or_stopped_it(ending: str):
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await asyncio.sleep(0.5)
+        match ending:
+            case "STOP":
+                await put(made, "T:x.STOP", 1)
+            case "SPMG":
+                await put(made, "T:x.SPMG", "Stop")
+                await put(made, "T:x.SPMG", "Go")
+            case "jog":
+                await put(made, "T:x.JVEL", 2.0)
+                await put(made, "T:x.JOGR", 1)
+                await asyncio.sleep(0.5)
+                await put(made, "T:x.JOGR", 0)
+            case "stop from elsewhere":
+                await running.client.stop("x")
+                await running.until("x", lambda state: state.moving is Moving.NO)
+                lease = await running.client.ask(Acquire(client="ann", axes=("x",), force=True, lease_s=60))
+                await running.client.command("x", Reset(lease=lease.lease))
+            case "another program":
+                lease = await running.client.ask(Acquire(client="ann", axes=("x",), force=True, lease_s=60))
+                await running.until("x", lambda state: state.moving is Moving.NO)
+                await running.client.command("x", MoveAbsolute(position=4.0, lease=lease.lease))
+            case _:
+                await put(made, "T:x.CNEN", "Disable")
+        with suppress(LdcndError):
+            await moving
+        state = await running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
+        await asyncio.sleep(0.5)
+
+        shaft = made.variables["T:x.RBV"].value
+        assert 0 < shaft < 30
+        assert made.variables["T:x.VAL"].value == pytest.approx(shaft, abs=AT_REST)
+        assert state.target is None or state.target == pytest.approx(shaft, abs=AT_REST)
+        assert (state.target is None) == (ending == "power")
+
+
+@pytest.mark.parametrize(
+    ("step", "count", "pause_s"), [(0.1, 50, 0.0), (0.1, 20, 0.02), (1.0, 6, 0.03), (0.002, 20, 0.001)]
+)
+async def test_no_tweak_is_lost_however_quick_they_are(step: float, count: int, pause_s: float):
+    async with records() as (running, made):
+        await put(made, "T:x.TWV", step)
+        tweaks = []
+        for _ in range(count):
+            tweaks.append(asyncio.create_task(put(made, "T:x.TWF", 1)))
+            await asyncio.sleep(pause_s)
+        await asyncio.gather(*tweaks)
+        await running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert made.variables["T:x.VAL"].value == pytest.approx(step * count)
+        assert (await running.client.position("x")).value == pytest.approx(step * count, abs=0.02)
+
+
+async def test_a_tweak_beyond_the_limit_leaves_the_target_of_those_before_it():
+    async with records() as (running, made):
+        await put(made, "T:x", 99.0)
+        await put(made, "T:x.TWV", 0.4)
+        results = await asyncio.gather(*(put(made, "T:x.TWF", 1) for _ in range(4)), return_exceptions=True)
+        await running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert [type(result) for result in results] == [type(None), type(None), PositionLimit, PositionLimit]
+        assert made.variables["T:x.VAL"].value == pytest.approx(99.8)
+        assert (await running.client.position("x")).value == pytest.approx(99.8, abs=0.02)
 
 
 async def test_control_that_another_program_takes_ends_puts_until_it_is_free():

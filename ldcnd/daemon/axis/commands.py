@@ -471,7 +471,7 @@ class AxisCommands:
         permit.still_wanted()
         guards.check_position_kept(self._tracker)
         motion.telemetry.origin_counts = here.position_counts - position * motion.counts_per_unit
-        self._tracker.referenced = True
+        self._tracker.referenced, self._tracker.target = True, None
         motion.publish_state()
         return motion.reply(permit, position=position)
 

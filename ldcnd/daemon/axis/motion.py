@@ -484,8 +484,13 @@ class AxisMotion:
                 "acceleration": plan.acceleration,
                 "duration_s": plan.duration_s,
             }
+        command = self.tracker.command
         return CommandReply(
-            command_id=permit.command_id, axis=self.config.name, verb=permit.verb, **{**planned, **values}
+            command_id=permit.command_id,
+            axis=self.config.name,
+            verb=permit.verb,
+            since=command.since_ns if command and command.command_id == permit.command_id else None,
+            **{**planned, **values},
         )
 
 

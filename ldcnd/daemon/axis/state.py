@@ -209,7 +209,7 @@ def _ignore(_fault: PastFault) -> None:
 
 
 StateShown = tuple[
-    Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None, float
+    Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None, float | None, float
 ]
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
 """Quality of a value read just now, by the drive's link."""
@@ -274,6 +274,8 @@ class AxisTracker:
             another one.
         reference_lost: the place was known and is not any more, until it is known again; a reset does not clear it.
         settle: judges the end of the motion under way; None where the end of its profile is its end.
+        target: where the axis was sent last, or came to rest after anything else, in axis units; None while it is
+            neither, and while nothing holds it.
         proof: that who answers is its drive; None for an axis without a line.
     """
 
@@ -301,6 +303,7 @@ class AxisTracker:
         self.link = LinkState.DOWN
         self.command: ActiveCommand | None = None
         self.last_error: str | None = None
+        self.target: float | None = None
         self.active_faults: tuple[FaultEntry, ...] = ()
         self.first_fault: FaultEntry | None = None
         self.speed_share = 1.0
@@ -329,6 +332,7 @@ class AxisTracker:
             self.stop_pending,
             self.command,
             self.last_error,
+            self.target,
             self.speed_share,
         )
 
@@ -378,6 +382,13 @@ class AxisTracker:
         """Whether the motor gets voltage: the loop is closed, or open for a command that wants it so."""
         return self.enabled or (self.command is not None and self.command.opens_loop)
 
+    @property
+    def holds_unnamed(self) -> bool:
+        """Whether the axis stands in a closed loop at a place to which no command has sent it."""
+        if self.target is not None or not self.enabled or self.command or self.position_lost:
+            return False
+        return self.moving is Moving.NO
+
     def concerns(self, timing: Timing) -> bool:
         """Tell whether a reading was requested after the latest command took effect."""
         return timing.sent_at_s >= self._effective_from_s
@@ -395,13 +406,15 @@ class AxisTracker:
             self._faults(faults, now_ns)
         self.position_lost = bool(faults) and any(fault.loses_position for fault in faults)
         if self.position_lost:
-            self.referenced = False
+            self.referenced, self.target = False, None
         if timing.sent_at_s < self._effective_from_s:
             return  # requested before the latest command took effect: says nothing about it
         self._rest.observed(reading, timing.sent_at_s)
         if reading.cut_short and self.command:
             self._failure = reading.cut_short
         self.enabled = reading.enabled
+        if not reading.enabled:
+            self.target = None
         if faults and any(fault.stops for fault in faults):
             self._fail(f"the drive reports a fault{'; its position is lost' if self.position_lost else ''}")
         elif self.enabled:
@@ -467,11 +480,13 @@ class AxisTracker:
 
     def changed_by_another(self, fault: Fault) -> None:
         """The next reading shows what this daemon has not done to the drive; until reset."""
+        self.target = None
         if fault not in self._own:
             self._own = (*self._own, fault)
 
     def jumped(self) -> None:
         """The next reading shows a position that no motion has led to: a fault until reset."""
+        self.target = None
         if JUMPED not in self._own:
             self._own = (*self._own, JUMPED)
 
@@ -521,7 +536,7 @@ class AxisTracker:
         if not was_up and (not another or any(fault.code == NOT_IDENTIFIED.code for fault in self.active_faults)):
             return
         self.link = LinkState.DOWN
-        self.referenced = False
+        self.referenced, self.target = False, None
         self._rest.forget()
         self._faults((NOT_IDENTIFIED if another else LINK_LOST,), now_ns)
         if was_up and self.state is not AxisState.DISABLED:
@@ -557,6 +572,8 @@ class AxisTracker:
         self._failure = self.settle = self._ends_at_s = None
         if math.isinf(self._effective_from_s):
             self._effective_from_s = 0.0  # the drive never took it, so there is nothing to wait for: readings count
+        if status is not CommandStatus.DONE:
+            self.target = None
         if command is None:
             return
         if reason:
@@ -578,6 +595,7 @@ class AxisTracker:
             if command.state is not AxisState.STOPPING:
                 self.last_error = None  # the motion goes on as another command's
         self.command = command
+        self.target = None if command.state is AxisState.CONTINUOUS_MOTION else command.target
         self.state = command.state
         self.settle = SettleJudge(command.settling) if command.settling else None
         self._ends_at_s = None
@@ -661,7 +679,12 @@ def _entry(fault: Fault, now_ns: int) -> FaultEntry:
 
 
 class ObservedTracker(AxisTracker):
-    """An `AxisTracker` without commands: Disabled, Standstill, moving, ErrorStop as the drive shows them."""
+    """An `AxisTracker` without commands: Disabled, Standstill, moving, ErrorStop as the drive shows them.
+
+    Others send such an axis: it has no target that is known here.
+    """
+
+    holds_unnamed = False
 
     has_reference = False
 

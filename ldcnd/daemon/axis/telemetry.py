@@ -147,15 +147,28 @@ class AxisTelemetry:
                         "amplifier_enable": amplifier_enable,
                     }
                 )
+        if self._tracker.holds_unnamed:
+            self._tracker.target = self.within_turn(self.position(reading.position_counts))[0]
         self.state(t, t_error_ns, due=TelemetryItem.STATE in asked)
 
     def state(self, t: int, t_error_ns: int = 0, *, due: bool = False) -> None:
         """Publish state and faults if they changed, or if they are due anyway."""
         tracker = self._tracker
         shown = tracker.shown()
-        quality, state, enabled, referenced, moving, link, stop_latched, stop_pending, command, last_error, share = (
-            shown
-        )
+        (
+            quality,
+            state,
+            enabled,
+            referenced,
+            moving,
+            link,
+            stop_latched,
+            stop_pending,
+            command,
+            last_error,
+            target,
+            share,
+        ) = shown
         if due or shown != self._last_state:
             self._last_state = shown
             self._state.publish(
@@ -175,6 +188,7 @@ class AxisTelemetry:
                     "last_error": last_error,
                     "has_reference": tracker.has_reference,
                     "reference_lost": tracker.reference_lost,
+                    "target": target,
                     "speed_override": 100.0 * share,
                 }
             )
