@@ -140,6 +140,11 @@ class Axis(Facade[asynchronous.Axis]):
         """The last position."""
         return self._wrapped.position
 
+    @property
+    def target(self) -> float:
+        """Where it was sent last, by any program; where it is, once anything else stopped or moved it."""
+        return self._wrapped.target
+
     def positions(self) -> Iterator[PositionSample]:
         """Iterate over the positions that come from now on."""
         return self._loop.each(self._wrapped.positions())

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TypeVar
 
@@ -10,7 +10,7 @@ from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionErro
 from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.messaging.hand_over import Answer
 from ldcnd.messaging.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
-from ldcnd.messaging.session import Declaration, Sample, SampleKind, Session
+from ldcnd.messaging.session import NO_PARAMETERS, Declaration, Sample, SampleKind, Session
 from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
 from ldcnd.model.frozen import Frozen
 from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
@@ -101,10 +101,23 @@ class RigClient:
         self.session = session
         self.keys = Keys(rig)
         self._instance: str | None = None
+        self._source: str | None = None  # the session of the daemon that was found last
 
     async def read(self, key: str, model: type[ModelT]) -> list[ModelT]:
         """Return the values of the keys of the rig that match `key`."""
-        return [self._decoded(answer, model) for answer in await self.session.query(key)]
+        return [self._decoded(answer, model) for answer in await self._values(key)]
+
+    async def _values(self, key: str, parameters: Mapping[str, str] = NO_PARAMETERS) -> list[Answer]:
+        """Return what the daemon of the rig answers: others, such as a storage with old values, may answer as well."""
+        answers = await self.session.query(key, parameters=parameters, everyone=True)
+        if any(answer.source == self._source for answer in answers):
+            return [answer for answer in answers if answer.source == self._source]
+        if answers:
+            try:
+                await self.daemon()
+            except SessionError:
+                return []
+        return [answer for answer in answers if answer.source == self._source]
 
     async def daemon(self) -> DaemonInfo:
         """Return what the daemon says about itself.
@@ -112,7 +125,12 @@ class RigClient:
         Raises:
             SessionError: no daemon serves this rig.
         """
-        return self._one(await self.session.query(self.keys.daemon), DaemonInfo)
+        answers = await self.session.query(self.keys.daemon, everyone=True)
+        found = [(self._decoded(answer, DaemonInfo), answer.source) for answer in answers if not answer.is_error]
+        if not found:
+            return self._one(answers, DaemonInfo)
+        daemon, self._source = max(found, key=lambda each: each[0].started)
+        return daemon
 
     async def axes(self) -> list[AxisInfo]:
         """Return all axes, in the order of their addresses."""
@@ -126,7 +144,7 @@ class RigClient:
         """Return all that describes the rig, as JSON, by what follows `meta/` in its key; schemas are left out."""
         found: dict[str, bytes] = {}
         for pattern in self.keys.description_patterns:
-            for answer in await self.session.query(pattern):
+            for answer in await self._values(pattern):
                 if answer.is_error:
                     raise decode_error(answer.payload, answer.encoding)
                 if answer.key != self.keys.health:
@@ -136,12 +154,12 @@ class RigClient:
     async def last(self, axis: str, item: str) -> Measurement | None:
         """Return the last value of an item, or None when there is none (yet)."""
         model = sample_model(item)
-        answers = await self.session.query(self.keys.telemetry_pattern(axis, item)) if model else []
+        answers = await self._values(self.keys.telemetry_pattern(axis, item)) if model else []
         return self._decoded(answers[0], model) if model and answers else None
 
     async def monitors(self, axis: str) -> dict[MonitorName, MonitorSample]:
         """Return the last value of every monitor that an axis publishes."""
-        answers = await self.session.query(self.keys.monitor(axis, "*"))
+        answers = await self._values(self.keys.monitor(axis, "*"))
         return {MonitorName(answer.key.rpartition("/")[2]): self._decoded(answer, MonitorSample) for answer in answers}
 
     async def states(self) -> dict[str, StateSample]:
@@ -196,7 +214,7 @@ class RigClient:
         return reply
 
     async def _of_all_axes(self, item: TelemetryItem, model: type[ModelT]) -> dict[str, ModelT]:
-        answers = await self.session.query(self.keys.telemetry_pattern("*", item))
+        answers = await self._values(self.keys.telemetry_pattern("*", item))
         return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, model) for answer in answers}
 
     async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
@@ -273,7 +291,7 @@ class RigClient:
             self.keys.telemetry_pattern("*", "monitor") + "/*",
             f"{self.keys.health}/**",
         )
-        answers = [a for key in keys for a in await self.session.query(key, parameters={"enc": "msgpack"})]
+        answers = [a for key in keys for a in await self._values(key, {"enc": "msgpack"})]
         return [
             Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns)
             for answer in answers
@@ -338,7 +356,8 @@ class RigClient:
                 f"no daemon serves rig {self.rig}, or this login may not query it",
                 remedy="check that the daemon runs and that you connect to it",
             )
-        return self._decoded(answers[-1], model)
+        own = [answer for answer in answers if answer.source == self._source]
+        return self._decoded((own or answers)[-1], model)
 
     @staticmethod
     def _decoded(answer: Answer, model: type[ModelT]) -> ModelT:
@@ -348,9 +367,10 @@ class RigClient:
 
 
 async def find_rigs(session: Session) -> list[DaemonInfo]:
-    """Return the daemons that can be reached."""
+    """Return the daemons that can be reached, the one that was started last behind the others."""
     answers = await session.query(ALL_DAEMONS)
-    return [decode_received(DaemonInfo, answer.payload, answer.encoding) for answer in answers if not answer.is_error]
+    found = (decode_received(DaemonInfo, answer.payload, answer.encoding) for answer in answers if not answer.is_error)
+    return sorted(found, key=lambda daemon: daemon.started)
 
 
 @asynccontextmanager

@@ -62,11 +62,11 @@ class Gateway:
 
     async def _follow(self, record: MotorRecord) -> None:
         axis = record.info.axis
-        for item in record.info.items:
-            last = await self._rig.latest(axis, item)
-            if last:
-                await record.take(last)
         async with self._rig.samples(axis) as samples:
+            for item in record.info.items:
+                last = await self._rig.latest(axis, item)
+                if last:
+                    await record.take(last)
             while True:
                 try:
                     async with asyncio.timeout(SILENT_S):

@@ -8,7 +8,7 @@ import asyncio
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from ldcnd.errors import InternalError, LdcndError, ShuttingDown, TooManyRequests
@@ -34,13 +34,18 @@ COLLECTED_ITEMS = 4096
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One answer to a query; an error answer carries an `ErrorReply`."""
+    """One answer to a query; an error answer carries an `ErrorReply`.
+
+    Attributes:
+        source: the session that has answered, as the asking one sees it; empty where the network does not say.
+    """
 
     key: str
     payload: bytes
     encoding: str
     measured_at_ns: int | None = None
     is_error: bool = False
+    source: str = field(default="", compare=False)
 
 
 def _no_login() -> str | None:

@@ -7,7 +7,7 @@ hand-over loses. Not modelled: access control, network faults, and the default c
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from ldcnd.errors import OutcomeUnknown, SessionError
@@ -45,6 +45,7 @@ class _Queryable:
     key: str
     intake: QueryIntake
     complete: bool
+    source: str
 
 
 @dataclass(eq=False, slots=True)
@@ -99,13 +100,13 @@ class MemoryBroker:
         finally:
             await session.close()
 
-    def asked(self, key: str) -> list[_Queryable]:
+    def asked(self, key: str, *, everyone: bool = False) -> list[_Queryable]:
         """Return who is to answer a query: one complete queryable if there is any, otherwise all that match.
 
         A complete queryable answers alone only for a key without wildcards; what it covers of others is not worked out.
         """
         found = [queryable for queryable in self.queryables if matches(queryable.key, key)]
-        complete = [queryable for queryable in found if queryable.complete and "*" not in key]
+        complete = [queryable for queryable in found if queryable.complete and "*" not in key and not everyone]
         return complete[:1] or found
 
     def show_token(self, key: str) -> None:
@@ -179,7 +180,7 @@ class MemorySession(Session):
 
     def _serve(self, key: str, intake: QueryIntake, *, complete: bool) -> Declaration:
         self._must_be_open()
-        queryable = _Queryable(key, intake, complete)
+        queryable = _Queryable(key, intake, complete, self._name)
 
         def undeclare() -> None:
             self._broker.queryables.remove(queryable)
@@ -213,17 +214,18 @@ class MemorySession(Session):
         parameters: Mapping[str, str] = NO_PARAMETERS,
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
+        everyone: bool = False,
     ) -> list[Answer]:
         """Query the queryables of the key; nothing is overtaken, because nothing waits on its way."""
         del urgent
         self._must_be_open()
-        asked = self._broker.asked(key)
+        asked = self._broker.asked(key, everyone=everyone)
         if not asked:
             return []
         pending = _Pending(len(asked), self._loop.create_future())
         for queryable in asked:
             if admission := queryable.intake.admit(self._name):
-                send = partial(_answer, pending, admission)
+                send = partial(_answer, pending, admission, queryable.source)
                 admission.offer(Query(key, parameters, payload, encoding, send, lambda: self._login))
             else:
                 refusal = queryable.intake.refusal(key, self._name)
@@ -288,6 +290,6 @@ class MemorySession(Session):
             raise SessionError("the session is closed")
 
 
-def _answer(pending: _Pending, admission: Admission, answers: tuple[Answer, ...]) -> None:
+def _answer(pending: _Pending, admission: Admission, source: str, answers: tuple[Answer, ...]) -> None:
     admission.leave()
-    pending.take(answers)
+    pending.take(tuple(replace(answer, source=source) for answer in answers))

@@ -166,6 +166,7 @@ class Session(ABC):
         parameters: Mapping[str, str] = NO_PARAMETERS,
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
+        everyone: bool = False,
     ) -> list[Answer]:
         """Send a query, and return all answers; none when there is no queryable or access control forbids it.
 
@@ -176,6 +177,7 @@ class Session(ABC):
             parameters: of the selector; neither `;` nor `=` nor `|` in names and values.
             timeout_s: how long to wait for the last answer; what has arrived by then is returned.
             urgent: overtakes everything else on its way, for stops.
+            everyone: ask all that match, also where one of them can answer everything.
 
         Raises:
             OutcomeUnknown: no answer came in time; the query may be carried out all the same, even later.

@@ -289,8 +289,9 @@ class ZenohSession(Session):
         parameters: Mapping[str, str] = NO_PARAMETERS,
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
+        everyone: bool = False,
     ) -> list[Answer]:
-        """Send a query, to one complete queryable or to all the others; repeated answers are kept."""
+        """Send a query, to one complete queryable or to all the others, or to everyone; repeated answers are kept."""
         self._must_be_open()
         if timeout_s <= 0:
             raise ValueOutOfRange(f"{key}: a query needs time; {timeout_s:g} s is none", value=timeout_s, limit=0)
@@ -302,7 +303,7 @@ class ZenohSession(Session):
             self._session.get(
                 zenoh.Selector(key, dict(parameters)),
                 Callback(collector.take, collector.end, indirect=False),
-                target=zenoh.QueryTarget.BEST_MATCHING,
+                target=zenoh.QueryTarget.ALL if everyone else zenoh.QueryTarget.BEST_MATCHING,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,

@@ -47,11 +47,14 @@ def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> li
     """
     answers: list[Answer] = []
     for reply in replies:
+        source = "" if reply.replier_id is None else str(reply.replier_id.zid)
         if (sample := reply.ok) is not None:
             stamp = _stamped_ns(sample.timestamp)
-            answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), stamp))
+            payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
+            answers.append(Answer(str(sample.key_expr), payload, encoding, stamp, source=source))
         elif (error := reply.err) is not None:
-            answers.append(Answer(key, error.payload.to_bytes(), str(error.encoding), is_error=True))
+            payload, encoding = error.payload.to_bytes(), str(error.encoding)
+            answers.append(Answer(key, payload, encoding, is_error=True, source=source))
     # Zenoh itself says so, in the place of a queryable that did not answer
     arrived = [answer for answer in answers if not (answer.is_error and answer.payload == b"Timeout")]
     if len(arrived) < len(answers) and not arrived:

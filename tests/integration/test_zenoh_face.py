@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 from tests.support.command_line import run_all
-from tests.support.process import ROOT, daemon
+from tests.support.process import ROOT, client, daemon
 
 pytestmark = pytest.mark.real_time
 
@@ -113,6 +113,47 @@ async def test_a_wildcard_moves_nothing_and_a_stop_needs_nothing(served):
         assert json.loads(answer.payload.to_string())["confirmed"] == ["x", "y", "z", "c"]
         state = get(session, "ldcn/sim/tele/x/state")["ldcn/sim/tele/x/state"]
         assert json.loads(state.payload.to_string())["stop_latched"] is True
+
+
+async def test_a_storage_that_answers_with_older_values_deceives_no_client(served):
+    """The storage is stock Zenoh: it keeps what was published once, and answers every key with it from then on."""
+    with connect(served) as session, connect(served) as storage:
+        old = get(session, "ldcn/sim/tele/**")
+
+        def answer(query):
+            for key, sample in old.items():
+                if query.key_expr.intersects(zenoh.KeyExpr(key)):
+                    query.reply(key, sample.payload, encoding=sample.encoding, timestamp=sample.timestamp)
+
+        declared = storage.declare_queryable("ldcn/**", answer, complete=True)
+        await command_line(served, "axis", "reset", "y")
+        await command_line(served, "axis", "power", "y", "on")
+        await command_line(served, "axis", "move", "y", "9", "--velocity", "5", "--wait")
+        (truth,) = (
+            json.loads(reply.ok.payload.to_string())
+            for reply in session.get("ldcn/sim/tele/y/position", target=zenoh.QueryTarget.ALL, timeout=5)
+            if reply.ok and str(reply.replier_id.zid) != str(storage.zid())
+        )
+        listed = await command_line(served, "axis", "list")
+        async with client(served) as rig:
+            positions, state = await rig.positions(), await rig.state("y")
+        declared.undeclare()
+
+    assert truth["value"] == pytest.approx(9, abs=0.05)
+    assert positions["y"].value == pytest.approx(9, abs=0.05)
+    assert state.enabled
+    assert re.search(r"^y .* (8\.9|9\.0)\d* mm", listed, re.MULTILINE), listed
+
+
+async def command_line(endpoint: str, *arguments: str) -> str:
+    """Run one command that succeeds; return what it prints."""
+    running = await create_subprocess_exec(
+        sys.executable, "-m", "ldcnd", *arguments, "--connect", endpoint, stdout=PIPE, stderr=STDOUT, cwd=ROOT
+    )
+    async with asyncio.timeout(60):
+        printed, _ = await running.communicate()
+    assert running.returncode == 0, printed.decode()
+    return printed.decode()
 
 
 async def test_published_samples_count_up_and_bear_the_instant_of_measurement(served):

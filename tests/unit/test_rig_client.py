@@ -33,6 +33,7 @@ class Newer:
     session: MemorySession
     client_session: MemorySession
     client: RigClient
+    broker: MemoryBroker
 
     async def answers(self, key: str, answer: Callable[[Query], None]) -> Declaration:
         return await self.session.serve(key, answer, complete=True)
@@ -50,7 +51,7 @@ def present(query: Query) -> None:
 async def newer() -> AsyncIterator[Newer]:
     broker = MemoryBroker()
     async with broker.session() as server, broker.session() as client:
-        yield Newer(server, client, RigClient(client, "bench1"))
+        yield Newer(server, client, RigClient(client, "bench1"), broker)
 
 
 async def test_a_description_with_fields_that_are_news_is_understood(newer: Newer) -> None:
@@ -58,6 +59,35 @@ async def test_a_description_with_fields_that_are_news_is_understood(newer: Newe
 
     assert (await newer.client.daemon()).instance == "i1"
     assert [rig.rig for rig in await find_rigs(newer.client_session)] == ["bench1"]
+
+
+@pytest.mark.parametrize("complete", [False, True])
+@pytest.mark.parametrize("serves_item", [True, False])
+async def test_a_storage_with_older_values_is_not_taken_for_the_daemon(
+    newer: Newer, *, complete: bool, serves_item: bool
+) -> None:
+    restarted = {**DAEMON, "instance": "i2", "started": 2}
+
+    def stored(query: Query) -> None:
+        if "/meta/daemon" in query.key:
+            query.reply(text(DAEMON), JSON, KEYS.daemon)
+        else:
+            query.reply(text(SAMPLE), JSON, POSITION)
+        query.finish()
+
+    def last(query: Query) -> None:
+        if serves_item:
+            query.reply(text({**SAMPLE, "t": 3, "value": 9.0}), JSON, POSITION)
+        query.finish()
+
+    async with newer.broker.session() as first, newer.broker.session() as other:
+        await first.serve("ldcn/bench1/**", stored, complete=complete)
+        await newer.answers(KEYS.daemon, lambda query: query.reply(text(restarted), JSON))
+        await newer.session.serve(KEYS.all_telemetry, last, complete=False)
+        await other.serve("ldcn/bench1/**", stored, complete=complete)
+        position, positions = await newer.client.position("x"), await newer.client.positions()
+
+    assert (position and position.value, "x" in positions) == (9.0 if serves_item else None, serves_item)
 
 
 async def test_a_sample_with_fields_that_are_news_is_understood(newer: Newer) -> None:
